@@ -1,0 +1,1 @@
+"""Scenes with depth: readers for files, and scenes made by the library."""

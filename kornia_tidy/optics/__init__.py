@@ -1,0 +1,1 @@
+"""Light: from phase masks and defocus to point spread functions."""

@@ -1,0 +1,1 @@
+"""Electrons: from irradiance to digital numbers."""

@@ -1,0 +1,39 @@
+"""Fixtures and options shared by all tests: device and dtype by option or environment, seeds, slow tests."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+
+DTYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32, "float64": torch.float64}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default=os.environ.get("KORNIA_TEST_DEVICE", "cpu"), help="cpu, cuda or all")
+    parser.addoption("--dtype", default=os.environ.get("KORNIA_TEST_DTYPE", "float32,float64"), help="comma list or all")
+    parser.addoption("--runslow", action="store_true", help="run tests marked slow")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "device" in metafunc.fixturenames:
+        wanted = metafunc.config.getoption("--device")
+        devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])] if wanted == "all" else [wanted]
+        metafunc.parametrize("device", [torch.device(d) for d in devices], ids=str)
+    if "dtype" in metafunc.fixturenames:
+        wanted = metafunc.config.getoption("--dtype")
+        names = list(DTYPES) if wanted == "all" else wanted.split(",")
+        metafunc.parametrize("dtype", [DTYPES[n] for n in names], ids=names)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--runslow"):
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason="slow: run with --runslow"))
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
