@@ -1,0 +1,147 @@
+"""Refractive indices n(λ): how much a phase mask's material delays light of each wavelength."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from kornia_tidy.checks import check_positive
+
+Terms = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A transparent material with a published dispersion formula; plain data that can be hashed and pickled.
+
+    Args:
+        name: what the material is called.
+        source: who published the formula.
+        dispersion: index from a wavelength in micrometres, the unit of all published formulas, and ``terms``.
+        terms: the coefficients, in pairs as ``dispersion`` reads them.
+        valid: shortest and longest wavelength in metres that the source vouches for.
+
+    Example:
+        >>> round(FUSED_SILICA.index(530e-9), 5)
+        1.4608
+        >>> NOA61.index(400e-9)
+        Traceback (most recent call last):
+        ValueError: the index of NOA61 is published for 450 to 1550 nm, got 400 nm
+    """
+
+    name: str
+    source: str
+    dispersion: Callable[[float, Terms], float] = field(repr=False)
+    terms: Terms
+    valid: tuple[float, float] = (0.0, math.inf)
+
+    def index(self, wavelength: float) -> float:
+        """Return the refractive index n at a vacuum wavelength.
+
+        Args:
+            wavelength: in metres.
+
+        Returns:
+            The index, no unit.
+
+        Raises:
+            ValueError: if the wavelength is not positive or outside the published range.
+        """
+        check_positive("wavelength", wavelength, "metres")
+        shortest, longest = self.valid
+        slack = 1e-9  # 0.45 * 1e-6 and 450e-9 differ in the last place
+        if not shortest * (1 - slack) <= wavelength <= longest * (1 + slack):
+            allowed = f"{shortest * 1e9:g} to {longest * 1e9:g} nm"
+            raise ValueError(f"the index of {self.name} is published for {allowed}, got {wavelength * 1e9:g} nm")
+        return self.dispersion(wavelength * 1e6, self.terms)
+
+
+def constant_index(index: float) -> Material:
+    """Return a material without dispersion, the same index at every wavelength.
+
+    Args:
+        index: refractive index, above 1 (at 1 no height of the material delays light).
+
+    Returns:
+        The material.
+
+    Raises:
+        ValueError: if the index is not finite and above 1.
+
+    Source: 1.5 for all colours is what Wu et al., PhaseCam3D, ICCP 2019, use.
+
+    Example:
+        >>> constant_index(1.5).index(470e-9)
+        1.5
+    """
+    if not 1 < index < math.inf:
+        raise ValueError(f"index must be finite and above 1, got {index}")
+    return Material(f"constant index {index:g}", "by definition", _power_series, ((float(index), 0),))
+
+
+def _sellmeier(um: float, terms: Terms) -> float:
+    """Return sqrt(1 + sum b λ²/(λ² - c)) over pairs (b, c), c in µm²."""
+    return math.sqrt(1 + sum(b * um**2 / (um**2 - c) for b, c in terms))
+
+
+def _power_series(um: float, terms: Terms) -> float:
+    """Return sum c λ^p over pairs (c, p); with p = 0, -2, -4 this is Cauchy's equation."""
+    return sum(c * um**p for c, p in terms)
+
+
+def _root_power_series(um: float, terms: Terms) -> float:
+    """Return sqrt(sum c λ^p) over pairs (c, p): a power series of n²."""
+    return math.sqrt(_power_series(um, terms))
+
+
+FUSED_SILICA = Material(
+    "fused silica",
+    "I. H. Malitson, J. Opt. Soc. Am. 55, 1205 (1965), at 20 °C",
+    _sellmeier,
+    ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
+    (210e-9, 3710e-9),
+)
+"""Fused silica (Malitson 1965): 1.46080 at 530 nm. Refuses what is beyond Malitson's own 0.21-3.71 µm."""
+
+PMMA = Material(
+    "PMMA",
+    "G. Beadie et al., Appl. Opt. 54, F139 (2015), at 20.1 °C",
+    _root_power_series,
+    (
+        (2.1778, 0),
+        (6.1209e-3, 2),
+        (-1.5004e-3, 4),
+        (2.3678e-2, -2),
+        (-4.2137e-3, -4),
+        (7.3417e-4, -6),
+        (-4.5042e-5, -8),
+    ),
+    (420e-9, 1620e-9),
+)
+"""Poly(methyl methacrylate), acrylic glass (Beadie 2015): 1.49539 at 530 nm."""
+
+PDMS = Material(
+    "PDMS",
+    "F. Schneider et al., Sens. Actuators A 151, 95 (2009), Sylgard 184",
+    _sellmeier,
+    ((1.0093, 0.013185),),
+    (350e-9, 700e-9),
+)
+"""Silicone elastomer Sylgard 184 (Schneider 2009): 1.43492 at 530 nm."""
+
+NOA61 = Material(
+    "NOA61",
+    "Norland Optical Adhesive 61, maker's Cauchy equation",
+    _power_series,
+    ((1.5375, 0), (0.00829045, -2), (-0.000211046, -4)),
+    (450e-9, 1550e-9),
+)
+"""Cured Norland Optical Adhesive 61 by its maker's equation: 1.56434 at 530 nm.
+
+Sources disagree: S. Joseph et al., ACS Applied Materials & Interfaces 12, 46519 (2020), give 1.498 at 530 nm for a
+film 1 µm thick. Ikoma et al. take the maker's, see :data:`NOA61_IKOMA`.
+"""
+
+NOA61_IKOMA = NOA61
+"""The resist of Ikoma et al., ICCP 2021: their Cauchy coefficients are the maker's, so this is :data:`NOA61`."""

@@ -1,0 +1,148 @@
+import math
+import pickle
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, NOA61_IKOMA, PDMS, PMMA, Material, constant_index
+from tests.base import DATA, BaseTester, needs_data
+
+FILES = {
+    FUSED_SILICA: "main_SiO2_nk_Malitson.yml",
+    PMMA: "organic__C5H8O2_n_-_poly_methyl_methacrylate__nk_Beadie.yml",
+    PDMS: "organic__C2H6OSi_n_-_polydimethylsiloxane_nk_Schneider-Sylgard184.yml",
+    NOA61: "other_optical_adhesives_NOA-61_nk_Norland.yml",
+}
+MATERIALS = list(FILES)
+by_name = pytest.mark.parametrize("material", MATERIALS, ids=lambda material: material.name)
+
+
+def database_index(text: str, um: float) -> float:
+    """Evaluate a refractiveindex.info entry: formulas 1, 2 (Sellmeier), 3 (polynomial of n²) and 5 (Cauchy)."""
+    formula = int(re.search(r"type: formula (\d)", text).group(1))
+    c = [float(number) for number in re.search(r"coefficients: (.*)", text).group(1).split()]
+    pairs = list(zip(c[1::2], c[2::2], strict=True))
+    match formula:
+        case 1:
+            return math.sqrt(1 + c[0] + sum(b * um**2 / (um**2 - resonance**2) for b, resonance in pairs))
+        case 2:
+            return math.sqrt(1 + c[0] + sum(b * um**2 / (um**2 - square) for b, square in pairs))
+        case 3:
+            return math.sqrt(c[0] + sum(b * um**power for b, power in pairs))
+        case 5:
+            return c[0] + sum(b * um**power for b, power in pairs)
+    raise AssertionError(f"formula {formula} is not one of these materials'")
+
+
+class TestMaterial(BaseTester):
+    @by_name
+    def test_smoke(self, material):
+        assert isinstance(material.index(530e-9), float)
+        assert material.name
+        assert material.source
+
+    @pytest.mark.parametrize("wavelength", [0.0, -530e-9, math.nan, math.inf])
+    def test_exception_a_wavelength_is_positive_and_finite(self, wavelength):
+        with pytest.raises(ValueError, match=f"wavelength must be positive and finite metres, got {wavelength}"):
+            constant_index(1.5).index(wavelength)
+
+    @pytest.mark.parametrize(
+        ("material", "allowed"),
+        [(FUSED_SILICA, "210 to 3710"), (PMMA, "420 to 1620"), (PDMS, "350 to 700"), (NOA61, "450 to 1550")],
+    )
+    def test_exception_names_the_published_range(self, material, allowed):
+        shortest, longest = material.valid
+        for wavelength in (shortest - 1e-9, longest + 1e-9):
+            with pytest.raises(ValueError, match=f"{material.name} is published for {allowed} nm, got"):
+                material.index(wavelength)
+
+    def test_exception_a_wavelength_in_nanometres_is_refused(self):
+        with pytest.raises(ValueError, match=r"got 5.3e\+11 nm"):
+            PDMS.index(530)
+
+    @by_name
+    def test_feature_both_ends_of_the_range_belong_to_it(self, material):
+        assert material.index(material.valid[0]) > material.index(material.valid[1]) > 1
+
+    def test_feature_a_rounded_end_belongs_to_the_range(self):
+        below = math.nextafter(450e-9, 0)
+        assert NOA61.index(below) == pytest.approx(NOA61.index(450e-9), abs=1e-12)
+
+    @pytest.mark.parametrize(
+        ("material", "indices"),
+        [
+            (FUSED_SILICA, (1.46415, 1.46080, 1.45771)),
+            (PDMS, (1.43992, 1.43492, 1.43052)),
+            (PMMA, (1.49970, 1.49539, 1.49163)),
+            (NOA61, (1.57071, 1.56434, 1.55826)),
+        ],
+    )
+    def test_feature_matches_the_published_index_at_470_530_and_610_nm(self, material, indices):
+        """Against refractiveindex.info's own values, rounded there to five places."""
+        for wavelength, index in zip((470e-9, 530e-9, 610e-9), indices, strict=True):
+            assert material.index(wavelength) == pytest.approx(index, abs=5.1e-6)
+
+    def test_feature_fused_silica_has_its_abbe_number(self):
+        """Malitson 1965: n_d = 1.45846 and V_d = 67.8."""
+        fraunhofer_f, fraunhofer_d, fraunhofer_c = (FUSED_SILICA.index(w) for w in (486.13e-9, 587.56e-9, 656.27e-9))
+        assert fraunhofer_d == pytest.approx(1.45846, abs=5.1e-6)
+        assert (fraunhofer_d - 1) / (fraunhofer_f - fraunhofer_c) == pytest.approx(67.8, abs=0.05)
+
+    @needs_data
+    @by_name
+    def test_feature_matches_the_database_over_the_whole_range(self, material):
+        text = (DATA / "materials" / FILES[material]).read_text(encoding="utf-8")
+        shortest, longest = material.valid
+        for step in range(101):
+            wavelength = shortest + step / 100 * (longest - shortest)
+            assert material.index(wavelength) == pytest.approx(database_index(text, wavelength * 1e6), abs=1e-12)
+
+    @needs_data
+    def test_feature_the_film_of_joseph_2020_is_another_noa61(self):
+        """The docstring's warning: 1.498 at 530 nm was measured on a thin film, far from the maker's 1.564."""
+        text = (DATA / "materials" / "other_optical_adhesives_NOA-61_nk_Joseph.yml").read_text(encoding="utf-8")
+        rows = [[float(number) for number in row] for row in re.findall(r"^\s+(\d\.\d+) (\d\.\d+)$", text, re.M)]
+        nearest = min(rows, key=lambda row: abs(row[0] - 0.53))
+        assert nearest[1] == pytest.approx(1.498, abs=5e-4)
+        assert NOA61.index(530e-9) - nearest[1] > 0.06
+
+    def test_feature_ikoma_2021_use_the_makers_equation(self):
+        """Their Cauchy coefficients written out: 1.5375 + 0.00829045 / um² - 0.000211046 / um⁴."""
+        for um in (0.45, 0.55, 0.632):
+            expected = 1.5375 + 0.00829045 / um**2 - 0.000211046 / um**4
+            assert NOA61_IKOMA.index(um * 1e-6) == pytest.approx(expected, abs=1e-12)
+
+    def test_feature_is_plain_data(self):
+        for material in (*MATERIALS, constant_index(1.5)):
+            copy = pickle.loads(pickle.dumps(material))
+            assert copy == material
+            assert hash(copy) == hash(material)
+            with pytest.raises(AttributeError):
+                material.name = "glass"
+
+    @by_name
+    @given(st.floats(0.0, 0.99), st.floats(0.001, 1.0))
+    @settings(deadline=None, max_examples=50)
+    def test_property_dispersion_is_normal(self, material, start, step):
+        """Clear dielectrics slow short waves more: n falls with the wavelength over the whole visible range."""
+        shortest, longest = max(material.valid[0], 400e-9), min(material.valid[1], 700e-9)
+        wavelength = shortest + start * (longest - shortest)
+        longer = min(wavelength + step * (longest - shortest), longest)
+        assert material.index(wavelength) > material.index(longer) > 1
+
+
+class TestConstantIndex(BaseTester):
+    def test_smoke(self):
+        assert isinstance(constant_index(1.5), Material)
+
+    @pytest.mark.parametrize("index", [1.0, 0.5, -1.5, math.nan, math.inf])
+    def test_exception_an_index_is_above_one(self, index):
+        with pytest.raises(ValueError, match=f"index must be finite and above 1, got {index}"):
+            constant_index(index)
+
+    @given(st.floats(100e-9, 20e-6))
+    @settings(deadline=None)
+    def test_property_is_the_same_at_every_wavelength(self, wavelength):
+        assert constant_index(1.5).index(wavelength) == 1.5
