@@ -1,0 +1,290 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kornia_tidy.optics.aperture import annular_aperture, check_aperture, circular_aperture, polygon_aperture
+from tests.base import BaseTester
+
+SQUARE = {"sides": 4, "rotation": math.pi / 4, "radius": math.sqrt(2)}  # half-width 1, sides along the axes
+both_edges = pytest.mark.parametrize("edges", ["binary", "area"])
+fast = settings(deadline=None, max_examples=40)
+sizes, pitches, radii = st.integers(1, 17), st.floats(0.05, 0.2), st.floats(0.5, 2.0)
+
+
+def polygon_area(sides: int, radius: float) -> float:
+    return sides / 2 * radius**2 * math.sin(2 * math.pi / sides)
+
+
+def sampled_cover(size: int, pitch: float, inside, subdivisions: int = 64) -> torch.Tensor:
+    """Return the share of a fine lattice of points in each cell that satisfy inside(x, y): brute force."""
+    points = (np.arange(size * subdivisions) + 0.5) * pitch / subdivisions - size * pitch / 2
+    hits = inside(points[None, :], points[:, None]).astype(float)
+    return torch.from_numpy(hits.reshape(size, subdivisions, size, subdivisions).mean(axis=(1, 3)))
+
+
+class TestCircularAperture(BaseTester):
+    @both_edges
+    @pytest.mark.parametrize("size", [1, 2, 23, 24])
+    def test_cardinality(self, size, edges):
+        aperture = circular_aperture(size, edges=edges)
+        assert aperture.shape == (size, size)
+        assert aperture.dtype == torch.float64
+
+    @pytest.mark.parametrize("size", [0, -1, 2.5])
+    def test_exception_size(self, size):
+        with pytest.raises(ValueError, match=f"size must be a whole number of at least 1, got {size}"):
+            circular_aperture(size)
+
+    @pytest.mark.parametrize("value", [0.0, -0.1, math.nan, math.inf])
+    def test_exception_lengths(self, value):
+        with pytest.raises(ValueError, match=f"pitch must be positive and finite pupil radii, got {value}"):
+            circular_aperture(23, pitch=value)
+        with pytest.raises(ValueError, match=f"radius must be positive and finite pupil radii, got {value}"):
+            circular_aperture(23, radius=value)
+
+    def test_exception_edges(self):
+        with pytest.raises(ValueError, match="edges must be one of 'binary', 'area', got 'soft'"):
+            circular_aperture(23, edges="soft")
+
+    def test_exception_a_disc_between_all_centres_lets_no_light_through(self):
+        with pytest.raises(ValueError, match="must let some light through"):
+            circular_aperture(4, pitch=1.0, radius=0.5)
+
+    def test_feature_the_papers_grid_has_317_open_cells(self):
+        """PhaseCam3D, 23 cells of 0.1: the lattice disc of radius 10, N(10) = 317 in Gauss's circle problem."""
+        aperture = circular_aperture(23)
+        assert aperture.sum() == 317
+        assert aperture.unique().tolist() == [0, 1]
+        assert aperture[1].sum() == aperture[21].sum() == 1  # the tips at rho = 1
+        assert aperture[1, 11] == aperture[11, 1] == aperture[21, 11] == aperture[11, 21] == 1
+
+    @pytest.mark.parametrize("cells", range(1, 12))
+    def test_feature_binary_counts_are_those_of_the_gauss_circle_problem(self, cells):
+        """OEIS A000328: lattice points within distance n of the origin, whatever rounding does to n · pitch."""
+        points = (1, 5, 13, 29, 49, 81, 113, 149, 197, 253, 317, 377)[cells]
+        for pitch in (0.1, 1 / 3, 1e-3):
+            assert circular_aperture(27, pitch, radius=cells * pitch).sum() == points
+
+    @pytest.mark.parametrize(("size", "pitch"), [(20, 0.1), (23, 0.1), (64, 1 / 32), (401, 0.005)])
+    def test_feature_areas_add_up_to_the_disc(self, size, pitch):
+        area = circular_aperture(size, pitch, edges="area").sum().item() * pitch**2
+        assert area == pytest.approx(math.pi, abs=1e-12)
+
+    @pytest.mark.parametrize(("size", "pitch", "radius"), [(7, 0.3, 1.0), (6, 0.37, 0.9), (4, 0.3, 0.7), (3, 1.0, 0.6)])
+    def test_feature_a_cell_holds_its_covered_fraction(self, size, pitch, radius):
+        """Against 64² points in each cell; the third disc reaches beyond its grid."""
+        expected = sampled_cover(size, pitch, lambda x, y: x**2 + y**2 <= radius**2)
+        self.assert_close(circular_aperture(size, pitch, radius, edges="area"), expected, rtol=0, atol=2e-3)
+
+    def test_feature_one_cell_around_the_disc_holds_pi_over_four(self):
+        assert circular_aperture(1, pitch=2.0, edges="area").item() == pytest.approx(math.pi / 4, abs=1e-15)
+
+    def test_feature_a_quarter_disc_in_a_cell_has_the_segment_formula(self):
+        """Two by two cells of 0.8: each is 0.8² less the corner outside the unit circle, integrated by hand."""
+        corner = 0.8 * 0.6 + (math.asin(0.8) - math.asin(0.6)) / 2  # rectangles 0.8 x 0.6, sector between
+        expected = torch.full((2, 2), corner / 0.8**2, dtype=torch.float64)
+        self.assert_close(circular_aperture(2, 0.8, edges="area"), expected, rtol=0, atol=1e-14)
+
+    def test_feature_cells_off_the_rim_are_exactly_open_or_shut(self):
+        aperture = circular_aperture(401, 0.005, edges="area")
+        line = (torch.arange(401, dtype=torch.float64) - 200) * 0.005
+        distance = torch.hypot(line[:, None], line)
+        assert bool((aperture[distance < 1 - 0.005] == 1).all())
+        assert bool((aperture[distance > 1 + 0.005] == 0).all())
+
+    def test_feature_binary_converges_to_area(self):
+        errors = []
+        for refinement in (1, 4, 16):
+            binary = circular_aperture(23 * refinement, 0.1 / refinement)
+            cells = binary.reshape(23, refinement, 23, refinement).mean(dim=(1, 3))
+            errors.append((cells - circular_aperture(23, edges="area")).abs().mean().item())
+        assert errors[0] > 4 * errors[1] > 16 * errors[2]
+        assert errors[2] < 1e-3
+
+    @both_edges
+    @given(size=sizes, pitch=pitches, radius=radii)
+    @fast
+    def test_property_is_an_amplitude_with_the_symmetry_of_the_square(self, edges, size, pitch, radius):
+        aperture = circular_aperture(size, pitch, radius, edges=edges)
+        assert 0 <= aperture.min() <= aperture.max() <= 1
+        for image in (aperture.flip(0), aperture.flip(1), aperture.rot90(), aperture.T):
+            self.assert_close(image, aperture, rtol=0, atol=1e-12)
+
+    @both_edges
+    @given(size=sizes, pitch=pitches, radius=radii, growth=st.floats(0, 0.5))
+    @fast
+    def test_property_a_larger_disc_covers_no_cell_less(self, edges, size, pitch, radius, growth):
+        smaller, larger = (circular_aperture(size, pitch, r, edges=edges) for r in (radius, radius + growth))
+        assert bool((larger >= smaller - 1e-12).all())
+
+
+class TestAnnularAperture(BaseTester):
+    @both_edges
+    def test_smoke(self, edges):
+        aperture = annular_aperture(23, 0.1, 0.5, edges=edges)
+        assert aperture.shape == (23, 23)
+        assert aperture.dtype == torch.float64
+        assert aperture[11, 11] == 0
+
+    @pytest.mark.parametrize("inner", [0.0, -0.1, 1.0, 2.0, math.nan])
+    def test_exception_inner_lies_between_zero_and_the_radius(self, inner):
+        with pytest.raises(ValueError, match=f"inner must be between 0 and the outer radius 1.0, got {inner}"):
+            annular_aperture(23, 0.1, inner)
+
+    def test_exception_a_ring_between_all_centres_lets_no_light_through(self):
+        with pytest.raises(ValueError, match="must let some light through"):
+            annular_aperture(23, 0.1, inner=0.97, radius=0.98)
+
+    def test_feature_areas_add_up_to_the_ring(self):
+        area = annular_aperture(23, 0.1, 0.37, edges="area").sum().item() * 0.1**2
+        assert area == pytest.approx(math.pi * (1 - 0.37**2), abs=1e-12)
+
+    def test_feature_a_cell_holds_its_covered_fraction(self):
+        expected = sampled_cover(7, 0.3, lambda x, y: (x**2 + y**2 <= 1) & (x**2 + y**2 > 0.45**2))
+        self.assert_close(annular_aperture(7, 0.3, 0.45, edges="area"), expected, rtol=0, atol=2e-3)
+
+    @both_edges
+    @given(inner=st.floats(0.1, 0.8))
+    @fast
+    def test_property_ring_and_obstruction_make_the_disc(self, edges, inner):
+        ring = annular_aperture(23, 0.1, inner, edges=edges)
+        assert 0 <= ring.min() <= ring.max() <= 1
+        whole = ring + circular_aperture(23, 0.1, inner, edges=edges)
+        self.assert_close(whole, circular_aperture(23, edges=edges), rtol=0, atol=1e-12)
+
+
+class TestPolygonAperture(BaseTester):
+    @both_edges
+    @pytest.mark.parametrize("sides", [3, 4, 5, 6, 9])
+    def test_smoke(self, sides, edges):
+        aperture = polygon_aperture(23, 0.1, sides, edges=edges)
+        assert aperture.shape == (23, 23)
+        assert aperture.dtype == torch.float64
+        assert aperture[11, 11] == 1
+
+    @pytest.mark.parametrize("sides", [2, 0, -4, 4.5])
+    def test_exception_sides(self, sides):
+        with pytest.raises(ValueError, match=f"sides must be a whole number of at least 3, got {sides}"):
+            polygon_aperture(23, 0.1, sides)
+
+    def test_exception_rotation_and_radius(self):
+        with pytest.raises(ValueError, match="rotation must be finite radians, got nan"):
+            polygon_aperture(23, 0.1, 6, rotation=math.nan)
+        with pytest.raises(ValueError, match="radius must be positive and finite pupil radii, got -1"):
+            polygon_aperture(23, 0.1, 6, radius=-1)
+
+    @pytest.mark.parametrize("sides", [3, 4, 5, 6, 7, 100])
+    @pytest.mark.parametrize("rotation", [0.0, 0.3, math.pi / 4, math.pi / 2])
+    @pytest.mark.parametrize(("size", "pitch"), [(23, 0.1), (20, 0.1), (129, 1 / 64)])
+    def test_feature_areas_add_up_to_the_polygon(self, sides, rotation, size, pitch):
+        aperture = polygon_aperture(size, pitch, sides, rotation, edges="area")
+        assert aperture.sum().item() * pitch**2 == pytest.approx(polygon_area(sides, 1.0), abs=1e-12)
+
+    @pytest.mark.parametrize(
+        ("sides", "rotation", "radius"), [(3, 0.2, 1.0), (5, 0.0, 0.8), (6, 1.0, 1.3), (4, 0.1, 0.3)]
+    )
+    @pytest.mark.parametrize(("size", "pitch"), [(7, 0.3), (4, 0.37)])
+    def test_feature_a_cell_holds_its_covered_fraction(self, sides, rotation, radius, size, pitch):
+        """Against 64² points in each cell, inside where no side lies between them and the axis."""
+
+        def inside(x, y):
+            middles = rotation + (2 * np.arange(sides) + 1) * np.pi / sides
+            reach = np.cos(middles)[:, None, None] * x + np.sin(middles)[:, None, None] * y
+            return (reach <= radius * np.cos(np.pi / sides)).all(axis=0)
+
+        aperture = polygon_aperture(size, pitch, sides, rotation, radius, edges="area")
+        self.assert_close(aperture, sampled_cover(size, pitch, inside), rtol=0, atol=8e-3)
+
+    @both_edges
+    def test_feature_a_square_fills_the_cells_inside_and_no_other(self, edges):
+        expected = torch.nn.functional.pad(torch.ones(20, 20, dtype=torch.float64), (2, 2, 2, 2))
+        assert torch.equal(polygon_aperture(24, 0.1, **SQUARE, edges=edges), expected)
+
+    def test_feature_a_square_through_cell_centres_halves_them(self):
+        """23 cells of 0.1: the rim runs through the centres of row and column 1, so they are half covered."""
+        weights = torch.tensor([0, 0.5, *[1.0] * 19, 0.5, 0], dtype=torch.float64)
+        expected = weights[:, None] * weights
+        self.assert_close(polygon_aperture(23, 0.1, **SQUARE, edges="area"), expected, rtol=0, atol=1e-12)
+        assert torch.equal(polygon_aperture(23, 0.1, **SQUARE), (expected > 0).double())  # the rim is inside
+
+    def test_feature_many_sides_approach_the_disc(self):
+        """The sagitta of a side is 1 - cos(π/1000) = 5e-6, which over a pitch of 0.1 is 5e-5 of a cell's width."""
+        polygon = polygon_aperture(23, 0.1, 1000, edges="area")
+        self.assert_close(polygon, circular_aperture(23, edges="area"), rtol=0, atol=1.5e-4)
+
+    def test_feature_binary_converges_to_area(self):
+        binary = polygon_aperture(23 * 16, 0.1 / 16, 6, 0.2).reshape(23, 16, 23, 16).mean(dim=(1, 3))
+        area = polygon_aperture(23, 0.1, 6, 0.2, edges="area")
+        assert (binary - area).abs().mean() < 1e-3
+        assert (polygon_aperture(23, 0.1, 6, 0.2) - area).abs().mean() > 1e-2
+
+    @both_edges
+    def test_convention_the_first_corner_is_on_the_right_and_turns_down(self, edges):
+        """Row is y, downwards; column is x: the triangle's first corner is at +x, and a quarter turn takes it to +y."""
+        right = polygon_aperture(23, 0.1, 3, edges=edges)
+        assert right[11, 20] > 0
+        assert right[11, 2] == right[2, 11] == right[20, 11] == 0
+        down = polygon_aperture(23, 0.1, 3, rotation=math.pi / 2, edges=edges)
+        assert down[20, 11] > 0
+        self.assert_close(down, right.rot90(-1), rtol=0, atol=1e-12)
+
+    @both_edges
+    @given(size=sizes, radius=radii, sides=st.integers(3, 9), rotation=st.floats(-7, 7))
+    @fast
+    def test_property_lies_between_its_incircle_and_circumcircle(self, edges, size, radius, sides, rotation):
+        pitch = 0.15
+        polygon = polygon_aperture(size, pitch, sides, rotation, radius, edges=edges)
+        inner = circular_aperture(size, pitch, radius * math.cos(math.pi / sides), edges=edges)
+        outer = circular_aperture(size, pitch, radius, edges=edges)
+        assert 0 <= polygon.min() <= polygon.max() <= 1
+        assert bool((inner <= polygon + 1e-11).all())
+        assert bool((polygon <= outer + 1e-11).all())
+
+    @given(sides=st.integers(3, 9), rotation=st.floats(-7, 7))
+    @fast
+    def test_property_a_turn_by_one_side_changes_nothing(self, sides, rotation):
+        turned = polygon_aperture(15, 0.16, sides, rotation + 2 * math.pi / sides, edges="area")
+        self.assert_close(turned, polygon_aperture(15, 0.16, sides, rotation, edges="area"), rtol=0, atol=1e-11)
+
+
+class TestCheckAperture(BaseTester):
+    def test_feature_returns_the_values_in_float64(self, device, dtype):
+        aperture = torch.rand(5, 5, device=device, dtype=dtype)
+        checked = check_aperture(aperture, 5)
+        assert checked.dtype == torch.float64
+        assert checked.device == aperture.device
+        assert torch.equal(checked, aperture.double())
+
+    @pytest.mark.parametrize("value", [np.eye(3), np.eye(3) > 0, np.eye(3, dtype=np.uint8).tolist()])
+    def test_feature_takes_arrays_booleans_and_lists(self, value):
+        assert torch.equal(check_aperture(value, 3), torch.eye(3, dtype=torch.float64))
+
+    def test_feature_later_edits_of_the_users_array_change_nothing(self):
+        array = np.ones((3, 3))
+        checked = check_aperture(array, 3)
+        array[0, 0] = 0
+        assert checked[0, 0] == 1
+
+    def test_exception_shape(self, device, dtype):
+        for shape in ((4, 5), (5,), (1, 5, 5), (4, 4)):
+            with pytest.raises(ValueError, match=r"aperture must have shape \(5, 5\), got"):
+                check_aperture(torch.ones(shape, device=device, dtype=dtype), 5)
+
+    @pytest.mark.parametrize("bad", [-0.5, 1.5, math.nan, math.inf, -math.inf])
+    def test_exception_names_the_bad_value(self, bad, device, dtype):
+        aperture = torch.ones(5, 5, device=device, dtype=dtype)
+        aperture[2, 3] = bad
+        with pytest.raises(ValueError, match=rf"amplitudes in \[0, 1\], got {bad}"):
+            check_aperture(aperture, 5)
+
+    def test_exception_a_closed_pupil_is_refused(self, device, dtype):
+        with pytest.raises(ValueError, match="must let some light through, got 0 open cells"):
+            check_aperture(torch.zeros(5, 5, device=device, dtype=dtype), 5)
+
+    def test_exception_a_complex_pupil_is_refused(self, device):
+        with pytest.raises(TypeError, match="real amplitude"):
+            check_aperture(torch.ones(5, 5, device=device, dtype=torch.complex64), 5)
