@@ -1,0 +1,251 @@
+"""Compositing: the image of a scene whose pixels lie in different defocus layers, one PSF a layer.
+
+This is the dense renderer: every layer that the scene contains is convolved over the whole image. It is the
+definition that faster renderers are judged against. Light is linear throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.scene.convolution import check_border, from_spectrum, pad_border, padded_size, to_spectrum
+from kornia_tidy.scene.layers import assign_layers, layer_weight, present_layers
+
+
+class Bank(Protocol):
+    """What a renderer asks of a PSF bank. D layers, C channels, PSFs of P x P pixels with P odd."""
+
+    @property
+    def psfs(self) -> Tensor:
+        """(D, C, P, P) fraction of a point's light that falls on each pixel."""
+        ...
+
+    @property
+    def defocus(self) -> Tensor:
+        """(D,) defocus of the layers in radians, ascending."""
+        ...
+
+    @property
+    def veil(self) -> Tensor | None:
+        """(D, C) fraction of light that leaves the window and is spread evenly, or None for none."""
+        ...
+
+
+def render(
+    image: Tensor,
+    defocus: Tensor,
+    bank: Bank,
+    compositing: str = "gather",
+    *,
+    layers: str = "linear",
+    border: str = "reflect",
+    correlate: bool = False,
+) -> Tensor:
+    """Render a scene through a PSF bank: what the sensor sees, in linear light.
+
+    Args:
+        image: (B, C, H, W) linear light of the scene, with the channels of the bank.
+        defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians. Beyond the bank's layers it is clamped to the ends.
+        bank: PSFs and their defocus, see :class:`Bank`.
+        compositing: ``"gather"`` or ``"scatter"``, see :func:`gather` and :func:`scatter`.
+        layers: ``"linear"`` or ``"nearest"``, see :func:`kornia_tidy.scene.layers.assign_layers`.
+        border: ``"reflect"``, ``"replicate"``, ``"zero"``, ``"circular"`` or ``"valid"``, see
+            :mod:`kornia_tidy.scene.convolution`.
+        correlate: turn the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
+
+    Returns:
+        The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or
+        (B, C, H - P + 1, W - P + 1) for ``"valid"``.
+
+    Raises:
+        TypeError: if a tensor is not floating point.
+        ValueError: if shapes do not fit, P is even, a choice is not known, or the image is too small for the border.
+
+    Convention:
+        A convolution: a PSF with its peak right of centre moves a point to the right. NaN is not looked for.
+
+    Example:
+        >>> import torch
+        >>> from types import SimpleNamespace
+        >>> bank = SimpleNamespace(psfs=torch.full((2, 3, 5, 5), 1 / 25), defocus=torch.tensor([-9.0, 9.0]), veil=None)
+        >>> render(torch.rand(4, 3, 32, 48), torch.zeros(1, 1, 32, 48), bank, border="valid").shape
+        torch.Size([4, 3, 28, 44])
+    """
+    check_choice("compositing", compositing, COMPOSITING)
+    composite = COMPOSITING[compositing]
+    return composite(
+        image, defocus, bank.defocus, bank.psfs, bank.veil, layers=layers, border=border, correlate=correlate
+    )
+
+
+def gather(
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    veil: Tensor | None = None,
+    *,
+    layers: str = "linear",
+    border: str = "reflect",
+    correlate: bool = False,
+) -> Tensor:
+    r"""Blur the image by each layer's PSF, then let each pixel take the layer it lies in.
+
+    .. math:: I_c = \sum_d O_d \, (L_c * h_{dc} + v_{dc} \overline{L_c})
+
+    White stays white where the PSFs sum to one (with the veil); flux is not conserved where depth changes.
+
+    Args:
+        image: L, (B, C, H, W) linear light.
+        defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians; with ``nodes`` and ``layers`` it gives the weights O.
+        nodes: (D,) ascending defocus of the layers in radians.
+        psfs: h, (D, C, P, P) with P odd.
+        veil: v, (D, C) fraction of the image's mean light that is added, or None.
+        layers: ``"linear"`` or ``"nearest"``.
+        border: what lies beyond the image, see :func:`render`.
+        correlate: turn the PSFs by 180 degrees.
+
+    Returns:
+        As :func:`render`; so are the errors and the convention.
+
+    Source: Shah et al., TiDy-PSFs, ICCV 2023, equation 1.
+
+    Example:
+        >>> import torch
+        >>> point = torch.zeros(1, 1, 5, 5)
+        >>> point[..., 2, 2] = 1
+        >>> psf = torch.tensor([[[[0.0, 0.0, 0.0], [0.0, 0.25, 0.75], [0.0, 0.0, 0.0]]]])
+        >>> coded = gather(point, torch.zeros(1, 1, 5, 5), torch.zeros(1), psf)
+        >>> (coded[0, 0, 2] * 100).round().int().tolist()
+        [0, 0, 25, 75, 0]
+    """
+    options = {"veil": veil, "layers": layers, "border": border, "correlate": correlate}
+    return _composite(_gather, image, defocus, nodes, psfs, **options)
+
+
+def scatter(
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    veil: Tensor | None = None,
+    *,
+    layers: str = "linear",
+    border: str = "reflect",
+    correlate: bool = False,
+) -> Tensor:
+    r"""Let each pixel spread its own light by the PSF of the layer it lies in.
+
+    .. math:: I_c = \sum_d \left( (O_d L_c) * h_{dc} + v_{dc} \overline{O_d L_c} \right)
+
+    Flux is conserved where the PSFs sum to one (with the veil) and the border is circular; white does not stay white
+    where depth changes, because no layer hides another. For the gradients one spectrum a layer is kept.
+
+    Args:
+        image: L, (B, C, H, W) linear light. The product with the weights O is what gets padded.
+        defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians; with ``nodes`` and ``layers`` it gives the weights O.
+        nodes: (D,) ascending defocus of the layers in radians.
+        psfs: h, (D, C, P, P) with P odd.
+        veil: v, (D, C) fraction of each layer's mean light that is added, or None.
+        layers: ``"linear"`` or ``"nearest"``.
+        border: what lies beyond the image, see :func:`render`.
+        correlate: turn the PSFs by 180 degrees.
+
+    Returns:
+        As :func:`render`; so are the errors and the convention.
+
+    Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
+    """
+    options = {"veil": veil, "layers": layers, "border": border, "correlate": correlate}
+    return _composite(_scatter, image, defocus, nodes, psfs, **options)
+
+
+COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": scatter}
+
+
+def _composite(
+    sum_layers: Callable[..., Tensor],
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    *,
+    veil: Tensor | None,
+    layers: str,
+    border: str,
+    correlate: bool,
+) -> Tensor:
+    """Check the inputs, find the layers and add them up in float32 or better."""
+    check_scene(image, defocus, nodes, psfs, veil)
+    check_border(border, image.shape[-2], image.shape[-1], psfs.shape[-1])
+    dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
+    with torch.autocast(image.device.type, enabled=False):
+        lower, fraction = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
+        psfs = psfs.flip((-2, -1)) if correlate else psfs
+        veil = None if veil is None else veil.to(dtype)
+        coded = sum_layers(image.to(dtype), lower, fraction.to(dtype), psfs.to(dtype), veil=veil, border=border)
+    return coded.to(image.dtype)
+
+
+def _gather(
+    image: Tensor, lower: Tensor, fraction: Tensor, psfs: Tensor, *, veil: Tensor | None, border: str
+) -> Tensor:
+    psf_size = psfs.shape[-1]
+    if border == "valid":
+        inside = slice(psf_size // 2, -(psf_size // 2) or None)
+        lower, fraction = lower[..., inside, inside], fraction[..., inside, inside]
+    size = padded_size(*image.shape[-2:], psf_size, border)
+    light = to_spectrum(pad_border(image, psf_size // 2, border), size)
+    haze = None if veil is None else veil[:, None, :, None, None] * image.mean((-2, -1), keepdim=True)
+    # Of the sum a pixel has two terms: pick them, mix once. Autograd then keeps masks, not a blurred image a layer.
+    below = above = torch.zeros((), dtype=image.dtype, device=image.device)
+    for index in present_layers(lower, fraction, len(psfs)):
+        blurred = from_spectrum(light * to_spectrum(psfs[index], size), size, psf_size)
+        if haze is not None:
+            blurred = blurred + haze[index]
+        below = torch.where(lower == index, blurred, below)
+        above = torch.where(lower == index - 1, blurred, above)
+    return torch.lerp(below, above, fraction)
+
+
+def _scatter(
+    image: Tensor, lower: Tensor, fraction: Tensor, psfs: Tensor, *, veil: Tensor | None, border: str
+) -> Tensor:
+    psf_size = psfs.shape[-1]
+    size = padded_size(*image.shape[-2:], psf_size, border)
+    light = haze = torch.zeros((), dtype=image.dtype, device=image.device)
+    for index in present_layers(lower, fraction, len(psfs)):
+        own = layer_weight(lower, fraction, index) * image
+        light = light + to_spectrum(pad_border(own, psf_size // 2, border), size) * to_spectrum(psfs[index], size)
+        if veil is not None:
+            haze = haze + veil[index, :, None, None] * own.mean((-2, -1), keepdim=True)
+    return from_spectrum(light, size, psf_size) + haze
+
+
+def check_scene(image: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, veil: Tensor | None) -> None:
+    """Raise ``TypeError`` or ``ValueError`` unless image, defocus map and PSFs fit each other. Looks at no value."""
+    check_float_tensor("image", image, 4, "(B, C, H, W)")
+    check_float_tensor("defocus", defocus, 4, "(B, 1, H, W)")
+    check_float_tensor("psfs", psfs, 4, "(D, C, P, P)")
+    batch, channels, height, width = image.shape
+    if tuple(defocus.shape) not in ((batch, 1, height, width), (1, 1, height, width)):
+        raise ValueError(
+            f"defocus must have the image's size, shape {(batch, 1, height, width)} or {(1, 1, height, width)}, "
+            f"got {tuple(defocus.shape)}"
+        )
+    depth, psf_channels, psf_height, psf_width = psfs.shape
+    if psf_height != psf_width or psf_height % 2 == 0:
+        raise ValueError(f"psfs must be square with an odd side, which has a centre, got {psf_height}x{psf_width}")
+    if psf_channels != channels:
+        raise ValueError(f"image and psfs must have the same channels, got {channels} and {psf_channels}")
+    if tuple(nodes.shape) != (depth,):
+        raise ValueError(f"nodes must have shape {(depth,)}, one defocus a PSF layer, got {tuple(nodes.shape)}")
+    if veil is not None and tuple(veil.shape) != (depth, channels):
+        raise ValueError(
+            f"veil must have shape {(depth, channels)}, one value a layer and channel, got {tuple(veil.shape)}"
+        )

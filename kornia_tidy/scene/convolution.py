@@ -1,0 +1,78 @@
+"""Convolution with a PSF: what lies beyond the image's border, and products of spectra.
+
+An image plane is padded by the PSF's radius on each side, multiplied with the PSF's spectrum, and the part that no
+wrap-around has touched is cut out. Borders: ``reflect`` (``...c b | a b c...``, OpenCV's reflect101), ``replicate``
+(``a a | a b c``), ``zero``, ``circular`` (``...y z | a b c``), and ``valid``: nothing is made up, and the output is
+smaller by the PSF's side less one.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+
+BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
+_PAD_MODES = {"reflect": "reflect", "replicate": "replicate", "zero": "constant", "circular": "circular"}
+
+
+def check_border(border: str, height: int, width: int, psf_size: int) -> None:
+    """Raise ``ValueError`` if the border is not known, or an image of this size is too small for it."""
+    check_choice("border", border, BORDERS)
+    radius = psf_size // 2
+    smallest_side = {"reflect": radius + 1, "replicate": 1, "zero": 1, "circular": max(radius, 1), "valid": psf_size}
+    fitting = [name for name in BORDERS if min(height, width) >= smallest_side[name]]
+    if border not in fitting:
+        raise ValueError(
+            f"border {border!r} needs an image of at least {smallest_side[border]} pixels a side for PSFs of "
+            f"{psf_size}x{psf_size}, got {height}x{width}; borders that work here: {', '.join(map(repr, fitting))}"
+        )
+
+
+def pad_border(image: Tensor, radius: int, border: str) -> Tensor:
+    """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` leaves them as they are."""
+    if border == "valid":
+        return image
+    return torch.nn.functional.pad(image, (radius, radius, radius, radius), mode=_PAD_MODES[border])
+
+
+def padded_size(height: int, width: int, psf_size: int, border: str) -> tuple[int, int]:
+    """Return the height and width that :func:`pad_border` gives an image."""
+    extra = 0 if border == "valid" else 2 * (psf_size // 2)
+    return height + extra, width + extra
+
+
+def next_fast_size(size: int) -> int:
+    """Return the smallest number of samples, at least ``size``, that has no prime factor above 5.
+
+    Example:
+        >>> next_fast_size(1046)
+        1080
+    """
+    while True:
+        rest = size
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return size
+        size += 1
+
+
+def to_spectrum(planes: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return the half spectrum of (..., H, W) planes, filled up with zeros so that planes of ``size`` transform fast.
+
+    Image and PSF are both given the padded image's ``size``; the product of their spectra goes to
+    :func:`from_spectrum`.
+    """
+    return torch.fft.rfft2(planes, s=(next_fast_size(size[0]), next_fast_size(size[1])))
+
+
+def from_spectrum(product: Tensor, size: tuple[int, int], psf_size: int) -> Tensor:
+    """Return the convolution: the pixels of a padded plane of ``size`` that see the whole PSF.
+
+    The first ``psf_size - 1`` rows and columns hold what wrapped around.
+    """
+    full = torch.fft.irfft2(product, s=(next_fast_size(size[0]), next_fast_size(size[1])))
+    return full[..., psf_size - 1 : size[0], psf_size - 1 : size[1]]

@@ -1,0 +1,98 @@
+"""What the scene tests share: small banks and scenes, and the forward model written as sums over pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Bank:
+    """A stand-in for a PSF bank: what the renderer's protocol asks for and nothing else."""
+
+    psfs: Tensor
+    defocus: Tensor
+    veil: Tensor | None = None
+
+    def to(self, dtype: torch.dtype) -> Bank:
+        veil = None if self.veil is None else self.veil.to(dtype)
+        return replace(self, psfs=self.psfs.to(dtype), veil=veil)
+
+
+def make_bank(layers=4, channels=3, size=5, *, dtype=torch.float64, device="cpu", light=1.0, veil=False) -> Bank:
+    """Random PSFs with no symmetry that hold ``light`` of the light, at uneven nodes; the veil holds the rest."""
+    psfs = torch.rand(layers, channels, size, size, dtype=dtype, device=device)
+    psfs = light * psfs / psfs.sum((-2, -1), keepdim=True)
+    nodes = torch.tensor([-20.0, -11.0, -4.0, 0.0, 7.0, 20.0], dtype=dtype, device=device)[:layers]
+    return Bank(psfs, nodes, 1 - psfs.sum((-2, -1)) if veil else None)
+
+
+def make_scene(bank: Bank, batch=2, height=9, width=12) -> tuple[Tensor, Tensor]:
+    """A random image and a random defocus map that reaches a little beyond the bank's nodes."""
+    like = {"dtype": bank.psfs.dtype, "device": bank.psfs.device}
+    image = torch.rand(batch, bank.psfs.shape[1], height, width, **like)
+    lowest, highest = bank.defocus[0] - 2, bank.defocus[-1] + 2
+    return image, lowest + (highest - lowest) * torch.rand(batch, 1, height, width, **like)
+
+
+def brute_weights(psi: np.ndarray, nodes: np.ndarray, mode: str) -> np.ndarray:
+    """(D, H, W) weights of an (H, W) defocus map: NumPy's interpolation of each unit vector, or the nearest node."""
+    if mode == "linear":
+        return np.stack([np.interp(psi, nodes, unit) for unit in np.eye(len(nodes))])
+    label = np.abs(psi[..., None] - nodes).argmin(-1)
+    return np.stack([label == d for d in range(len(nodes))]).astype(float)
+
+
+def _source(index: int, size: int, border: str) -> int | None:
+    """The pixel that stands at ``index`` once the image goes on beyond its border; None is black."""
+    if 0 <= index < size:
+        return index
+    if border == "zero":
+        return None
+    if border == "replicate":
+        return min(max(index, 0), size - 1)
+    if border == "circular":
+        return index % size
+    return -index if index < 0 else 2 * (size - 1) - index
+
+
+def brute_blur(plane: np.ndarray, psf: np.ndarray, border: str) -> np.ndarray:
+    """Convolution as four loops: each output pixel adds up what the PSF brings to it."""
+    height, width = plane.shape
+    radius = len(psf) // 2
+    edge = radius if border == "valid" else 0
+    out = np.zeros((height - 2 * edge, width - 2 * edge))
+    for y, x in np.ndindex(*out.shape):
+        for i, j in np.ndindex(*psf.shape):
+            row = _source(y + edge + radius - i, height, border)
+            column = _source(x + edge + radius - j, width, border)
+            if row is not None and column is not None:
+                out[y, x] += psf[i, j] * plane[row, column]
+    return out
+
+
+def brute_render(image, psi, bank: Bank, *, compositing: str, layers: str, border: str) -> Tensor:
+    """The forward model from its formula for a batch of tiny images, in NumPy's float64."""
+    nodes, psfs = bank.defocus.double().cpu().numpy(), bank.psfs.double().cpu().numpy()
+    veil = np.zeros(psfs.shape[:2]) if bank.veil is None else bank.veil.double().cpu().numpy()
+    crop = psfs.shape[-1] // 2 if border == "valid" else 0
+    out = []
+    for b in range(len(image)):
+        weights = brute_weights(psi[b % len(psi), 0].double().cpu().numpy(), nodes, layers)
+        inner = weights[:, crop : weights.shape[1] - crop, crop : weights.shape[2] - crop]
+        for c, plane in enumerate(image[b].double().cpu().numpy()):
+            if compositing == "gather":
+                terms = [
+                    o * (brute_blur(plane, h, border) + v * plane.mean())
+                    for o, h, v in zip(inner, psfs[:, c], veil[:, c], strict=True)
+                ]
+            else:
+                terms = [
+                    brute_blur(o * plane, h, border) + v * (o * plane).mean()
+                    for o, h, v in zip(weights, psfs[:, c], veil[:, c], strict=True)
+                ]
+            out.append(sum(terms))
+    return torch.from_numpy(np.stack(out)).reshape(*image.shape[:2], *out[0].shape).to(image.device)
