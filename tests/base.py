@@ -37,6 +37,7 @@ class BaseTester:
     def gradcheck(function: Any, inputs: tuple[Any, ...], **options: Any) -> None:
         """Check gradients in float64 of every floating-point input."""
         prepared = tuple(
-            x.detach().double().requires_grad_() if isinstance(x, Tensor) and x.is_floating_point() else x for x in inputs
+            x.detach().double().requires_grad_() if isinstance(x, Tensor) and x.is_floating_point() else x
+            for x in inputs
         )
         assert torch.autograd.gradcheck(function, prepared, **{"fast_mode": True, **options})

@@ -12,7 +12,9 @@ DTYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default=os.environ.get("KORNIA_TEST_DEVICE", "cpu"), help="cpu, cuda or all")
-    parser.addoption("--dtype", default=os.environ.get("KORNIA_TEST_DTYPE", "float32,float64"), help="comma list or all")
+    parser.addoption(
+        "--dtype", default=os.environ.get("KORNIA_TEST_DTYPE", "float32,float64"), help="comma list or all"
+    )
     parser.addoption("--runslow", action="store_true", help="run tests marked slow")
 
 

@@ -140,8 +140,5 @@ NOA61 = Material(
 """Cured Norland Optical Adhesive 61 by its maker's equation: 1.56434 at 530 nm.
 
 Sources disagree: S. Joseph et al., ACS Applied Materials & Interfaces 12, 46519 (2020), give 1.498 at 530 nm for a
-film 1 µm thick. Ikoma et al. take the maker's, see :data:`NOA61_IKOMA`.
+film 1 µm thick. Ikoma et al., ICCP 2021, take the maker's.
 """
-
-NOA61_IKOMA = NOA61
-"""The resist of Ikoma et al., ICCP 2021: their Cauchy coefficients are the maker's, so this is :data:`NOA61`."""

@@ -1,0 +1,267 @@
+"""Depth to defocus: where a scene point comes to focus, written as phase at the edge of the pupil."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_depth, check_positive
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+
+
+def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: float | Tensor) -> Tensor:
+    r"""Return the defocus phase at the pupil edge of a thin lens.
+
+    .. math:: \psi(z) = \frac{\pi R^2}{\lambda_0} \left( \frac{1}{z} - \frac{1}{z_f} \right)
+
+    Args:
+        depth: distance to the scene in metres, any shape; ``inf`` is allowed and exact.
+        aperture_radius: pupil radius R in metres.
+        focus_distance: distance z_f in metres that is imaged sharply; may be ``inf``.
+
+    Returns:
+        Defocus in radians at 530 nm, same shape and dtype as ``depth``.
+
+    Convention:
+        - Positive is nearer than focus. At another wavelength multiply by 530 nm / wavelength.
+        - The phase over the pupil is defocus * rho**2, with rho = 1 at the edge.
+        - Depths are not checked here: :meth:`ThinLensCamera.defocus` does.
+
+    Source: Goodman, Introduction to Fourier Optics, section 6.4.
+
+    Example:
+        >>> thin_lens_defocus(torch.tensor([0.2975, float("inf")]), 1.4175e-3, 0.595).round(decimals=2)
+        tensor([ 20.0200, -20.0200])
+    """
+    scale = math.pi * aperture_radius**2 / REFERENCE_WAVELENGTH
+    return scale * (depth.reciprocal() - 1 / focus_distance)  # inverse depth: infinity is a plain zero
+
+
+class ThinLensCamera(nn.Module):
+    r"""A thin lens in front of a sensor: turns metric depth into defocus, and says how finely the sensor samples.
+
+    Args:
+        focal_length: in metres.
+        aperture_diameter: diameter of the pupil in metres.
+        focus_distance: distance imaged sharply, in metres; ``inf`` is allowed. A float stays fixed; a tensor becomes
+            a learnable parameter.
+        pixel_pitch: distance between the sensor's pixels in metres.
+        depth_range: nearest and farthest depth in metres that the PSFs are prepared for. Default: from half the focus
+            distance to infinity, which is symmetric in defocus.
+
+    Shape:
+        - ``defocus(depth)``: any shape to the same shape.
+
+    Raises:
+        ValueError: if a length is not positive, or the focus distance is not beyond the focal length.
+
+    Convention:
+        - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus.
+        - The PSF is sampled with the image distance s' = 1 / (1/f - 1/z_f), not with the focal length.
+
+    Source: Goodman, Introduction to Fourier Optics, sections 5.1 and 6.4; the default lens spans the range of
+    Shah et al., TiDy-PSFs (ICCV 2023): psi from -20 at infinity to +20 at 0.2975 m.
+
+    Example:
+        >>> camera = ThinLensCamera()
+        >>> camera.defocus(torch.tensor([0.298, 0.595, float("inf")])).round(decimals=2)
+        tensor([ 19.9500,  -0.0000, -20.0200])
+        >>> round(camera.f_number, 1), round(float(camera.image_distance), 5)
+        (17.6, 0.05459)
+    """
+
+    def __init__(
+        self,
+        focal_length: float = 50e-3,
+        aperture_diameter: float = 2.835e-3,
+        focus_distance: float | Tensor = 0.595,
+        pixel_pitch: float = 8e-6,
+        depth_range: tuple[float, float] | None = None,
+    ) -> None:
+        super().__init__()
+        check_positive("focal_length", focal_length, "metres")
+        check_positive("aperture_diameter", aperture_diameter, "metres")
+        check_positive("pixel_pitch", pixel_pitch, "metres")
+        focus = float(focus_distance)
+        if not focus > focal_length:
+            raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
+        self.focal_length = focal_length
+        self.aperture_diameter = aperture_diameter
+        self.pixel_pitch = pixel_pitch
+        self.focus_distance: float | Tensor = focus
+        if isinstance(focus_distance, Tensor):
+            del self.focus_distance  # a parameter may not shadow an attribute
+            self.focus_distance = nn.Parameter(focus_distance.detach().clone())
+        if depth_range is None and math.isinf(focus):
+            raise ValueError("a camera focused at infinity needs depth_range=(near, far) in metres, got None")
+        near, far = depth_range if depth_range is not None else (focus / 2, math.inf)
+        if not 0 < near < far:
+            raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {(near, far)}")
+        self.depth_range = (near, far)
+        scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
+        # Kept as numbers: the nodes of a PSF bank stay where they are while a learnable focus moves.
+        self.defocus_range = (scale * (1 / far - 1 / focus), scale * (1 / near - 1 / focus))
+
+    @property
+    def aperture_radius(self) -> float:
+        """Radius of the pupil in metres."""
+        return self.aperture_diameter / 2
+
+    @property
+    def f_number(self) -> float:
+        """Focal length over aperture diameter."""
+        return self.focal_length / self.aperture_diameter
+
+    @property
+    def image_distance(self) -> float | Tensor:
+        """Distance from the lens to the sensor in metres, at which the focus distance is sharp."""
+        return 1 / (1 / self.focal_length - 1 / self.focus_distance)
+
+    def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
+        """Return the defocus map of a depth map. See :func:`thin_lens_defocus`.
+
+        Args:
+            depth: metres, any shape; ``inf`` is allowed.
+            check_inputs: look at the values first and refuse NaN, zero and negative depths.
+
+        Raises:
+            ValueError: if a depth is NaN or not positive.
+        """
+        if check_inputs:
+            check_depth(depth)
+        return thin_lens_defocus(depth, self.aperture_radius, self.focus_distance)
+
+    def resized(self, scale: float) -> ThinLensCamera:
+        """Return this camera for images resized by ``scale`` (0.5 halves their sides), so that PSFs keep their size.
+
+        Example:
+            >>> ThinLensCamera(pixel_pitch=8e-6).resized(0.5).pixel_pitch
+            1.6e-05
+        """
+        check_positive("scale", scale)
+        focus = self.focus_distance
+        return ThinLensCamera(
+            self.focal_length,
+            self.aperture_diameter,
+            focus.detach() if isinstance(focus, Tensor) else focus,
+            self.pixel_pitch / scale,
+            self.depth_range,
+        )
+
+    @classmethod
+    def for_scene(
+        cls,
+        depth_range: tuple[float, float],
+        defocus_range: tuple[float, float] = (-20.0, 20.0),
+        focal_length: float = 50e-3,
+        pixel_pitch: float = 8e-6,
+    ) -> ThinLensCamera:
+        r"""Choose focus and aperture so that a range of depths fills a range of defocus.
+
+        Two equations, :math:`\psi(z_{far}) = \psi_{lo}` and :math:`\psi(z_{near}) = \psi_{hi}`, give R and z_f.
+
+        Args:
+            depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
+            defocus_range: defocus at the farthest and at the nearest depth in radians, lo < hi and lo <= 0 <= hi.
+            focal_length: in metres.
+            pixel_pitch: in metres.
+
+        Raises:
+            ValueError: if a range is empty, or no lens of this focal length can do it.
+
+        Example:
+            >>> camera = ThinLensCamera.for_scene((0.5, 4.0))
+            >>> camera.defocus(torch.tensor([0.5, 4.0])).round(decimals=3)
+            tensor([ 20., -20.])
+        """
+        near, far = depth_range
+        lo, hi = defocus_range
+        if not 0 < near < far:
+            raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {depth_range}")
+        if not (lo <= 0 <= hi and lo < hi):
+            raise ValueError(f"defocus_range must be (lo, hi) with lo <= 0 <= hi and lo < hi, got {defocus_range}")
+        scale = (hi - lo) / (1 / near - 1 / far)
+        inverse_focus = 1 / far - lo / scale
+        focus = math.inf if inverse_focus == 0 else 1 / inverse_focus
+        radius = math.sqrt(scale * REFERENCE_WAVELENGTH / math.pi)
+        return cls(focal_length, 2 * radius, focus, pixel_pitch, depth_range)
+
+    def extra_repr(self) -> str:
+        """Describe the lens in a person's words."""
+        near, far = self.depth_range
+        lo, hi = self.defocus_range
+        return (
+            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {float(self.focus_distance):.4g} m, "
+            f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} m to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
+        )
+
+
+class DefocusRange(nn.Module):
+    r"""Depth that already is a normalised disparity: maps [0, 1] linearly to a range of defocus.
+
+    The data of the paper come so. The lens behind it is only needed for the size of the PSF on the sensor.
+
+    Args:
+        lo: defocus in radians that a value of 0 means.
+        hi: defocus in radians that a value of 1 means.
+        lens: aperture, image distance and pixel pitch for the PSFs. Default: :class:`ThinLensCamera`.
+
+    Raises:
+        ValueError: if ``lo`` is not below ``hi``.
+
+    Convention:
+        - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus, so 1 is nearest.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 4; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
+
+    Example:
+        >>> DefocusRange(-20, 20).defocus(torch.tensor([0.0, 0.5, 1.0]))
+        tensor([-20.,   0.,  20.])
+    """
+
+    def __init__(self, lo: float = -20.0, hi: float = 20.0, lens: ThinLensCamera | None = None) -> None:
+        super().__init__()
+        if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
+            raise ValueError(f"a defocus range must be finite with lo < hi, got lo={lo}, hi={hi}")
+        self.defocus_range = (float(lo), float(hi))
+        self.lens = ThinLensCamera() if lens is None else lens
+
+    @property
+    def aperture_radius(self) -> float:
+        """Radius of the pupil in metres."""
+        return self.lens.aperture_radius
+
+    @property
+    def image_distance(self) -> float | Tensor:
+        """Distance from the lens to the sensor in metres."""
+        return self.lens.image_distance
+
+    @property
+    def pixel_pitch(self) -> float:
+        """Distance between the sensor's pixels in metres."""
+        return self.lens.pixel_pitch
+
+    def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
+        """Return the defocus map of a normalised disparity map.
+
+        Raises:
+            ValueError: if a value is NaN or outside [0, 1].
+        """
+        if check_inputs:
+            valid = (depth >= 0) & (depth <= 1)
+            if not bool(valid.all()):
+                bad = depth[~valid][0].item()
+                raise ValueError(f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}")
+        lo, hi = self.defocus_range
+        return lo + (hi - lo) * depth
+
+    def resized(self, scale: float) -> DefocusRange:
+        """Return this camera for images resized by ``scale``, so that PSFs keep their size in the scene."""
+        return DefocusRange(*self.defocus_range, lens=self.lens.resized(scale))
+
+    def extra_repr(self) -> str:
+        """Describe the range in a person's words."""
+        lo, hi = self.defocus_range
+        return f"normalised disparity 0 to 1 means psi {lo:+.4g} to {hi:+.4g} rad"
