@@ -44,7 +44,7 @@ class DatasetTransform:
             return self.optics(sample, generator=item_generator(self.seed, self._item(sample)))
 
     def _item(self, sample: Any) -> int:
-        if callable(self.key):
+        if not isinstance(self.key, str):
             return int(self.key(sample))
         if not isinstance(sample, Mapping) or self.key not in sample:
             have = list(sample) if isinstance(sample, Mapping) else type(sample).__name__

@@ -214,7 +214,7 @@ class TiDyOptics(nn.Module):
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
-        """Defocus of the PSF bank's layers in radians: evenly spaced from one end of the camera's range to the other."""
+        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
         lo, hi = self.camera.defocus_range
         intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))

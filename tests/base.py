@@ -23,7 +23,7 @@ TOLERANCES = {
 
 
 class BaseTester:
-    """Base class of test classes; its methods are named by kind: smoke, exception, cardinality, feature, gradcheck, dynamo."""
+    """Base class of test classes. Kinds: smoke, exception, cardinality, feature, gradcheck, dynamo."""
 
     @staticmethod
     def assert_close(actual: Tensor, expected: Tensor, rtol: float | None = None, atol: float | None = None) -> None:

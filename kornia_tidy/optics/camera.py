@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_depth, check_positive
@@ -32,6 +31,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     Source: Goodman, Introduction to Fourier Optics, section 6.4.
 
     Example:
+        >>> import torch
         >>> thin_lens_defocus(torch.tensor([0.2975, float("inf")]), 1.4175e-3, 0.595).round(decimals=2)
         tensor([ 20.0200, -20.0200])
     """
@@ -65,6 +65,7 @@ class ThinLensCamera(nn.Module):
     Shah et al., TiDy-PSFs (ICCV 2023): psi from -20 at infinity to +20 at 0.2975 m.
 
     Example:
+        >>> import torch
         >>> camera = ThinLensCamera()
         >>> camera.defocus(torch.tensor([0.298, 0.595, float("inf")])).round(decimals=2)
         tensor([ 19.9500,  -0.0000, -20.0200])
@@ -172,7 +173,8 @@ class ThinLensCamera(nn.Module):
             ValueError: if a range is empty, or no lens of this focal length can do it.
 
         Example:
-            >>> camera = ThinLensCamera.for_scene((0.5, 4.0))
+            >>> import torch
+        >>> camera = ThinLensCamera.for_scene((0.5, 4.0))
             >>> camera.defocus(torch.tensor([0.5, 4.0])).round(decimals=3)
             tensor([ 20., -20.])
         """
@@ -194,7 +196,7 @@ class ThinLensCamera(nn.Module):
         lo, hi = self.defocus_range
         return (
             f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {float(self.focus_distance):.4g} m, "
-            f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} m to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
+            f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
         )
 
 
@@ -217,6 +219,7 @@ class DefocusRange(nn.Module):
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 4; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
 
     Example:
+        >>> import torch
         >>> DefocusRange(-20, 20).defocus(torch.tensor([0.0, 0.5, 1.0]))
         tensor([-20.,   0.,  20.])
     """

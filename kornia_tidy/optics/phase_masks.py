@@ -61,7 +61,7 @@ class PhaseMasks(nn.Module):
         return phase / metres_to_radians(self.material)
 
     def dispersion(self, wavelength: float) -> float:
-        """Return the factor from phase at 530 nm to phase at a wavelength in metres: colour and index of the element."""
+        """Return the factor from phase at 530 nm to phase at a wavelength in metres: colour and the element's index."""
         return metres_to_radians(self.material, wavelength) / metres_to_radians(self.material)
 
     def extra_repr(self) -> str:

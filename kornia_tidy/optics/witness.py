@@ -1,9 +1,9 @@
-r"""Theorem 1 in numbers: why an average of PSFs need not be the PSF of any single mask.
+r"""Theorem 1 in numbers: an average of PSFs need not be the PSF of any single mask.
 
 The Fourier transform of a PSF is the autocorrelation of the pupil field. Take the two points u, v of the aperture that
 are farthest apart along some direction: only one pair of points is that far apart, so for a single mask the
-autocorrelation at v - u is one unit phasor, of modulus exactly 1. An average over masks is a mean of unit phasors, whose
-modulus is below 1 unless they agree. So no single mask makes that average.
+autocorrelation at v - u is one unit phasor, of modulus exactly 1. An average over masks is a mean of unit phasors,
+whose modulus is below 1 unless they agree. So no single mask makes that average.
 """
 
 from __future__ import annotations
