@@ -1,0 +1,211 @@
+"""Dead leaves: endless procedural scenes with exact depth and the statistics of natural images."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_tidy.data.leaf_textures import paint_leaves
+
+COVERAGE = 3.0  # how many leaves lie over a pixel on average; exp(-3) = 5 % of the picture shows the background
+LARGEST_RADIUS = 0.25  # of the picture's geometric mean side
+SMALLEST_LEAF = 1.0  # px: a smaller leaf would fall between pixels
+LARGEST_SLANT = 0.08  # of the dioptre range, from a leaf's middle to its edge
+OUTLINE_POINTS = 120  # divisible by 3, 4, 5 and 6: every corner of a polygon is hit
+PEN = 0.6  # px by which cv2.fillPoly grows a shape: it fills every pixel that the outline touches
+SUBPIXEL_BITS = 4  # cv2 draws with fixed-point coordinates
+
+
+class _Leaves(NamedTuple):
+    """One entry per leaf, sorted from far to near; entry 0 is the background."""
+
+    center: NDArray[np.float64]  # (N, 2) x, y in px
+    radius: NDArray[np.float64]  # (N,) px, of the disc with the same area
+    angle: NDArray[np.float64]  # (N,) rad
+    nearness: NDArray[np.float64]  # (N,) inverse depth at the centre, 0 = far end, 1 = near end of the range
+    slant: NDArray[np.float64]  # (N, 2) change of nearness per px along x and y
+    outline: NDArray[np.float64]  # (N, OUTLINE_POINTS, 2) px
+
+
+def dead_leaves(
+    height: int,
+    width: int,
+    *,
+    depth_range: tuple[float, float] = (0.3, 10.0),
+    num_leaves: int = 3000,
+    seed: int = 0,
+) -> tuple[Tensor, Tensor]:
+    r"""Paint one dead-leaves scene: textured shapes that occlude each other, with the depth of every pixel.
+
+    Shapes (ellipses, pebbles, polygons, leaves) have radii with density :math:`\propto r^{-3}`, which gives the power
+    spectrum (:math:`1/f^2`) and the heavy-tailed gradients of natural images. Their inverse depths have density
+    :math:`\propto 1 / (b + (1 - b) u)`, where u runs from 0 at the far end to 1 at the near end and b is the share of
+    the picture that shows the background: this undoes the advantage of near leaves, so that the depth that is *seen* is
+    uniform in dioptres, and with it defocus.
+
+    Size, colour and texture do not depend on depth: besides occlusion, nothing but defocus tells how far a leaf is.
+
+    Args:
+        height: rows in pixels.
+        width: columns in pixels.
+        depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
+        num_leaves: number of shapes. They always cover the picture equally: more leaves are smaller ones.
+        seed: everything follows from it, whatever the global random state and the number of threads.
+
+    Returns:
+        The image, :math:`(3, H, W)` float32, sRGB-encoded in [0, 1], and the depth, :math:`(1, H, W)` float32, metres.
+
+    Raises:
+        ValueError: if a size or the number of leaves is not a positive integer, the seed is negative, or the depth
+            range is not 0 < near < far.
+
+    Convention:
+        - Every pixel shows one surface: nothing is anti-aliased across outlines, so an edge in depth lies exactly on
+          the edge in the image. For soft edges paint at twice the size and average the image.
+        - Leaves are planes, a third of them slanted (inverse depth is affine in x and y, as perspective has it); where
+          two cross, the nearer one is seen. The background is a plane at the far end.
+
+    Source: Matheron, Random Sets and Integral Geometry (1975); Lee, Mumford and Huang, Occlusion models for natural
+    images, IJCV 41 (2001).
+
+    Example:
+        >>> image, depth = dead_leaves(48, 64, depth_range=(0.5, float("inf")), num_leaves=200, seed=1)
+        >>> image.shape, depth.shape
+        (torch.Size([3, 48, 64]), torch.Size([1, 48, 64]))
+        >>> bool(depth.min() >= 0.5), bool(depth.isinf().any())
+        (True, True)
+    """
+    for name, value in (("height", height), ("width", width), ("num_leaves", num_leaves)):
+        if not isinstance(value, Integral) or value < 1:
+            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    near, far = depth_range
+    if not (0 < near < far and math.isfinite(near)):
+        raise ValueError(f"depth_range must be (near, far) in metres with 0 < near < far, got {depth_range}")
+    if not isinstance(seed, Integral) or seed < 0:
+        raise ValueError(f"seed must be an integer of 0 or more, got {seed!r}")
+
+    rng = np.random.default_rng(seed)
+    leaves = _scatter_leaves(height, width, num_leaves, rng)
+    index, nearness = _rasterise(height, width, leaves)
+    image = paint_leaves(index, leaves.center, leaves.radius, leaves.angle, rng)
+
+    dioptres = 1 / far + (1 / near - 1 / far) * nearness
+    depth = np.full_like(dioptres, np.inf)
+    np.divide(1.0, dioptres, out=depth, where=dioptres > 0)
+    depth = depth.astype(np.float32).clip(near, far)
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))), torch.from_numpy(depth[None])
+
+
+def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Leaves:
+    largest = max(LARGEST_RADIUS * math.sqrt(height * width), 2 * SMALLEST_LEAF)
+    smallest = _smallest_radius(height, width, count, largest)
+    radius = _radius_at(rng.random(count), height, width, smallest, largest)
+    # A leaf may lie anywhere that touches the picture, so that the border is covered like the middle.
+    center = rng.uniform(-1, 1, (count, 2)) * (np.array([width, height]) / 2 + radius[:, None])
+    center += np.array([width - 1, height - 1]) / 2
+
+    background = math.exp(-_coverage(height, width, count, smallest, largest))
+    visible_below = background ** rng.random(count)  # wanted share of the picture that lies farther than the leaf
+    nearness = np.sort((visible_below - background) / (1 - background))
+
+    angle = rng.uniform(0, 2 * math.pi, count)
+    slant = np.where(rng.random(count) < 1 / 3, rng.uniform(0, LARGEST_SLANT, count), 0.0)
+    slant = np.minimum(slant, np.minimum(nearness, 1 - nearness)) / radius  # a leaf stays inside the range ...
+    direction = rng.uniform(0, 2 * math.pi, count)
+    outline = _outlines(angle, radius, rng) + center[:, None]
+
+    middle = np.array([[(width - 1) / 2, (height - 1) / 2]])
+    frame = np.resize(np.array([[-1, -1], [width, -1], [width, height], [-1, height]], float), (1, OUTLINE_POINTS, 2))
+    return _Leaves(
+        center=np.concatenate([middle, center]),
+        radius=np.concatenate([[math.hypot(height, width) / 2], radius]),
+        angle=np.concatenate([[0.0], angle]),
+        nearness=np.concatenate([[0.0], nearness]),
+        slant=np.concatenate([np.zeros((1, 2)), slant[:, None] * np.stack([np.cos(direction), np.sin(direction)], 1)]),
+        outline=np.concatenate([frame, outline]),
+    )
+
+
+def _coverage(height: int, width: int, count: int, smallest: float, largest: float) -> float:
+    """Mean number of leaves over a pixel, if radii have density r^-3 and centres lie wherever a leaf can touch."""
+    centers = (
+        height * width * (smallest**-2 - largest**-2) / 2
+        + 2 * (height + width) * (1 / smallest - 1 / largest)
+        + 4 * math.log(largest / smallest)
+    )
+    return count * math.pi * math.log(largest / smallest) / centers
+
+
+def _smallest_radius(height: int, width: int, count: int, largest: float) -> float:
+    """The smallest radius for which ``count`` leaves give the wanted coverage, by bisection."""
+    low, high = SMALLEST_LEAF, 0.99 * largest
+    for _ in range(50):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if _coverage(height, width, count, middle, largest) > COVERAGE else (middle, high)
+    return low
+
+
+def _radius_at(
+    rank: NDArray[np.float64], height: int, width: int, smallest: float, largest: float
+) -> NDArray[np.float64]:
+    """Quantiles of the radii: density r^-3 on the picture, so r^-3 times the area from which a leaf can reach it."""
+    grid = np.geomspace(smallest, largest, 1025)
+    density = grid**-3 * (width + 2 * grid) * (height + 2 * grid)
+    share = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(grid))])
+    return np.interp(rank * share[-1], share, grid)
+
+
+def _outlines(angle: NDArray[np.float64], radius: NDArray[np.float64], rng: Generator) -> NDArray[np.float64]:
+    """Closed outlines (N, OUTLINE_POINTS, 2) around the origin; filled, each has the area of a disc of its radius."""
+    count = len(angle)
+    turn = np.linspace(0, 2 * math.pi, OUTLINE_POINTS, endpoint=False)
+    pebble = np.ones((count, OUTLINE_POINTS))
+    for wave in (2, 3, 5):
+        size = rng.normal(0, 0.22 / wave, (count, 1))
+        pebble += size * np.cos(wave * turn + rng.uniform(0, 2 * math.pi, (count, 1)))
+    sides = rng.choice([3, 4, 4, 5, 6], (count, 1))
+    polygon = 1 / np.cos(turn % (2 * math.pi / sides) - math.pi / sides)
+    kind = rng.choice(4, (count, 1), p=[0.3, 0.2, 0.2, 0.3])
+    ray = np.choose(kind, [np.ones_like(pebble), pebble.clip(0.3), polygon, np.ones_like(pebble)])
+    x, y = ray * np.cos(turn), ray * np.sin(turn)
+    leaf_half_width = np.abs(np.sin(turn)) * (1 - 0.35 * np.cos(turn))  # two sharp tips, broader towards the stem
+    y = np.where(kind == 3, 0.9 * y * leaf_half_width, y)
+    y *= np.exp(rng.uniform(-0.6, 0, (count, 1)))
+
+    area = np.abs((x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(1, keepdims=True)) / 2
+    scale = (radius[:, None] - PEN) * np.sqrt(math.pi / area)
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return np.stack([scale * (cos * x - sin * y), scale * (sin * x + cos * y)], axis=-1)
+
+
+def _rasterise(height: int, width: int, leaves: _Leaves) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Which leaf each pixel sees, and its nearness there: painted from far to near, crossing planes compared."""
+    index = np.zeros((height, width), np.int32)
+    nearness = np.full((height, width), -1.0)
+    corner = np.floor(leaves.outline.min(1)).astype(int).clip(0)
+    end = np.ceil(leaves.outline.max(1)).astype(int) + 1
+    end = np.minimum(end, [width, height])
+    points = np.rint((leaves.outline - corner[:, None]) * 2**SUBPIXEL_BITS).astype(np.int32)
+    at_corner = leaves.nearness + ((corner - leaves.center) * leaves.slant).sum(1)
+    columns, rows = np.arange(width, dtype=float), np.arange(height, dtype=float)[:, None]
+    boxes = np.concatenate([corner, end], 1).tolist()
+    for leaf, (x0, y0, x1, y1) in enumerate(boxes):
+        if x0 >= x1 or y0 >= y1:
+            continue
+        mask = np.zeros((y1 - y0, x1 - x0), np.uint8)
+        cv2.fillPoly(mask, [points[leaf]], 1, shift=SUBPIXEL_BITS)
+        slant_x, slant_y = leaves.slant[leaf]
+        plane = at_corner[leaf] + slant_x * columns[: x1 - x0] + slant_y * rows[: y1 - y0]
+        below = nearness[y0:y1, x0:x1]
+        seen = mask.view(bool) & (plane > below)
+        np.copyto(below, plane, where=seen)
+        np.copyto(index[y0:y1, x0:x1], leaf, where=seen)
+    return index, nearness.clip(0, 1)  # ... and an outline that reaches beyond its radius is held at the ends

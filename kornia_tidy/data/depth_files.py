@@ -1,0 +1,160 @@
+"""Depth files: metres with a mask of what is known, from stored depth or stored disparity."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
+from kornia_tidy.data.files import read_stored, write_bytes
+from kornia_tidy.data.pfm import encode_pfm
+
+
+class DepthMap(NamedTuple):
+    """Depth that a camera can render, and where it was measured."""
+
+    depth: Tensor
+    """(1, H, W) float32 in metres, positive everywhere; may be infinite. Holes carry their nearest known neighbour."""
+    valid: Tensor
+    """(1, H, W) bool, False in holes."""
+
+
+def read_depth(
+    path: str | os.PathLike[str],
+    scale: float = 1.0,
+    *,
+    kind: Literal["depth", "disparity"] = "depth",
+    invalid: Collection[float] = (),
+    focal_px: float | None = None,
+    baseline_m: float | None = None,
+    doffs_px: float = 0.0,
+) -> DepthMap:
+    r"""Read a depth map in metres; holes are marked, then filled from their nearest neighbour.
+
+    Stored values v are depth, :math:`z = s v`, or disparity, :math:`z = f B / (s v + d)`.
+
+    Args:
+        path: a PNG, TIFF, PGM, PFM or NPY file with one channel; an NPY file is (H, W) and is never unpickled.
+        scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres.
+        kind: what is stored.
+        invalid: stored values that mean *unknown*, besides those named below.
+        focal_px: f, focal length in pixels; disparity only.
+        baseline_m: B, distance between the two cameras in metres; disparity only.
+        doffs_px: d, difference of the principal points in pixels; disparity only.
+
+    Returns:
+        The depth and where it is valid, each :math:`(1, H, W)`.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is no image, cut short or damaged, has several channels or no valid pixel, if disparity comes
+            without calibration or depth with one, or if a number is not positive.
+
+    Convention:
+        - Always unknown: NaN, a stored integer 0 (as Kinect, KITTI and Middlebury mean it), depth of 0 or less, and
+          disparity that is infinite or, with d added, negative.
+        - Infinite depth is a valid sky, and so is a floating-point disparity that is 0 with d added. Name them in
+          ``invalid`` where a data set means *unknown* by them.
+        - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.save(f"{folder}/depth.npy", np.array([[500, 0, 0, 2000]], np.uint16))
+        ...     depth, valid = read_depth(f"{folder}/depth.npy", scale=0.001)
+        >>> depth, valid
+        (tensor([[[0.5000, 0.5000, 2.0000, 2.0000]]]), tensor([[[ True, False, False,  True]]]))
+    """
+    check_choice("kind", kind, ("depth", "disparity"))
+    check_positive("scale", scale)
+    if kind == "depth":
+        if focal_px is not None or baseline_m is not None or doffs_px:
+            raise ValueError("focal_px, baseline_m and doffs_px belong to kind='disparity', got kind='depth'")
+    elif focal_px is None or baseline_m is None:
+        raise ValueError(
+            "disparity without calibration cannot give metres: focal_px and baseline_m are needed, "
+            f"got {focal_px} and {baseline_m}"
+        )
+    else:
+        check_positive("focal_px", focal_px, "pixels")
+        check_positive("baseline_m", baseline_m, "metres")
+        if not np.isfinite(doffs_px):
+            raise ValueError(f"doffs_px must be finite pixels, got {doffs_px}")
+
+    stored = read_stored(path)
+    if stored.shape[2] != 1:
+        raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
+    stored = stored[..., 0]
+    known = stored != 0 if stored.dtype.kind in "ui" else ~np.isnan(stored)
+    for value in invalid:
+        known &= stored != value
+    metres = stored.astype(np.float64) * scale
+    if focal_px is not None and baseline_m is not None:
+        metres = _disparity_to_depth(metres + doffs_px, focal_px * baseline_m)
+    with np.errstate(over="ignore"):
+        depth = metres.astype(np.float32)
+    known &= depth > 0
+    if not known.any():
+        raise ValueError(f"cannot read {path}: it has no valid {kind} at any pixel")
+    return DepthMap(torch.from_numpy(_fill_holes(depth, known))[None], torch.from_numpy(known)[None])
+
+
+def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0) -> None:
+    """Write a depth map so that :func:`read_depth` with the same ``scale`` reads it back; whole or not at all.
+
+    Args:
+        path: ``.pfm`` keeps float32; ``.png`` keeps 16-bit multiples of ``scale``.
+        depth: :math:`(1, H, W)` in metres, positive; infinity goes into a PFM only.
+        scale: metres per stored unit; 0.001 lets a PNG hold 1 mm to 65.535 m.
+
+    Raises:
+        TypeError: if the depth is not a floating-point tensor.
+        ValueError: if its shape, a value, the scale or the suffix is not as above, or a PNG cannot hold a value.
+        FileNotFoundError: if the folder does not exist.
+    """
+    suffix = Path(path).suffix.lower()
+    check_choice("the suffix of a depth file", suffix, (".pfm", ".png"))
+    check_positive("scale", scale, "metres")
+    check_float_tensor("depth", depth, 3, "(1, H, W)")
+    if depth.shape[0] != 1 or 0 in depth.shape:
+        raise ValueError(f"depth must have shape (1, H, W), got {tuple(depth.shape)}")
+    check_depth(depth)
+    stored = depth[0].detach().double().cpu().numpy() / scale
+    if suffix == ".pfm":
+        write_bytes(path, encode_pfm(stored.astype(np.float32)))
+        return
+    units = np.rint(stored)
+    outside = (units < 1) | (units > 65535)
+    if outside.any():
+        bad = stored[outside][0] * scale
+        raise ValueError(f"a 16-bit file with scale {scale} holds {scale} to {65535 * scale:.6g} m, got {bad:.6g}")
+    write_bytes(path, cv2.imencode(suffix, units.astype(np.uint16))[1].tobytes())
+
+
+def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -> NDArray[np.float64]:
+    """Depth in metres; infinite at zero disparity, NaN (unknown) at negative and 0 (unknown) at infinite disparity."""
+    depth = np.full_like(disparity, np.nan)
+    depth[disparity == 0] = np.inf
+    with np.errstate(over="ignore"):
+        np.divide(focal_baseline, disparity, out=depth, where=disparity > 0)
+    return depth
+
+
+def _fill_holes(depth: NDArray[np.float32], known: NDArray[Any]) -> NDArray[np.float32]:
+    """Give every hole the value of its nearest known pixel."""
+    if known.all():
+        return depth
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    value_of = np.empty(label.max() + 1, np.float32)
+    value_of[label[known]] = depth[known]  # every known pixel has a label of its own
+    return value_of[label.astype(np.int32, copy=False)]

@@ -1,0 +1,113 @@
+"""Files in and out: the numbers an image file stores, whatever its format, and writes that are never left half done."""
+
+from __future__ import annotations
+
+import os
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_tidy.data.pfm import decode_pfm
+
+PNG, JPEG, NPY = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"\x93NUMPY"
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Read a whole file.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is a folder or empty.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"cannot read {path}: it is a folder")
+    if not path.exists():
+        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    data = path.read_bytes()
+    if not data:
+        raise ValueError(f"cannot read {path}: the file is empty")
+    return data
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file so that nobody ever sees half of it: under another name in the same folder, then renamed.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+        ValueError: if the path is a folder.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ValueError(f"cannot write {path}: it is a folder")
+    temporary = path.with_name(f".{uuid4().hex}.tmp")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
+    """Read the numbers a file stores, as they are: PNG, TIFF, JPEG, PGM/PPM, PFM, NPY and what else OpenCV decodes.
+
+    The format is told from the content, not from the name. An orientation written in EXIF is ignored: depth maps and
+    calibrations belong to the sensor's own grid of pixels.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (H, W, C) in the file's own data type; channels are grey or R, G, B; a fourth one, alpha, is dropped.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is a folder, empty, cut short, damaged or of no known format.
+    """
+    data = read_bytes(path)
+    try:
+        if data.startswith(NPY):
+            stored = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
+        elif data.startswith((b"PF", b"Pf")):
+            stored = decode_pfm(data)
+        else:
+            stored = _decode_with_opencv(data)
+    except (ValueError, EOFError, MemoryError, TypeError, OverflowError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    if stored.ndim == 2:
+        stored = stored[..., None]
+    if stored.ndim != 3 or 0 in stored.shape:
+        raise ValueError(f"cannot read {path}: an image has rows, columns and channels, this is {stored.shape}")
+    if stored.dtype.kind not in "uif":
+        raise ValueError(f"cannot read {path}: its values must be integers or real numbers, not {stored.dtype}")
+    return stored[..., :3] if stored.shape[2] == 4 else stored
+
+
+def _decode_with_opencv(data: bytes) -> NDArray[Any]:
+    # Some versions of OpenCV fill up what is missing at the end with grey, and say nothing. In a JPEG an end marker
+    # must follow the last start of a scan; the data of a scan cannot look like either.
+    cut_jpeg = data.startswith(JPEG) and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+    if cut_jpeg or (data.startswith(PNG) and b"IEND" not in data):
+        raise ValueError("the file is cut short")
+    logging = cv2.utils.logging
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # a bad file raises; OpenCV need not print it too
+    try:
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        decoded = None
+    finally:
+        if level != logging.LOG_LEVEL_SILENT:  # another thread may have found it silenced by this one
+            logging.setLogLevel(level)
+    if decoded is None:
+        raise ValueError("it is not an image in a known format, or it is damaged")
+    if decoded.ndim == 2:
+        return decoded
+    return decoded[..., 2::-1] if decoded.shape[2] > 2 else decoded[..., :1]  # BGR(A) to RGB, or grey with alpha

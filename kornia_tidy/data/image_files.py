@@ -1,0 +1,89 @@
+"""Image files: encoded pictures as tensors in [0, 1], and back."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
+from kornia_tidy.data.files import read_stored, write_bytes
+
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+
+
+def read_image(path: str | os.PathLike[str]) -> Tensor:
+    """Read a picture.
+
+    Args:
+        path: an 8- or 16-bit PNG, TIFF, JPEG, PGM or PPM, or a TIFF, PFM or NPY of floats that lie in [0, 1];
+            an NPY file is laid out (H, W) or (H, W, C), is never unpickled, and has its channels as R, G, B.
+
+    Returns:
+        :math:`(3, H, W)`, or :math:`(1, H, W)` if the file is grey, float32 in [0, 1], encoded as stored (as a rule
+        sRGB).
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is no image, cut short or damaged, or has other channels, types or floats outside [0, 1].
+
+    Convention:
+        Alpha is dropped. An orientation written in EXIF is ignored: a depth map of the same camera has none, and
+        calibrations belong to the sensor's own grid of pixels.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_image(f"{folder}/grey.png", torch.tensor([[[0.0, 0.2, 1.0]]]))
+        ...     read_image(f"{folder}/grey.png")
+        tensor([[[0.0000, 0.2000, 1.0000]]])
+    """
+    stored = read_stored(path)
+    channels = stored.shape[2]
+    if channels not in {1, 3}:
+        raise ValueError(f"cannot read {path}: an image has 1, 3 or 4 channels, this has {channels}")
+    if stored.dtype in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    elif stored.dtype.kind == "f":
+        if not (stored.min() >= 0 and stored.max() <= 1):  # False for NaN too
+            raise ValueError(
+                f"cannot read {path}: floats must lie in [0, 1], found {stored.min():.6g} to {stored.max():.6g}"
+            )
+        values = stored.astype(np.float32)
+    else:
+        raise ValueError(f"cannot read {path}: values must be 8- or 16-bit unsigned or floats, not {stored.dtype}")
+    return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
+
+
+def write_image(path: str | os.PathLike[str], image: Tensor, bits: int = 8) -> None:
+    """Write a picture as PNG, TIFF or JPEG, by the suffix of the path; whole or not at all.
+
+    Args:
+        path: where to; an existing file is replaced.
+        image: :math:`(3, H, W)` or :math:`(1, H, W)`, encoded, in [0, 1]; values outside are clipped.
+        bits: 8, or 16 for PNG and TIFF.
+
+    Raises:
+        TypeError: if the image is not a floating-point tensor.
+        ValueError: if its shape, a value (NaN, infinity), the bits or the suffix is not as above.
+        FileNotFoundError: if the folder does not exist.
+    """
+    suffix = Path(path).suffix.lower()
+    check_choice("the suffix of an image file", suffix, SUFFIXES)
+    check_choice(f"bits of a {suffix} file", bits, (8,) if suffix in {".jpg", ".jpeg"} else (8, 16))
+    check_float_tensor("image", image, 3, "(C, H, W)")
+    if image.shape[0] not in {1, 3} or 0 in image.shape:
+        raise ValueError(f"image must have shape (3, H, W) or (1, H, W), got {tuple(image.shape)}")
+    check_finite("image", image)
+    values = image.detach().double().cpu().clamp(0, 1).mul(2**bits - 1).round().numpy()
+    rows = np.ascontiguousarray(values.transpose(1, 2, 0)[..., ::-1].astype(np.uint8 if bits == 8 else np.uint16))
+    done, encoded = cv2.imencode(suffix, rows)
+    if not done:
+        raise ValueError(
+            f"cannot write {path}: OpenCV cannot encode an image of shape {tuple(image.shape)} as {suffix}"
+        )
+    write_bytes(path, encoded.tobytes())

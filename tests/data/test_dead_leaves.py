@@ -1,0 +1,154 @@
+"""Dead-leaves scenes: reproducible, natural in their statistics, and exact at depth edges."""
+
+from __future__ import annotations
+
+import cv2
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from kornia_tidy.data.dead_leaves import dead_leaves
+from tests.base import BaseTester
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Four 256x256 scenes from 0.3 m to infinity."""
+    return [dead_leaves(256, 256, depth_range=(0.3, float("inf")), seed=seed) for seed in range(4)]
+
+
+class TestDeadLeaves(BaseTester):
+    def test_smoke_image_is_encoded_rgb_and_depth_is_metres(self, scenes):
+        for image, depth in scenes:
+            assert image.dtype == depth.dtype == torch.float32
+            assert image.is_contiguous()
+            assert 0 <= image.min() < 0.15
+            assert 0.85 < image.max() <= 1
+            assert depth.min() >= 0.3
+
+    @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 50), (7, 3), (33, 64), (64, 33)])
+    def test_cardinality(self, height, width):
+        image, depth = dead_leaves(height, width, num_leaves=50)
+        assert image.shape == (3, height, width)
+        assert depth.shape == (1, height, width)
+
+    def test_feature_same_seed_gives_the_same_scene_whatever_the_global_state(self):
+        first = dead_leaves(96, 80, num_leaves=300, seed=5)
+        threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
+        try:
+            torch.set_num_threads(2)
+            cv2.setNumThreads(2)
+            np.random.seed(123)  # noqa: NPY002 - the legacy global state is what must not matter
+            torch.manual_seed(123)
+            second = dead_leaves(96, 80, num_leaves=300, seed=5)
+        finally:
+            torch.set_num_threads(threads)
+            cv2.setNumThreads(cv_threads)
+        assert torch.equal(first[0], second[0])
+        assert torch.equal(first[1], second[1])
+
+    def test_feature_the_global_random_state_is_left_alone(self):
+        torch.manual_seed(7)
+        state = torch.get_rng_state()
+        legacy = np.random.get_state()[1].copy()  # noqa: NPY002
+        dead_leaves(16, 16, num_leaves=20)
+        assert torch.equal(torch.get_rng_state(), state)
+        assert np.array_equal(np.random.get_state()[1], legacy)  # noqa: NPY002
+
+    def test_feature_another_seed_gives_another_scene(self):
+        first, second = dead_leaves(64, 64, num_leaves=200, seed=1), dead_leaves(64, 64, num_leaves=200, seed=2)
+        assert (first[0] != second[0]).float().mean() > 0.9
+        assert (first[1] != second[1]).float().mean() > 0.9
+
+    @pytest.mark.parametrize("num_leaves", [200, 1000])
+    def test_feature_seen_depth_is_uniform_in_dioptres(self, num_leaves):
+        """Background exp(-3) = 5 % of the pixels, then 9.5 % in each tenth of the range, however small the leaves."""
+        seen = [dead_leaves(96, 96, depth_range=(0.5, 4.0), num_leaves=num_leaves, seed=s)[1] for s in range(20)]
+        nearness = (1 / torch.stack(seen) - 1 / 4.0) / (1 / 0.5 - 1 / 4.0)
+        background = (nearness < 1e-5).float().mean()
+        share = torch.histc(nearness[nearness >= 1e-5], 10, 0, 1 + 1e-6) / nearness.numel()
+        assert 0.03 < background < 0.07
+        assert share.min() > 0.06
+        assert share.max() < 0.14
+
+    def test_feature_the_far_end_is_a_background_at_infinity(self, scenes):
+        """Every scene shows a little of it, and leaves beside it are at finite depths."""
+        for _, depth in scenes:
+            assert 0.01 < depth.isinf().float().mean() < 0.12
+            assert depth[depth.isfinite()].max() > 10
+
+    def test_feature_power_spectrum_falls_as_in_natural_images(self, scenes):
+        """Radially averaged power ~ 1 / f^2 (Field 1987; Ruderman and Bialek 1994)."""
+        window = np.hanning(256)[:, None] * np.hanning(256)
+        frequency = np.hypot(np.fft.fftfreq(256)[:, None], np.fft.fftfreq(256)[None]).ravel()
+        edges = np.geomspace(4 / 256, 0.4, 16)
+        power = np.zeros(15)
+        for image, _ in scenes:
+            luminance = np.tensordot([0.2126, 0.7152, 0.0722], image.numpy(), 1)
+            spectrum = np.abs(np.fft.fft2((luminance - luminance.mean()) * window)).ravel() ** 2
+            sums, _ = np.histogram(frequency, edges, weights=spectrum)
+            power += sums / np.histogram(frequency, edges)[0]
+        slope = np.polyfit(np.log(np.sqrt(edges[1:] * edges[:-1])), np.log(power), 1)[0]
+        assert -2.6 < slope < -1.4
+
+    def test_feature_gradients_have_heavy_tails(self, scenes):
+        """Kurtosis 3 is Gaussian; natural images lie far above (Huang and Mumford 1999: about 10 and more)."""
+        for image, _ in scenes:
+            gradient = image.mean(0).diff(dim=1)
+            gradient = gradient - gradient.mean()
+            assert (gradient**4).mean() / (gradient**2).mean() ** 2 > 8
+
+    def test_feature_image_jumps_where_depth_jumps(self, scenes):
+        """Across a depth edge the median step of the image is many times that between neighbours on one surface."""
+        for image, depth in scenes:
+            step = image.diff(dim=2).abs().amax(0)
+            jump = (1 / depth[0]).diff(dim=1).abs() > 0.05 / 0.3
+            flat = (1 / depth[0]).diff(dim=1) == 0
+            assert step[jump].median() > 5 * step[flat].median()
+
+    def test_convention_depth_is_not_mixed_at_edges(self):
+        """One leaf in front of the background: its depth, where it does not slant, is one value up to the edge."""
+        values = [dead_leaves(32, 32, num_leaves=1, seed=seed)[1].unique() for seed in range(12)]
+        flat = [depths for depths in values if len(depths) == 2]
+        assert len(flat) >= 5  # two thirds of leaves do not slant; any mixing would give dozens of values
+        assert all(depths[1] == 10 for depths in flat)
+
+    def test_feature_planes_are_affine_in_inverse_depth(self):
+        """Away from edges the second difference of 1 / z vanishes, yet some of the picture is slanted."""
+        _, depth = dead_leaves(128, 128, depth_range=(0.5, 4.0), num_leaves=40, seed=3)
+        slope = (1 / depth[0].double()).diff(dim=1)
+        assert (slope.abs() > 1e-5).float().mean() > 0.1
+        assert ((slope.diff(dim=1).abs() < 1e-6).float().mean()) > 0.85
+
+    @settings(max_examples=15, deadline=None)
+    @given(
+        st.tuples(st.integers(1, 40), st.integers(1, 40)),
+        st.integers(1, 60),
+        st.integers(0, 2**64),
+        st.floats(0.01, 10),
+        st.floats(1.01, 1e6),
+    )
+    def test_property_depth_stays_within_its_range(self, size, num_leaves, seed, near, ratio):
+        span = (near, near * ratio)
+        image, depth = dead_leaves(*size, depth_range=span, num_leaves=num_leaves, seed=seed)
+        assert bool(((image >= 0) & (image <= 1)).all())
+        assert bool(((depth >= np.float32(span[0])) & (depth <= np.float32(span[1]))).all())
+
+    @pytest.mark.parametrize(
+        ("changed", "message"),
+        [
+            ({"height": 0}, "height must be a positive integer, got 0"),
+            ({"width": 2.5}, "width must be a positive integer, got 2.5"),
+            ({"num_leaves": -3}, "num_leaves must be a positive integer, got -3"),
+            ({"seed": -1}, "seed must be an integer of 0 or more, got -1"),
+            ({"depth_range": (0.0, 1.0)}, r"0 < near < far, got \(0.0, 1.0\)"),
+            ({"depth_range": (2.0, 1.0)}, r"0 < near < far, got \(2.0, 1.0\)"),
+            ({"depth_range": (float("nan"), 1.0)}, "0 < near < far"),
+            ({"depth_range": (float("inf"), float("inf"))}, "0 < near < far"),
+        ],
+    )
+    def test_exception_names_the_bad_value(self, changed, message):
+        with pytest.raises(ValueError, match=message):
+            dead_leaves(**{"height": 8, "width": 8, **changed})

@@ -1,0 +1,203 @@
+"""Depth files: metres from depth and disparity, holes, and refusals."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from kornia_tidy.data.depth_files import _fill_holes, read_depth, write_depth
+from tests.base import BaseTester
+
+STEREO = {"kind": "disparity", "focal_px": 1000.0, "baseline_m": 0.1}
+INF, NAN = float("inf"), float("nan")
+
+
+def save(path, values, dtype):
+    np.save(path, np.array([values], dtype))
+    return path
+
+
+class TestReadDepth(BaseTester):
+    def test_feature_millimetres(self, tmp_path):
+        depth, valid = read_depth(save(tmp_path / "a.npy", [1, 1500, 65535], np.uint16), 0.001)
+        self.assert_close(depth, torch.tensor([[[0.001, 1.5, 65.535]]]), rtol=1e-6, atol=0)
+        assert valid.all()
+        assert depth.dtype == torch.float32
+        assert valid.dtype == torch.bool
+
+    def test_feature_disparity_gives_baseline_times_focal_over_disparity(self, tmp_path):
+        """Middlebury: Z = 0.1 * 1000 / (v * 0.25 + 10)."""
+        path = save(tmp_path / "a.npy", [40, 160, 360], np.uint16)
+        depth, _ = read_depth(path, 0.25, **STEREO, doffs_px=10)
+        self.assert_close(depth, torch.tensor([[[5.0, 2.0, 1.0]]]), rtol=1e-6, atol=0)
+
+    @pytest.mark.parametrize(
+        ("stored", "options", "expected"),
+        [
+            ([2, NAN, -1, 0, INF], {}, [2, None, None, None, INF]),
+            ([2, 9, INF], {"invalid": [9, INF]}, [2, None, None]),
+            ([50, 0, -5, INF, NAN, -INF], STEREO, [2, INF, None, None, None, None]),
+            ([50, 0, -5, -10, -11], {**STEREO, "doffs_px": 10}, [100 / 60, 10, 20, INF, None]),
+            ([50, 0], {**STEREO, "invalid": [0]}, [2, None]),
+        ],
+    )
+    def test_convention_floats(self, stored, options, expected, tmp_path):
+        """None stands for a hole."""
+        depth, valid = read_depth(save(tmp_path / "a.npy", stored, np.float32), **options)
+        assert valid.flatten().tolist() == [value is not None for value in expected]
+        known = torch.tensor([value for value in expected if value is not None])
+        self.assert_close(depth[valid], known, rtol=1e-6, atol=0)
+        assert bool((depth > 0).all())
+
+    @pytest.mark.parametrize(
+        ("stored_type", "stored", "options", "expected"),
+        [
+            (np.uint16, [2, 0, 65535], {"invalid": [65535]}, [2, None, None]),
+            (np.int16, [2, 0, -3], {}, [2, None, None]),
+            (np.uint8, [50, 0], {**STEREO, "doffs_px": 10}, [100 / 60, None]),
+            (np.uint16, [2, 3], {"invalid": [-1, 1e9, NAN, 2.5]}, [2, 3]),
+        ],
+    )
+    def test_convention_integer_zero_is_unknown(self, stored_type, stored, options, expected, tmp_path):
+        depth, valid = read_depth(save(tmp_path / "a.npy", stored, stored_type), **options)
+        assert valid.flatten().tolist() == [value is not None for value in expected]
+        self.assert_close(depth[valid], torch.tensor([v for v in expected if v is not None]).float(), rtol=1e-6, atol=0)
+
+    @pytest.mark.parametrize("suffix", [".png", ".tiff", ".pgm"])
+    def test_feature_16_bit_formats(self, suffix, tmp_path):
+        stored = np.random.default_rng(0).integers(1, 65536, (9, 7), dtype=np.uint16)
+        cv2.imwrite(str(tmp_path / f"a{suffix}"), stored)
+        depth, _ = read_depth(tmp_path / f"a{suffix}")
+        np.testing.assert_array_equal(depth[0], stored)
+
+    @pytest.mark.parametrize("suffix", [".pfm", ".tiff"])
+    def test_feature_float_formats(self, suffix, tmp_path):
+        stored = np.random.default_rng(0).uniform(0.1, 9, (9, 7)).astype(np.float32)
+        cv2.imwrite(str(tmp_path / f"a{suffix}"), stored)
+        depth, _ = read_depth(tmp_path / f"a{suffix}")
+        np.testing.assert_array_equal(depth[0], stored)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"kind": "inverse"}, "kind must be one of 'depth', 'disparity', got 'inverse'"),
+            ({"scale": 0.0}, "scale must be positive and finite, got 0.0"),
+            ({"scale": NAN}, "scale must be positive and finite, got nan"),
+            ({"kind": "disparity"}, "disparity without calibration cannot give metres"),
+            ({"kind": "disparity", "focal_px": 900.0}, "got 900.0 and None"),
+            ({**STEREO, "baseline_m": -0.1}, "baseline_m must be positive and finite metres, got -0.1"),
+            ({**STEREO, "focal_px": 0}, "focal_px must be positive and finite pixels, got 0"),
+            ({**STEREO, "doffs_px": INF}, "doffs_px must be finite pixels, got inf"),
+            ({"focal_px": 900.0}, "belong to kind='disparity'"),
+            ({"doffs_px": 1.0}, "belong to kind='disparity'"),
+        ],
+    )
+    def test_exception_names_the_bad_option(self, options, message, tmp_path):
+        """Before the file is looked at: there is none."""
+        with pytest.raises(ValueError, match=message):
+            read_depth(tmp_path / "none.png", **options)
+
+    @pytest.mark.parametrize(
+        ("stored", "message"),
+        [
+            (np.zeros((3, 4), np.uint16), "no valid depth at any pixel"),
+            (np.full((3, 4), NAN), "no valid depth at any pixel"),
+            (np.ones((3, 4, 3), np.uint8), "depth has one channel, this has 3"),
+            (np.ones((3, 4, 2), np.uint8), "depth has one channel, this has 2"),
+        ],
+    )
+    def test_exception_file_holds_no_depth(self, stored, message, tmp_path):
+        np.save(tmp_path / "a.npy", stored)
+        with pytest.raises(ValueError, match=f"a.npy: .*{message}"):
+            read_depth(tmp_path / "a.npy")
+
+    def test_exception_missing_empty_folder_or_text(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"none\.png"):
+            read_depth(tmp_path / "none.png")
+        with pytest.raises(ValueError, match="it is a folder"):
+            read_depth(tmp_path)
+        for name, content in (("empty.png", b""), ("text.png", b"a letter"), ("text.pfm", b"Pf this is prose")):
+            (tmp_path / name).write_bytes(content)
+            with pytest.raises(ValueError, match=name):
+                read_depth(tmp_path / name)
+
+
+class TestFillHoles(BaseTester):
+    @settings(max_examples=40, deadline=None)
+    @given(st.integers(0, 2**31), st.floats(0.002, 0.9), st.integers(1, 40), st.integers(1, 40))
+    def test_property_a_hole_takes_the_value_of_its_nearest_neighbour(self, seed, share, height, width):
+        """Against brute force: the pixel it takes its value from is at most 3 % farther than the nearest."""
+        rng = np.random.default_rng(seed)
+        known = rng.random((height, width)) < share
+        known[rng.integers(height), rng.integers(width)] = True
+        values = rng.permutation(height * width).reshape(height, width).astype(np.float32) + 1  # tells its pixel
+        filled = _fill_holes(np.where(known, values, np.float32(np.nan)), known)
+        assert np.array_equal(filled[known], values[known])
+        place = np.empty((height * width, 2))
+        place[values.astype(int).ravel() - 1] = np.indices((height, width)).reshape(2, -1).T
+        here = np.indices((height, width)).reshape(2, -1).T.astype(float)
+        taken = np.linalg.norm(here - place[filled.astype(int).ravel() - 1], axis=1)
+        nearest = np.linalg.norm(here[:, None] - here[known.ravel()][None], axis=2).min(1)
+        assert np.isin(filled, values[known]).all()
+        assert (taken <= 1.03 * nearest + 1e-9).all()
+
+    def test_feature_infinity_fills_too(self):
+        known = np.array([[True, False, False, True]])
+        filled = _fill_holes(np.array([[1, 0, 0, np.inf]], np.float32), known)
+        assert filled.tolist() == [[1, 1, INF, INF]]
+
+
+class TestWriteDepth(BaseTester):
+    def test_feature_pfm_keeps_every_bit_and_infinity(self, tmp_path):
+        depth = torch.rand(1, 6, 9) + 0.1
+        depth[0, 0, 0] = INF
+        write_depth(tmp_path / "a.pfm", depth)
+        assert torch.equal(read_depth(tmp_path / "a.pfm").depth, depth)
+
+    @pytest.mark.parametrize("scale", [0.001, 0.0002])
+    def test_feature_png_keeps_multiples_of_the_scale(self, scale, dtype, tmp_path):
+        depth = torch.randint(1, 65536, (1, 6, 9)) * scale
+        write_depth(tmp_path / "a.png", depth.to(dtype), scale)
+        self.assert_close(read_depth(tmp_path / "a.png", scale).depth, depth.float(), rtol=1e-6, atol=0)
+        assert cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint16
+
+    def test_feature_scale_of_a_pfm_is_undone_by_reading(self, tmp_path):
+        write_depth(tmp_path / "a.pfm", torch.full((1, 2, 2), 1.5), scale=0.25)
+        assert cv2.imread(str(tmp_path / "a.pfm"), cv2.IMREAD_UNCHANGED)[0, 0] == 6
+        assert read_depth(tmp_path / "a.pfm", scale=0.25).depth[0, 0, 0] == 1.5
+
+    @pytest.mark.parametrize(
+        ("name", "depth", "error", "message"),
+        [
+            ("a.tif", torch.ones(1, 2, 2), ValueError, "suffix of a depth file must be one of '.pfm', '.png'"),
+            ("a.png", torch.full((1, 2, 2), 70.0), ValueError, "holds 0.001 to 65.535 m, got 70"),
+            ("a.png", torch.full((1, 2, 2), 0.0004), ValueError, "holds 0.001 to 65.535 m, got 0.0004"),
+            ("a.png", torch.full((1, 2, 2), INF), ValueError, "holds 0.001 to 65.535 m, got inf"),
+            ("a.pfm", torch.zeros(1, 2, 2), ValueError, "depth must be positive metres, got 0.0"),
+            ("a.pfm", torch.full((1, 2, 2), NAN), ValueError, "depth must be positive metres, got nan"),
+            ("a.pfm", torch.ones(3, 2, 2), ValueError, r"\(3, 2, 2\)"),
+            ("a.pfm", torch.ones(2, 2), ValueError, r"\(2, 2\)"),
+            ("a.pfm", torch.ones(1, 2, 2).int(), TypeError, "int32"),
+            ("none/a.pfm", torch.ones(1, 2, 2), FileNotFoundError, "there is no folder"),
+        ],
+    )
+    def test_exception_names_the_bad_value(self, name, depth, error, message, tmp_path):
+        with pytest.raises(error, match=message):
+            write_depth(tmp_path / name, depth, scale=0.001)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_exception_scale_is_not_positive(self, tmp_path):
+        with pytest.raises(ValueError, match="scale must be positive and finite metres, got 0"):
+            write_depth(tmp_path / "a.png", torch.ones(1, 2, 2), scale=0)
+
+    def test_convention_top_row_stays_on_top(self, tmp_path):
+        depth = torch.tensor([[[1.0], [2.0], [math.pi]]])
+        write_depth(tmp_path / "a.pfm", depth)
+        assert torch.equal(read_depth(tmp_path / "a.pfm").depth, depth)
+        assert (tmp_path / "a.pfm").read_bytes()[-4:] == b"\x00\x00\x80\x3f"  # the file ends with the top row: 1.0

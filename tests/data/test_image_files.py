@@ -1,0 +1,225 @@
+"""Image files: exact round trips, channel order, and one clear sentence for everything that is not an image."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy.data.image_files import read_image, write_image
+from tests.base import BaseTester
+
+
+def random_image(channels: int, bits: int) -> torch.Tensor:
+    return torch.randint(0, 2**bits, (channels, 12, 17)).double() / (2**bits - 1)
+
+
+def png_bytes(*chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG put together by hand."""
+    body = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+class TestReadImage(BaseTester):
+    def test_feature_reads_a_png_typed_by_hand(self, tmp_path):
+        """2 x 1 pixels: pure red, then (0, 128, 255)."""
+        pixels = zlib.compress(b"\x00" + bytes([255, 0, 0, 0, 128, 255]))
+        header = struct.pack(">IIBBBBB", 2, 1, 8, 2, 0, 0, 0)
+        (tmp_path / "a.png").write_bytes(png_bytes((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b"")))
+        expected = torch.tensor([[[255, 0]], [[0, 128]], [[0, 255]]]) / 255
+        assert torch.equal(read_image(tmp_path / "a.png"), expected)
+
+    def test_feature_16_bit_grey_png_typed_by_hand(self, tmp_path):
+        """PNG is big-endian: 01 02 is 258."""
+        pixels = zlib.compress(b"\x00" + bytes([0x01, 0x02, 0xFF, 0xFF]))
+        header = struct.pack(">IIBBBBB", 2, 1, 16, 0, 0, 0, 0)
+        (tmp_path / "a.png").write_bytes(png_bytes((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b"")))
+        assert torch.equal(read_image(tmp_path / "a.png"), torch.tensor([[[258 / 65535, 1.0]]]))
+
+    def test_feature_alpha_is_dropped(self, tmp_path):
+        bgra = np.random.default_rng(0).integers(0, 256, (5, 4, 4), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "a.png"), bgra)
+        expected = torch.from_numpy(bgra[..., [2, 1, 0]].copy()).permute(2, 0, 1) / 255
+        self.assert_close(read_image(tmp_path / "a.png"), expected, rtol=0, atol=0)
+
+    def test_convention_exif_orientation_is_ignored(self, tmp_path):
+        """Orientation 6 asks viewers to turn by 90 degrees; rows and columns stay those of the sensor."""
+        _, jpeg = cv2.imencode(".jpg", np.full((8, 24, 3), 90, np.uint8))
+        tiff = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
+        app1 = b"Exif\0\0" + tiff
+        data = jpeg.tobytes()
+        turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(app1) + 2) + app1 + data[2:]
+        (tmp_path / "a.jpg").write_bytes(turned)
+        assert cv2.imread(str(tmp_path / "a.jpg")).shape[:2] == (24, 8)  # OpenCV by default does turn it
+        assert read_image(tmp_path / "a.jpg").shape == (3, 8, 24)
+
+    @pytest.mark.parametrize("suffix", [".npy", ".tiff", ".pfm"])
+    def test_feature_floats_are_taken_as_they_are(self, suffix, tmp_path):
+        values = np.random.default_rng(0).random((6, 5, 3)).astype(np.float32)
+        path = tmp_path / f"a{suffix}"
+        if suffix == ".npy":
+            np.save(path, values)
+        else:
+            cv2.imwrite(str(path), values[..., ::-1])
+        np.testing.assert_array_equal(read_image(path), values.transpose(2, 0, 1))
+
+    @pytest.mark.parametrize(("stored_type", "top"), [(np.uint8, 255), (np.uint16, 65535)])
+    def test_feature_integer_arrays_are_scaled(self, stored_type, top, tmp_path):
+        np.save(tmp_path / "a.npy", np.array([[0, 51, top]], stored_type))
+        self.assert_close(read_image(tmp_path / "a.npy"), torch.tensor([[[0, 51 / top, 1.0]]]), rtol=1e-6, atol=0)
+
+    @pytest.mark.parametrize(
+        ("values", "message"),
+        [
+            (np.full((2, 2), 1.5), r"floats must lie in \[0, 1\], found 1.5 to 1.5"),
+            (np.full((2, 2), np.nan), r"floats must lie in \[0, 1\], found nan"),
+            (np.zeros((2, 2), np.int32), "not int32"),
+            (np.zeros((2, 2), complex), "not complex128"),
+            (np.zeros((2, 2), bool), "not bool"),
+            (np.zeros((2, 2, 5)), "this has 5"),
+            (np.zeros(7), r"rows, columns and channels, this is \(7,\)"),
+            (np.zeros((0, 3)), "rows, columns and channels"),
+            (np.array([{"code": "never run"}]), "allow_pickle=False"),
+        ],
+    )
+    def test_exception_array_is_no_image(self, values, message, tmp_path):
+        np.save(tmp_path / "a.npy", values, allow_pickle=True)
+        with pytest.raises(ValueError, match=f"a.npy.*{message}"):
+            read_image(tmp_path / "a.npy")
+
+    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".npy", ".pfm", ".pgm"])
+    @pytest.mark.parametrize("kept", [0.995, 0.5, 0.02])
+    def test_exception_file_is_cut_short(self, suffix, kept, tmp_path, capfd):
+        path = tmp_path / f"a{suffix}"
+        grey = np.random.default_rng(0).random((40, 60)).astype(np.float32)
+        if suffix == ".npy":
+            np.save(path, grey)
+        else:
+            cv2.imwrite(str(path), grey if suffix == ".pfm" else np.rint(grey * 255).astype(np.uint8))
+        assert read_image(path).shape == (1, 40, 60)
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * kept)])
+        with pytest.raises(ValueError, match=f"cannot read .*a{suffix}: "):
+            read_image(path)
+        assert capfd.readouterr().err == ""  # libraries below stay quiet
+
+    def test_exception_jpeg_with_a_thumbnail_is_cut_short(self, tmp_path):
+        """The end marker of the thumbnail in its header does not count."""
+        data = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8))[1].tobytes()
+        small = cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))[1].tobytes()
+        whole = data[:2] + b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small + data[2:]
+        (tmp_path / "a.jpg").write_bytes(whole + b"some camera's notes")
+        assert read_image(tmp_path / "a.jpg").shape == (1, 40, 60)
+        (tmp_path / "a.jpg").write_bytes(whole[: -len(data) // 3])
+        with pytest.raises(ValueError, match="cut short"):
+            read_image(tmp_path / "a.jpg")
+
+    @pytest.mark.parametrize("content", [b"this is a letter, not a picture", b"\x89PNG\r\n\x1a\n", bytes(500), b"P"])
+    def test_exception_text_under_the_name_of_an_image(self, content, tmp_path, capfd):
+        (tmp_path / "a.png").write_bytes(content)
+        with pytest.raises(ValueError, match=r"cannot read .*a\.png: (it is not an image|the file is cut short)"):
+            read_image(tmp_path / "a.png")
+        assert capfd.readouterr().err == ""
+
+    def test_exception_missing_empty_or_folder(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"none\.png: there is no such file"):
+            read_image(tmp_path / "none.png")
+        with pytest.raises(ValueError, match="it is a folder"):
+            read_image(tmp_path)
+        (tmp_path / "empty.png").touch()
+        with pytest.raises(ValueError, match=r"empty\.png: the file is empty"):
+            read_image(tmp_path / "empty.png")
+
+    def test_feature_opencv_logs_again_after_a_bad_file(self, tmp_path):
+        before = cv2.utils.logging.getLogLevel()
+        (tmp_path / "a.png").write_bytes(b"text")
+        with pytest.raises(ValueError, match="not an image"):
+            read_image(tmp_path / "a.png")
+        assert cv2.utils.logging.getLogLevel() == before
+
+
+class TestWriteImage(BaseTester):
+    @pytest.mark.parametrize("channels", [1, 3])
+    @pytest.mark.parametrize("bits", [8, 16])
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".TIFF"])
+    def test_feature_round_trip_is_exact(self, channels, bits, suffix, dtype, tmp_path):
+        image = random_image(channels, bits)
+        write_image(tmp_path / f"a{suffix}", image.to(dtype), bits=bits)
+        self.assert_close(read_image(tmp_path / f"a{suffix}"), image.float(), rtol=0, atol=1e-7)
+
+    def test_feature_opencv_reads_what_is_written(self, tmp_path):
+        image = random_image(3, 8)
+        write_image(tmp_path / "a.png", image)
+        theirs = cv2.imread(str(tmp_path / "a.png"))
+        np.testing.assert_array_equal(theirs[..., ::-1], (image * 255).round().permute(1, 2, 0).numpy())
+
+    def test_feature_jpeg_is_close(self, tmp_path):
+        image = torch.linspace(0, 1, 64).expand(3, 48, 64).clone()
+        write_image(tmp_path / "a.jpg", image)
+        assert (read_image(tmp_path / "a.jpg") - image).abs().max() < 0.02
+
+    def test_feature_values_are_clipped_and_rounded(self, tmp_path):
+        image = torch.tensor([[[-0.2, 0.5019, 0.5, 1.7]]], requires_grad=True)
+        write_image(tmp_path / "a.png", image)
+        assert (read_image(tmp_path / "a.png") * 255).round().flatten().tolist() == [0, 128, 128, 255]
+
+    def test_feature_failure_leaves_the_old_file_and_nothing_else(self, tmp_path):
+        write_image(tmp_path / "a.png", torch.ones(1, 2, 2))
+        with pytest.raises(ValueError, match="image must be finite, got nan"):
+            write_image(tmp_path / "a.png", torch.full((1, 2, 2), float("nan")))
+        assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+        assert torch.equal(read_image(tmp_path / "a.png"), torch.ones(1, 2, 2))
+
+    def test_feature_a_crash_while_writing_leaves_the_old_file(self, tmp_path, monkeypatch):
+        write_image(tmp_path / "a.png", torch.ones(1, 2, 2))
+
+        def full_disk(self, data):
+            self.open("wb").close()
+            raise OSError("no space left")
+
+        monkeypatch.setattr("pathlib.Path.write_bytes", full_disk)
+        with pytest.raises(OSError, match="no space left"):
+            write_image(tmp_path / "a.png", torch.zeros(1, 2, 2))
+        assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+        assert torch.equal(read_image(tmp_path / "a.png"), torch.ones(1, 2, 2))
+
+    def test_feature_a_reader_of_the_old_file_keeps_it_whole(self, tmp_path):
+        """The new file takes the name only; the old content, held by a second name, is not written over."""
+        write_image(tmp_path / "a.png", torch.ones(1, 2, 2))
+        (tmp_path / "held.png").hardlink_to(tmp_path / "a.png")
+        write_image(tmp_path / "a.png", torch.zeros(1, 2, 2))
+        assert torch.equal(read_image(tmp_path / "held.png"), torch.ones(1, 2, 2))
+        assert torch.equal(read_image(tmp_path / "a.png"), torch.zeros(1, 2, 2))
+
+    @pytest.mark.parametrize(
+        ("name", "image", "options", "message"),
+        [
+            ("a.bmp", torch.zeros(1, 2, 2), {}, "suffix of an image file must be one of .*'.bmp'"),
+            ("a", torch.zeros(1, 2, 2), {}, "suffix of an image file must be one of .*''"),
+            ("a.jpg", torch.zeros(1, 2, 2), {"bits": 16}, "bits of a .jpg file must be one of 8, got 16"),
+            ("a.png", torch.zeros(1, 2, 2), {"bits": 12}, "must be one of 8, 16, got 12"),
+            ("a.png", torch.zeros(4, 2, 2), {}, r"\(4, 2, 2\)"),
+            ("a.png", torch.zeros(1, 3, 2, 2), {}, r"\(1, 3, 2, 2\)"),
+            ("a.png", torch.zeros(3, 0, 2), {}, r"\(3, 0, 2\)"),
+            ("a.png", torch.full((1, 2, 2), float("inf")), {}, "image must be finite, got inf"),
+        ],
+    )
+    def test_exception_names_the_bad_value(self, name, image, options, message, tmp_path):
+        with pytest.raises(ValueError, match=message):
+            write_image(tmp_path / name, image, **options)
+
+    def test_exception_integers_or_no_folder(self, tmp_path):
+        with pytest.raises(TypeError, match="uint8"):
+            write_image(tmp_path / "a.png", torch.zeros(1, 2, 2).byte())
+        with pytest.raises(FileNotFoundError, match=r"there is no folder .*none"):
+            write_image(tmp_path / "none" / "a.png", torch.zeros(1, 2, 2))
+
+    def test_exception_path_is_a_folder(self, tmp_path):
+        (tmp_path / "a.png").mkdir()
+        with pytest.raises(ValueError, match="it is a folder"):
+            write_image(tmp_path / "a.png", torch.zeros(1, 2, 2))
