@@ -16,10 +16,12 @@ from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
+from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
-from kornia_tidy.optics.paper import PAPER_SIZE, warn_if_aliased
+from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, adam_groups
-from kornia_tidy.optics.psf_bank import PSFBank, Pupil, enclosing_window, exact_psf_bank, paper_psf_bank
+from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
+from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.sensor.noise import SensorNoise

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
-from kornia_tidy.data.files import read_stored, write_bytes
 from kornia_tidy.data.pfm import encode_pfm
+from kornia_tidy.data.stored import read_stored
+from kornia_tidy.files import write_bytes
 
 
 class DepthMap(NamedTuple):

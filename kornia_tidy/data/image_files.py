@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
-from kornia_tidy.data.files import read_stored, write_bytes
+from kornia_tidy.data.stored import read_stored
+from kornia_tidy.files import write_bytes
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 

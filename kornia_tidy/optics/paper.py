@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 
 PAPER_SIZE = 23  # pixels of mask, pupil and PSF
@@ -81,6 +82,33 @@ def paper_psfs(
     wave = wave[..., margin : margin + PAPER_SIZE, margin : margin + PAPER_SIZE]
     intensity = wave.real.square() + wave.imag.square()
     return torch.einsum("k,dkyx->dyx", weights.to(intensity), intensity) / (pad**2 * amplitude.square().sum())
+
+
+def paper_psf_bank(
+    phase: Tensor,
+    weights: Tensor,
+    aperture: Tensor,
+    spectrum: Spectrum,
+    dispersion: Sequence[float],
+    defocus: Sequence[float],
+) -> PSFBank:
+    """Return the bank of the published discretisation; see :func:`paper_psfs`.
+
+    Raises:
+        ValueError: if mask or aperture are not 23x23.
+    """
+    if phase.shape[-1] != PAPER_SIZE or aperture.shape[-1] != PAPER_SIZE:
+        raise ValueError(
+            f"fidelity 'paper' is defined for masks and apertures of 23x23 pixels, got {phase.shape[-1]} and "
+            f"{aperture.shape[-1]}"
+        )
+    nodes = phase.new_tensor(defocus)
+    psfs = phase.new_zeros(len(defocus), len(spectrum.channel_weights), PAPER_SIZE, PAPER_SIZE)
+    for w, wavelength in enumerate(spectrum.wavelengths):
+        share = phase.new_tensor([channel[w] for channel in spectrum.channel_weights])
+        one = paper_psfs(phase, weights, aperture, nodes, wavelength, dispersion[w])
+        psfs = psfs + one[:, None] * share[:, None, None]
+    return PSFBank(psfs, nodes, psfs.sum((2, 3)))
 
 
 def warn_if_aliased(defocus_range: Sequence[float], spectrum: Spectrum) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.optics.psf_bank import pupil_field
+from kornia_tidy.optics.pupil import pupil_field
 
 _DIRECTION = (1.0, 2**-0.5 - 0.5)  # no two points of a grid have the same extent along it
 

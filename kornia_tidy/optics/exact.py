@@ -1,0 +1,91 @@
+"""PSFs of a mask sequence by exact propagation: no depth and no colour at which they alias."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.optics.propagation import pixel_energies, sensor_kernels
+from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.optics.pupil import Pupil, pupil_field
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+
+Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
+_CACHE: OrderedDict[tuple[object, ...], Tensor] = OrderedDict()
+_CACHE_BYTES = 256 * 2**20
+
+
+def exact_psf_bank(
+    phase: Tensor,
+    weights: Tensor,
+    pupil: Pupil,
+    spectrum: Spectrum,
+    dispersion: Sequence[float],
+    defocus: Sequence[float],
+    pixel_step: float | Tensor,
+    window: int,
+    tolerance: float = 2e-2,
+) -> PSFBank:
+    r"""Return the PSFs of a mask sequence with every mask pixel and sensor pixel integrated.
+
+    .. math:: h_{dc} = \sum_\lambda s_c(\lambda) \sum_k w_k h_{dk\lambda} \Big/ \sum_\lambda s_c(\lambda)
+
+    Args:
+        phase: radians at 530 nm, (K, N, N).
+        weights: share of the exposure of each mask, (K,), summing to one.
+        pupil: the aperture.
+        spectrum: wavelengths and how the channels weight them.
+        dispersion: for each wavelength, the factor from phase at 530 nm to phase there.
+        defocus: nodes in radians at 530 nm, ascending.
+        pixel_step: a sensor pixel in the pupil, pitch * R / image distance, in metres; divided by a wavelength it is
+            the pixel's side in cycles per pupil radius. May carry gradients.
+        window: side P of the PSFs in pixels, odd.
+        tolerance: error allowed to the integrals over sensor pixels, see :func:`sensor_kernels`.
+
+    Returns:
+        A bank whose PSFs sum to their energy.
+
+    Source: design of the matrix transform: Soummer et al. 2007; average over masks: Shah et al. 2023, equation 4.
+
+    Example:
+        >>> flat, pupil = torch.zeros(1, 23, 23), Pupil(torch.ones(23, 23), 0.1)
+        >>> bank = exact_psf_bank(flat, torch.ones(1), pupil, Spectrum.monochrome(), [1.0], [0.0], 2e-7, 23)
+        >>> bank.psfs.shape
+        torch.Size([1, 1, 23, 23])
+    """
+    per_channel = spectrum.channel_weights
+    psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
+    for w, wavelength in enumerate(spectrum.wavelengths):
+        kernels = _kernels(
+            tuple(p * (REFERENCE_WAVELENGTH / wavelength) for p in defocus),
+            pixel_step / wavelength,
+            (window, pupil.amplitude.shape[-1], pupil.cell_pitch, pupil.extent, tolerance),
+            phase.device,
+            torch.complex128 if phase.dtype == torch.float64 else torch.complex64,
+        )
+        light = pixel_energies(pupil_field(phase, pupil.amplitude, dispersion[w]), weights, kernels)
+        energies = light / pupil.light
+        share = phase.new_tensor([channel[w] for channel in per_channel])
+        psfs = psfs + energies[:, None] * share[:, None, None]
+    return PSFBank(psfs, phase.new_tensor(defocus), psfs.sum((2, 3)))
+
+
+def _kernels(
+    defocus: tuple[float, ...], step: float | Tensor, geometry: Geometry, device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    """Return the sensor kernels, remembered where the geometry is fixed: they depend on nothing else."""
+    if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
+        return sensor_kernels(defocus, step.double(), *geometry, device).to(dtype)
+    if torch.compiler.is_compiling():
+        return sensor_kernels(defocus, step, *geometry, device).to(dtype)
+    key = (defocus, step, geometry, device, dtype)
+    if key not in _CACHE:
+        with torch.inference_mode(False), torch.no_grad():
+            _CACHE[key] = sensor_kernels(defocus, step, *geometry, device).to(dtype)
+        while len(_CACHE) > 1 and sum(kernels.nbytes for kernels in _CACHE.values()) > _CACHE_BYTES:
+            _CACHE.popitem(last=False)
+    _CACHE.move_to_end(key)
+    return _CACHE[key]
