@@ -87,7 +87,7 @@ PRESETS = {
         "reference",
         pixel_tolerance=1e-6,
         layer_spacing=1.0,
-        enclosed_energy=0.95,
+        enclosed_energy=0.9,
         max_window=129,
         double=True,
     ),

@@ -232,31 +232,39 @@ class TiDyOptics(nn.Module):
         """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
 
         It is done on construction, after ``load_state_dict`` and when a part is swapped; masks in training keep their
-        window until this is called again.
+        window until this is called again. A window or a preset that fixes the side is only measured.
 
         Returns:
-            The side in pixels: at most ``fidelity.max_window``, whether that holds the share or not.
+            The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
         settings = self.fidelity
-        if settings.propagation == "paper":
-            window: int | None = PAPER_SIZE
-        elif settings.window is not None:
-            window = settings.window
-        else:
-            lo, hi = self.camera.defocus_range
-            nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-            window, tried = None, 33
-            while window is None:
-                tried = min(tried, settings.max_window)
-                with torch.no_grad():
-                    # The share of light in a window needs no finer integrals than this.
-                    bank = self._bank(self.spectrum, nodes, tried, 0.1, torch.float32)
-                window = enclosing_window(bank.psfs, settings.enclosed_energy)
-                if tried == settings.max_window:
-                    window = window or tried
-                tried = 2 * tried - 1
-        self._window = window
-        return window
+        fixed = PAPER_SIZE if settings.propagation == "paper" else settings.window
+        size = fixed or min(33, settings.max_window)
+        while True:
+            psfs = self._sampled_psfs(size)
+            window = fixed or enclosing_window(psfs, settings.enclosed_energy)
+            if window is not None or size == settings.max_window:
+                break
+            size = min(2 * size - 1, settings.max_window)
+        self._window = window or size
+        margin = (size - self._window) // 2
+        shares = psfs[..., margin : size - margin, margin : size - margin].sum((2, 3))
+        self._held = (float(shares.min()), float(shares.max()))
+        if window is None:
+            warnings.warn(
+                f"the largest PSF window allowed, {size} pixels, holds {self._held[0]:.0%} of the light where it should "
+                f"hold {settings.enclosed_energy:.0%}; what is outside is handled by {settings.stray_light!r}: raise "
+                f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
+                stacklevel=2,
+            )
+        return self._window
+
+    @torch.no_grad()
+    def _sampled_psfs(self, size: int) -> Tensor:
+        """PSFs at both ends of the range and at focus, good enough to see where the light goes."""
+        lo, hi = self.camera.defocus_range
+        nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
+        return self._bank(self.spectrum, nodes, size, 0.1, torch.float32).psfs
 
     # ------------------------------------------------------------------ colour
 
@@ -304,8 +312,8 @@ class TiDyOptics(nn.Module):
         settings = self.fidelity
         return (
             f"fidelity {settings.name!r}: {len(self.defocus_nodes)} {settings.layers} layers of defocus, PSF window "
-            f"{self.window}x{self.window} px ({settings.stray_light} the light outside); {self.compositing}, "
-            f"{self.border} border, {self.color_space} colour"
+            f"{self.window}x{self.window} px holding {self._held[0]:.0%} to {self._held[1]:.0%} of the light "
+            f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
         )
 
     def __setattr__(self, name: str, value: Any) -> None:

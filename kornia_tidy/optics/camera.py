@@ -85,7 +85,7 @@ class ThinLensCamera(nn.Module):
         check_positive("focal_length", focal_length, "metres")
         check_positive("aperture_diameter", aperture_diameter, "metres")
         check_positive("pixel_pitch", pixel_pitch, "metres")
-        focus = float(focus_distance)
+        focus = float(focus_distance.detach() if isinstance(focus_distance, Tensor) else focus_distance)
         if not focus > focal_length:
             raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
         self.focal_length = focal_length
@@ -194,8 +194,9 @@ class ThinLensCamera(nn.Module):
         """Describe the lens in a person's words."""
         near, far = self.depth_range
         lo, hi = self.defocus_range
+        focus = self.focus_distance.item() if isinstance(self.focus_distance, Tensor) else self.focus_distance
         return (
-            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {float(self.focus_distance):.4g} m, "
+            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {focus:.4g} m, "
             f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
         )
 
