@@ -1,1 +1,41 @@
 """Light: from phase masks and defocus to point spread functions."""
+
+from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
+from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera, thin_lens_defocus
+from kornia_tidy.optics.exact import exact_psf_bank
+from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, constant_index
+from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.paper import AliasingWarning, paper_psf_bank
+from kornia_tidy.optics.phase_masks import FresnelLens, PhaseMasks, PixelwiseMask
+from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.optics.pupil import Pupil
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
+from kornia_tidy.optics.witness import autocorrelation_witness
+
+__all__ = [
+    "FUSED_SILICA",
+    "NOA61",
+    "PDMS",
+    "PMMA",
+    "REFERENCE_WAVELENGTH",
+    "AliasingWarning",
+    "DefocusRange",
+    "DwellTimes",
+    "FresnelLens",
+    "Material",
+    "PSFBank",
+    "PhaseMasks",
+    "PixelwiseMask",
+    "Pupil",
+    "Spectrum",
+    "ThinLensCamera",
+    "annular_aperture",
+    "autocorrelation_witness",
+    "camera_spectrum",
+    "circular_aperture",
+    "constant_index",
+    "exact_psf_bank",
+    "paper_psf_bank",
+    "polygon_aperture",
+    "thin_lens_defocus",
+]

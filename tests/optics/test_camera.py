@@ -92,7 +92,7 @@ class TestThinLensCamera(BaseTester):
         ],
     )
     def test_exception_impossible_lens(self, options):
-        with pytest.raises(ValueError, match="must be|needs depth_range"):
+        with pytest.raises(ValueError, match=r"must be|needs depth_range"):
             ThinLensCamera(**options)
 
     def test_exception_for_scene_ranges(self):
