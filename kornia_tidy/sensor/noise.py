@@ -1,0 +1,232 @@
+"""What a sensor reports of a linear-light image: shot, dark and read noise, and a converter's levels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_choice, check_float_tensor, check_positive
+from kornia_tidy.sensor.shot import shot_noise
+
+
+def quantize(image: Tensor, bits: int) -> Tensor:
+    r"""Round to the levels of an analogue-to-digital converter.
+
+    .. math:: q(x) = \mathrm{round}\left( x \, (2^b - 1) \right) / (2^b - 1)
+
+    Args:
+        image: values, any shape; 1.0 is the highest level.
+        bits: bits b of the converter, 1 to 16.
+
+    Returns:
+        Rounded values, same shape and dtype. [0, 1] holds the levels 0 to 2^b - 1; values outside go on in the same
+        steps and are the caller's to clip.
+
+    Raises:
+        ValueError: if ``bits`` is not a whole number from 1 to 16.
+
+    Convention:
+        - Gradient: straight through, dq/dx = 1 everywhere.
+
+    Example:
+        >>> quantize(torch.tensor([0.0, 0.2, 0.6, 1.0, 1.2]), bits=2) * 3
+        tensor([0., 1., 2., 3., 4.])
+    """
+    _check_bits(bits)
+    value = image.to(torch.promote_types(image.dtype, torch.float32))
+    top = 2**bits - 1
+    rounded = (value.detach() * top).round() / top
+    return (rounded + (value - value.detach())).to(image.dtype)  # adds 0, and a gradient of 1
+
+
+class SensorNoise(nn.Module):
+    r"""A sensor: turns a linear-light image into what the camera reports, still in linear light.
+
+    In order, with full scale = 1.0 = ``full_well`` electrons:
+
+    1. shot noise: N = Poisson(full_well · max(image, 0) + dark), one draw for both, as Poisson draws add up to one;
+    2. full well: N is cut at ``full_well``;
+    3. black level: (N - dark) / full_well;
+    4. read noise: plus a Gaussian of standard deviation ``sigma``;
+    5. converter: rounded to ``bits``, see :func:`quantize`;
+    6. clipped to [0, 1].
+
+    Steps 1 to 3 need ``full_well``, step 5 needs ``bits``. A camera is noisy at test time too: ``eval()`` changes
+    nothing.
+
+    Args:
+        sigma: standard deviation of the read noise, in units of full scale.
+        full_well: electrons a pixel holds, which turns shot noise on. None: no shot noise.
+        dark: mean dark signal over the exposure, in electrons, below ``full_well``. Its shot noise stays in the image;
+            its mean is subtracted as a camera's black level is, so a saturated pixel reads 1 - dark / full_well.
+        bits: bits of the converter, 1 to 16. None: no rounding.
+        clip: cut at the full well and to [0, 1]. False keeps highlights above 1 (HDR) and negative noise.
+
+    Raises:
+        ValueError: if a value is out of its range, or ``dark`` is given without ``full_well``.
+
+    Shape:
+        - image: (B, C, H, W), linear light, 1.0 = full scale, float16, bfloat16, float32 or float64.
+        - Output: the same shape and dtype, computed in float32 (float64 for float64) under autocast too.
+
+    Convention:
+        - Gradients: those of :func:`shot_noise` and :func:`quantize`; zero where a value is clipped.
+
+    Source: EMVA Standard 1288, 4.0, section 2 (linear camera model); photon transfer, Janesick 2007.
+
+    Example:
+        >>> sensor = SensorNoise.physical(full_well=10500, read_noise_electrons=2.4)
+        >>> sensor(torch.full((1, 3, 4, 4), 0.5)).shape
+        torch.Size([1, 3, 4, 4])
+        >>> SensorNoise(0.0)(torch.tensor([-0.5, 0.5, 1.5]).view(1, 1, 1, 3)).flatten()
+        tensor([0.0000, 0.5000, 1.0000])
+    """
+
+    def __init__(
+        self,
+        sigma: float = 0.01,
+        *,
+        full_well: float | None = None,
+        dark: float = 0.0,
+        bits: int | None = None,
+        clip: bool = True,
+    ) -> None:
+        super().__init__()
+        _check_not_negative("sigma", sigma, "in units of full scale")
+        _check_not_negative("dark", dark, "electrons")
+        if full_well is not None:
+            check_positive("full_well", full_well, "electrons")
+            if dark >= full_well:
+                raise ValueError(f"dark must be below full_well, {full_well} electrons, got {dark}")
+        elif dark:
+            raise ValueError(f"dark needs full_well to say how many electrons full scale is, got dark = {dark} alone")
+        if bits is not None:
+            _check_bits(bits)
+        self.sigma, self.full_well, self.dark, self.bits, self.clip = sigma, full_well, dark, bits, clip
+
+    @classmethod
+    def physical(
+        cls, full_well: float, read_noise_electrons: float, dark_electrons: float = 0.0, bits: int = 12
+    ) -> SensorNoise:
+        """Return the sensor of a data sheet, all in electrons but the bits.
+
+        Args:
+            full_well: electrons a pixel holds.
+            read_noise_electrons: standard deviation of the read noise.
+            dark_electrons: mean dark signal over the exposure.
+            bits: bits of the converter, whose levels span the full well.
+
+        Raises:
+            ValueError: if a value is out of its range.
+
+        Example:
+            >>> SensorNoise.physical(full_well=10000, read_noise_electrons=5)
+            SensorNoise(read noise 0.0005 of full scale, full well 10000 electrons, 12 bits, clipped to [0, 1])
+        """
+        check_positive("full_well", full_well, "electrons")
+        _check_not_negative("read_noise_electrons", read_noise_electrons, "electrons")
+        return cls(read_noise_electrons / full_well, full_well=full_well, dark=dark_electrons, bits=bits)
+
+    def forward(
+        self, image: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return the noisy image.
+
+        Args:
+            image: (B, C, H, W), linear light, 1.0 = full scale. Negative values (FFT round-off) give no electrons.
+            params: fields of an earlier :meth:`draw`, to replay them; the way to go under ``torch.compile``.
+            generator: where random numbers come from, eager only; its device need not be the image's.
+                Without either it is the global generator of the image's device.
+
+        Raises:
+            TypeError: if the image is not a floating-point tensor.
+            ValueError: if the image is not (B, C, H, W), a field is missing or has another shape, or both ``params``
+                and ``generator`` are given.
+        """
+        check_float_tensor("image", image, 4, "(B, C, H, W)")
+        value = image.to(torch.promote_types(image.dtype, torch.float32))
+        if params is None:
+            params = self.draw(image.shape, device=image.device, generator=generator, dtype=value.dtype)
+        elif generator is not None:
+            raise ValueError("give params to replay or generator to draw, got both")
+        fields = {name: self._field(params, name, value) for name in self._field_names()}
+
+        if self.full_well is not None:
+            electrons = shot_noise(value.clamp(min=0) * self.full_well + self.dark, fields["shot"])
+            if self.clip:
+                electrons = electrons.clamp(max=self.full_well)
+            value = (electrons - self.dark) / self.full_well
+        if self.sigma > 0:
+            value = value + self.sigma * fields["read"]
+        if self.bits is not None:
+            value = quantize(value, self.bits)
+        if self.clip:
+            value = value.clamp(0, 1)
+        return value.to(image.dtype)
+
+    def draw(
+        self,
+        shape: Sequence[int],
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> dict[str, Tensor]:
+        """Return the random fields an image of this shape needs, and no others.
+
+        Args:
+            shape: the image's shape (B, C, H, W).
+            device: where the fields go. They are drawn on the generator's device: a CPU seed gives the same anywhere.
+            generator: where random numbers come from; the global generator of ``device`` without one.
+            dtype: float32 or float64.
+
+        Returns:
+            "read": standard normal, if ``sigma`` is not zero; "shot": uniform in [0, 1), if ``full_well`` is given.
+
+        Raises:
+            ValueError: if ``dtype`` is another.
+
+        Example:
+            >>> sorted(SensorNoise(0.01, full_well=1e4).draw((1, 3, 4, 4)))
+            ['read', 'shot']
+        """
+        check_choice("dtype", dtype, (torch.float32, torch.float64))
+        source = device if generator is None else generator.device
+        samplers = {"read": torch.randn, "shot": torch.rand}
+        return {
+            name: samplers[name](tuple(shape), generator=generator, device=source, dtype=dtype).to(device)
+            for name in self._field_names()
+        }
+
+    def _field_names(self) -> list[str]:
+        return ["read"] * (self.sigma > 0) + ["shot"] * (self.full_well is not None)
+
+    @staticmethod
+    def _field(params: Mapping[str, Tensor], name: str, value: Tensor) -> Tensor:
+        if name not in params:
+            raise ValueError(f"params must hold the field {name!r} as draw() returns it, got {sorted(params)}")
+        if params[name].shape != value.shape:
+            raise ValueError(
+                f"params[{name!r}] must have the image's shape {tuple(value.shape)}, got {tuple(params[name].shape)}"
+            )
+        return params[name].to(value)
+
+    def extra_repr(self) -> str:
+        """Return the sensor in words."""
+        words = [f"read noise {self.sigma:g} of full scale" if self.sigma > 0 else "no read noise"]
+        words += ["no shot noise" if self.full_well is None else f"full well {self.full_well:g} electrons"]
+        words += [f"dark signal {self.dark:g} electrons"] if self.dark else []
+        words += [] if self.bits is None else [f"{self.bits} bits"]
+        words += ["clipped to [0, 1]" if self.clip else "not clipped"]
+        return ", ".join(words)
+
+
+def _check_bits(bits: int) -> None:
+    if not isinstance(bits, int) or not 1 <= bits <= 16:
+        raise ValueError(f"bits must be a whole number from 1 to 16, got {bits}")
+
+
+def _check_not_negative(name: str, value: float, unit: str) -> None:
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"{name} must be zero or positive and finite, {unit}, got {value}")

@@ -1,0 +1,124 @@
+"""Shot noise: how many electrons arrive when so many are expected; replayable from a uniform field, differentiable."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+# Expected electrons from which a Gaussian stands for the Poisson law. Its mean and variance are right at any count;
+# what it lacks is the skew. Rounded to whole electrons it is off by 0.025 in total variation here (0.040 at 10, 0.018
+# at 50), and it falls below zero, where it is cut, with probability 3e-7 (8e-4 at 10): a bias of 3e-7 electrons.
+GAUSSIAN_FROM = 25.0
+
+_MAX_COUNT = 80  # P(more than 72 | 25 expected) is 7e-15, the tail poisson_quantile leaves out
+
+
+def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
+    r"""Return one draw of the Poisson law, chosen by ``uniform``, with a gradient for its mean.
+
+    .. math::
+        k = \begin{cases}
+            \min\{k : P(X \le k) \ge u\}, \; X \sim \mathrm{Poisson}(\lambda) & \lambda < 25 \\
+            \max(0, \lambda + \sqrt{\lambda} \, \Phi^{-1}(u)) & \lambda \ge 25
+        \end{cases}
+
+    Args:
+        electrons: expected electrons λ, any shape. Negative values (FFT round-off) count as zero.
+        uniform: uniform random numbers u in [0, 1], same shape; the same u gives the same draw.
+
+    Returns:
+        Electrons, same shape and dtype as ``electrons``, computed in float32 or wider: whole numbers below 25 expected,
+        not rounded from there on (the converter does that), never negative. λ = 0 gives exactly 0.
+
+    Raises:
+        ValueError: if the two shapes differ.
+
+    Convention:
+        - Gradient below 25: straight through, dk/dλ = 1, the derivative of the mean.
+        - Gradient from 25 on: that of the formula, 1 + Φ⁻¹(u) / (2 √λ). Zero for λ < 0 and where the draw is cut at 0.
+        - Cost: a pixel below 25 takes as many terms as the largest count drawn, in all under a microsecond of a CPU
+          core; one above takes a tenth of that.
+
+    Source: inversion by sequential search, Devroye, Non-Uniform Random Variate Generation (1986), III.2.
+
+    Example:
+        >>> shot_noise(torch.tensor([0.0, 2.0, 2.0, 900.0]), torch.tensor([0.9, 0.1, 0.9, 0.5]))
+        tensor([  0.,   0.,   4., 900.])
+    """
+    if uniform.shape != electrons.shape:
+        raise ValueError(
+            f"uniform must have the shape of electrons, {tuple(electrons.shape)}, got {tuple(uniform.shape)}"
+        )
+    rate = electrons.to(torch.promote_types(electrons.dtype, torch.float32)).clamp(min=0)
+    uniform = uniform.to(rate.dtype)
+    dim = rate < GAUSSIAN_FROM
+    draw = _dim_counts_operator if torch.compiler.is_compiling() else _dim_counts
+    counted = draw(rate.detach(), uniform.detach()) + (rate - rate.detach())  # adds 0, and a gradient of 1
+    bright = torch.where(dim, GAUSSIAN_FROM, rate)  # keeps the root's infinite slope at zero off the gradient's path
+    spread = (bright + bright.sqrt() * _normal_quantile(uniform)).clamp(min=0)
+    return torch.where(dim, counted, spread).to(electrons.dtype)
+
+
+def poisson_quantile(rate: Tensor, uniform: Tensor) -> Tensor:
+    r"""Return the smallest whole k with P(X <= k) >= u for X of the Poisson law, summed term by term.
+
+    Args:
+        rate: the mean λ in [0, 25), any shape.
+        uniform: u in [0, 1], same shape and dtype. The last 32 ``eps`` below 1 share one count, as the sum of the terms
+            is not exact to better than a few ``eps``.
+
+    Returns:
+        k, same shape and dtype. No gradient passes.
+
+    Example:
+        >>> poisson_quantile(torch.tensor([1.0, 1.0]), torch.tensor([0.36, 0.37]))  # P(X = 0) = 0.3679
+        tensor([0., 1.])
+    """
+    uniform = uniform.clamp(max=1 - 32 * torch.finfo(rate.dtype).eps)
+    term = torch.exp(-rate)
+    below = term.clone()  # P(X < k)
+    count = torch.zeros_like(rate)
+    for k in range(1, _MAX_COUNT + 1):
+        more = uniform > below
+        if not _recording(rate) and not bool(more.any()):
+            break
+        count += more
+        term *= rate
+        term /= k
+        below += term
+    return count
+
+
+def _dim_counts(rate: Tensor, uniform: Tensor) -> Tensor:
+    """Poisson counts where ``rate`` is below ``GAUSSIAN_FROM``, zero elsewhere."""
+    # float32 sums move the count of one pixel in 3e5; float64 makes replays agree between devices. Apple's has none.
+    wide = torch.float32 if rate.device.type == "mps" else torch.float64
+    dim = rate < GAUSSIAN_FROM
+    if _recording(rate):
+        every = poisson_quantile(torch.where(dim, rate, 0).to(wide), uniform.to(wide))
+        return torch.where(dim, every, 0).to(rate.dtype)
+    count = torch.zeros_like(rate)
+    count[dim] = poisson_quantile(rate[dim].to(wide), uniform[dim].to(wide)).to(rate.dtype)
+    return count
+
+
+# The same as an operator, which a compiled graph may hold: the work follows the values, and traced with all its terms
+# it costs inductor a minute and a half. Not used eagerly, as an operator's first call imports the compiler (2 s).
+_dim_counts_operator = torch.library.custom_op(
+    "kornia_tidy::dim_counts", _dim_counts, mutates_args=(), schema="(Tensor rate, Tensor uniform) -> Tensor"
+)
+_dim_counts_operator.register_fake(lambda rate, _uniform: torch.empty_like(rate))
+
+
+def _recording(tensor: Tensor) -> bool:
+    """Tell whether a CUDA graph is being recorded, when nothing may wait for values."""
+    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
+def _normal_quantile(uniform: Tensor) -> Tensor:
+    """Return Φ⁻¹(u) by erfinv, which more devices have than ndtri; finite for u = 0 and 1 too."""
+    eps = torch.finfo(uniform.dtype).eps
+    inside = uniform.clamp(eps / 4, 1 - eps / 2)  # 2u - 1 is then exact on the grid random numbers come on, and not ±1
+    return math.sqrt(2) * torch.erfinv(2 * inside - 1)
