@@ -253,7 +253,7 @@ class TiDyOptics(nn.Module):
         if window is None:
             warnings.warn(
                 f"the largest PSF window allowed, {size} pixels, holds {self._held[0]:.0%} of the light where it should "
-                f"hold {settings.enclosed_energy:.0%}; what is outside is handled by {settings.stray_light!r}: raise "
+                f"hold {settings.enclosed_energy:.0%}; the rest is handled by {settings.stray_light!r}: raise "
                 f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
                 stacklevel=2,
             )
