@@ -252,7 +252,7 @@ class TiDyOptics(nn.Module):
         self._held = (float(shares.min()), float(shares.max()))
         if window is None:
             warnings.warn(
-                f"the largest PSF window allowed, {size} pixels, holds {self._held[0]:.0%} of the light where it should "
+                f"the largest PSF window allowed, {size} px, holds {self._held[0]:.0%} of the light where it should "
                 f"hold {settings.enclosed_energy:.0%}; the rest is handled by {settings.stray_light!r}: raise "
                 f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
                 stacklevel=2,
