@@ -1,0 +1,48 @@
+# Everything a fresh machine needs: each target sets up its own environment in .venv first, once.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make demo     one picture that explains the library: outputs/demo.png"
+	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
+	@echo "make test     the tests; ARGS='-k camera' runs some of them"
+	@echo "make lint     style, spelling and types"
+	@echo "make bench    the benchmarks"
+	@echo "make clean    removes .venv, outputs and caches"
+	@echo
+	@echo "PYTHON=python3.12 chooses the interpreter (3.11 or newer) for the environment in $(VENV)."
+
+demo: $(READY)
+	@$(BIN)/kornia-tidy demo $(if $(IMAGE),--image '$(IMAGE)') $(if $(DEPTH),--depth '$(DEPTH)') $(ARGS)
+
+test: $(READY)
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: $(READY)
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/codespell
+	@$(BIN)/ty check
+
+# The usual options of pytest leave the benchmarks out.
+bench: $(READY)
+	@$(BIN)/python -m pytest -q --override-ini addopts= tests/benchmarks $(ARGS)
+
+clean:
+	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
+	find kornia_tidy tests -name __pycache__ -prune -exec rm -rf {} +
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed, $(PYTHON) is not: make PYTHON=/path/to/python3.11"; exit 1; }
+	@echo "Setting up $(VENV): some minutes and up to a few gigabytes (PyTorch), once ..."
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@

@@ -1,0 +1,1 @@
+"""The subcommands of `kornia-tidy`, one to a file: add_parser() describes it, run() does it."""

@@ -1,0 +1,173 @@
+"""Options that subcommands share: which scene, which camera, and how they become the library's objects."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.data.image_files import SUFFIXES
+from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.optics.camera import ThinLensCamera
+
+
+def add_depth_options(parser: argparse.ArgumentParser) -> None:
+    """Add what a depth file needs to become metres."""
+    group = parser.add_argument_group(
+        "depth file",
+        "Metres are stored value * scale or, for the disparity of a stereo pair,\n"
+        "baseline * focal / (stored value * scale + doffs).",
+    )
+    group.add_argument(
+        "--depth-scale",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="metres (or pixels of disparity) per stored unit; 0.001 for a 16-bit file in millimetres (default: 1)",
+    )
+    group.add_argument(
+        "--depth-kind", choices=("depth", "disparity"), default="depth", help="what is stored (default: depth)"
+    )
+    group.add_argument(
+        "--invalid",
+        type=float,
+        action="append",
+        default=[],
+        metavar="VALUE",
+        help="stored value that means 'unknown', such as inf; may be repeated. NaN and a stored integer 0 always do. "
+        "Unknown pixels take the depth of their nearest known neighbour",
+    )
+    group.add_argument(
+        "--focal-px", type=float, metavar="PX", help="disparity: focal length of the stereo pair, pixels"
+    )
+    group.add_argument("--baseline-m", type=float, metavar="M", help="disparity: distance between its cameras, metres")
+    group.add_argument(
+        "--doffs-px", type=float, default=0.0, metavar="PX", help="disparity: offset of their principal points, pixels"
+    )
+
+
+def add_camera_options(parser: argparse.ArgumentParser) -> None:
+    """Add the lens and the sensor's pixels, in SI units."""
+    group = parser.add_argument_group(
+        "camera",
+        "Lengths in metres. Defocus, in radians at the edge of an aperture of radius R, is\n"
+        "psi = pi R^2 / 530 nm * (1/depth - 1/focus): from +20 at 0.2975 m to -20 at\n"
+        "infinity for the default lens. A scene that spans less of 1/depth needs a wider\n"
+        "aperture to tell its depths apart: try --fit-depth.",
+    )
+    group.add_argument(
+        "--fit-depth",
+        action="store_true",
+        help="choose focus and aperture so that this scene's depths (its middle 99 %%) fill psi = -20 to +20",
+    )
+    group.add_argument(
+        "--focal-length", type=float, default=50e-3, metavar="M", help="longer enlarges the PSF (default: 0.05)"
+    )
+    group.add_argument(
+        "--aperture-diameter", type=float, metavar="M", help="wider blurs more out of focus (default: 0.002835, f/17.6)"
+    )
+    group.add_argument("--focus-distance", type=float, metavar="M", help="depth seen sharply (default: 0.595)")
+    group.add_argument(
+        "--depth-range",
+        type=float,
+        nargs=2,
+        metavar=("NEAR", "FAR"),
+        help="depths that PSFs are prepared for; others are clamped to its ends (default: half the focus distance "
+        "to inf)",
+    )
+    group.add_argument(
+        "--pixel-pitch",
+        type=float,
+        default=8e-6,
+        metavar="M",
+        help="smaller enlarges the PSF in pixels (default: 8e-6)",
+    )
+
+
+def seed(text: str) -> int:
+    """Return a seed that a torch.Generator takes."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"a seed must be a whole number from 0 to 2^63 - 1, got {text!r}")
+    return value
+
+
+def read_scene(args: argparse.Namespace) -> Scene:
+    """Read the image and depth named by the arguments."""
+    return read_rgbd(
+        args.image,
+        args.depth,
+        scale=args.depth_scale,
+        kind=args.depth_kind,
+        invalid=args.invalid,
+        focal_px=args.focal_px,
+        baseline_m=args.baseline_m,
+        doffs_px=args.doffs_px,
+    )
+
+
+def make_camera(args: argparse.Namespace, scene: Scene) -> ThinLensCamera:
+    """Return the camera named by the arguments, or the one that fits the scene.
+
+    Raises:
+        ValueError: if ``--fit-depth`` comes with what it is to choose, or no lens can do what is asked.
+    """
+    if not args.fit_depth:
+        given = {"aperture_diameter": args.aperture_diameter, "focus_distance": args.focus_distance}
+        return ThinLensCamera(
+            focal_length=args.focal_length,
+            pixel_pitch=args.pixel_pitch,
+            depth_range=None if args.depth_range is None else tuple(args.depth_range),
+            **{name: value for name, value in given.items() if value is not None},
+        )
+    for name in ("aperture_diameter", "focus_distance", "depth_range"):
+        if getattr(args, name) is not None:
+            raise ValueError(f"--fit-depth chooses --{name.replace('_', '-')}: give one of the two")
+    return ThinLensCamera.for_scene(
+        middle_depths(scene.depth, scene.valid), focal_length=args.focal_length, pixel_pitch=args.pixel_pitch
+    )
+
+
+def middle_depths(depth: Tensor, valid: Tensor) -> tuple[float, float]:
+    """Return the nearest and farthest depth in metres, less half a percent of the known pixels at either end.
+
+    Counted in dioptres, so that a sky at infinity is part of the scene.
+
+    Raises:
+        ValueError: if all of the scene lies at one depth, which no choice of aperture can spread over defocus.
+
+    Example:
+        >>> import torch
+        >>> middle_depths(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.tensor([[[True, True, False]]]))
+        (1.0, 2.0)
+    """
+    ends = np.quantile(1 / depth[valid].double().numpy(), (0.995, 0.005), method="nearest")
+    near, far = (float("inf") if end == 0 else float(1 / end) for end in ends)
+    if not near < far:
+        raise ValueError(f"--fit-depth needs a scene with a range of depths, this one lies at {near:.4g} m")
+    return near, far
+
+
+def check_output(path: str, *inputs: str | None, bits: int = 8) -> None:
+    """Refuse a picture's path that could not be written, or that would replace an input, before any work.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+        ValueError: if the suffix is not a picture's, cannot hold the bits, or the file is an input.
+    """
+    target = Path(path)
+    suffix = target.suffix.lower()
+    check_choice("the suffix of an image file", suffix, SUFFIXES)
+    check_choice(f"bits of a {suffix} file", bits, (8,) if suffix in {".jpg", ".jpeg"} else (8, 16))
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {target.parent}")
+    if target.is_dir():
+        raise ValueError(f"cannot write {path}: it is a folder")
+    if target.exists() and any(other and Path(other).exists() and target.samefile(other) for other in inputs):
+        raise ValueError(f"cannot write {path}: it is the input")

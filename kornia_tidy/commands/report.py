@@ -1,0 +1,81 @@
+"""What a command tells: the scene, the camera and the light in words, and how long each stage took."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+
+from torch import Tensor
+
+from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.tidy_optics import TiDyOptics
+
+
+class Stages:
+    """Times the stages of a command.
+
+    Example:
+        >>> stages = Stages()
+        >>> with stages("read"):
+        ...     pass
+        >>> stages.summary()
+        'read 0.00 s, together 0.00 s'
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Generator[None]:
+        """Time a block; blocks of one name add up."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def summary(self) -> str:
+        """Return the stages and their times in one line."""
+        parts = [f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items()]
+        return ", ".join([*parts, f"together {sum(self.seconds.values()):.2f} s"])
+
+
+def tell(topic: str, text: str) -> None:
+    """Print one line of a report, its topic in the margin."""
+    print(f"{topic:<9} {text}", flush=True)
+
+
+def scene_in_words(scene: Scene) -> str:
+    """Return size and depths of a scene."""
+    height, width = scene.image.shape[-2:]
+    colour = "RGB" if scene.image.shape[0] == 3 else "grey"
+    holes = 1 - float(scene.valid.float().mean())
+    filled = f", {100 * holes:.1f} % of it unknown and taken from the nearest known pixel" if holes else ""
+    near, far = scene.depth.aminmax()
+    return f"{width} x {height} px {colour}, depth {float(near):.4g} to {float(far):.4g} m{filled}"
+
+
+def light_in_words(bank: PSFBank, optics: TiDyOptics) -> str:
+    """Return the size of the PSF window and the share of the light that it holds, over all depths."""
+    fate = {
+        "renormalize": "the rest is given back to the window",
+        "veil": "the rest is spread over the image",
+        "discard": "the rest is lost",
+    }[optics.fidelity.stray_light]
+    names = ("red", "green", "blue") if bank.energy.shape[1] == 3 else ("530 nm",)
+    shares = [
+        f"{name} {100 * float(lo):.0f}-{100 * float(hi):.0f} %"
+        for name, lo, hi in zip(names, bank.energy.amin(0), bank.energy.amax(0), strict=True)
+    ]
+    return (
+        f"{len(bank.defocus)} depths, window {bank.window} x {bank.window} px holds {', '.join(shares)} of a point's "
+        f"light; {fate}"
+    )
+
+
+def clamped_in_words(optics: TiDyOptics, depth: Tensor) -> str:
+    """Return how many pixels of the last capture lay beyond the camera's range."""
+    count = optics.clamped_pixels
+    if not count:
+        return "no pixel lies beyond the camera's range"
+    return f"{count} of {depth.numel()} pixels ({100 * count / depth.numel():.2g} %) lie beyond the camera's range"

@@ -1,0 +1,139 @@
+"""`kornia-tidy simulate`: the capture of one picture with depth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from kornia_tidy.commands.options import (
+    add_camera_options,
+    add_depth_options,
+    check_output,
+    make_camera,
+    read_scene,
+    seed,
+)
+from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
+from kornia_tidy.data.image_files import write_image
+from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.optics.phase_masks import PixelwiseMask
+from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.tidy_optics import COLOR_SPACES, TiDyOptics
+
+DESCRIPTION = """\
+Simulate what a camera captures whose K phase masks are shown one after another
+during one exposure. The scene is a picture and a depth map of the same size.
+"""
+
+EXAMPLES = """\
+examples:
+  A Kinect frame, depth in millimetres:
+    kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 -o coded.png
+
+  A Middlebury stereo scene, with a lens chosen for its depths:
+    kornia-tidy simulate im0.png --depth disp0.pfm --depth-kind disparity \\
+        --invalid inf --focal-px 999.421 --baseline-m 0.193001 --doffs-px 32.778 \\
+        --fit-depth
+
+The first one in Python, the same but for the rounding to 8 bits:
+  import torch
+  from kornia_tidy import PixelwiseMask, TiDyOptics
+  from kornia_tidy.data.rgbd import read_rgbd
+  image, depth, valid = read_rgbd("rgb.png", "depth.png", scale=0.001)
+  optics = TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
+  coded = optics(image, depth, generator=torch.Generator().manual_seed(0))
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the command to argparse."""
+    parser = subparsers.add_parser(
+        "simulate",
+        help="picture + depth -> coded capture",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("image", metavar="IMAGE", help="picture: PNG, JPEG, TIFF, 8 or 16 bits, or NPY in [0, 1]")
+    parser.add_argument("--depth", required=True, metavar="DEPTH", help="its depth: PNG, TIFF, PFM, PGM or NPY")
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", help="PNG, TIFF or JPEG to write (default: IMAGE_coded.png, in this folder)"
+    )
+    parser.add_argument("--bits", type=int, choices=(8, 16), default=8, help="bits a sample of OUT (default: 8)")
+    add_depth_options(parser)
+    add_camera_options(parser)
+
+    masks = parser.add_argument_group("masks", "23 x 23 pixels of random height, the start of training.")
+    masks.add_argument("--masks", type=int, default=5, metavar="K", help="masks shown in one exposure (default: 5)")
+    masks.add_argument("--mask-seed", type=seed, default=0, metavar="N", help="seed of their heights (default: 0)")
+
+    capture = parser.add_argument_group("capture")
+    capture.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the sensor's noise (default: 0)")
+    capture.add_argument(
+        "--sigma",
+        type=float,
+        default=0.01,
+        metavar="S",
+        help="standard deviation of the read noise; 1 is full scale, in linear light (default: 0.01)",
+    )
+    capture.add_argument(
+        "--fidelity", choices=tuple(PRESETS), default="balanced", help="speed or accuracy (default: balanced)"
+    )
+    capture.add_argument(
+        "--compositing",
+        choices=("gather", "scatter"),
+        default="gather",
+        help="gather: each pixel collects light through its own depth's PSF, as the paper; scatter: each spreads its "
+        "light, which conserves it (default: gather)",
+    )
+    capture.add_argument(
+        "--border",
+        choices=("reflect", "replicate", "zero", "circular", "valid"),
+        default="reflect",
+        help="what lies beyond the picture; valid crops it to where all is known (default: reflect)",
+    )
+    capture.add_argument(
+        "--color-space",
+        choices=COLOR_SPACES,
+        help="srgb: decoded to linear light and encoded after; linear: is light already; paper: sRGB taken for light, "
+        "as the paper does (default: srgb; paper with --fidelity paper)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Simulate the capture and write it."""
+    output = args.output or f"{Path(args.image).stem}_coded.png"
+    check_output(output, args.image, args.depth, bits=args.bits)
+    stages = Stages()
+    with torch.no_grad():
+        with stages("read"):
+            scene = read_scene(args)
+        tell("scene", scene_in_words(scene))
+
+        with stages("PSFs"):
+            optics = TiDyOptics(
+                PixelwiseMask(args.masks, generator=torch.Generator().manual_seed(args.mask_seed)),
+                camera=make_camera(args, scene),
+                sensor=SensorNoise(args.sigma),
+                fidelity=args.fidelity,
+                compositing=args.compositing,
+                color_space=args.color_space,
+                border=args.border,
+            )
+            bank = optics.psf_bank(channels=scene.image.shape[0])
+        tell("camera", optics.camera.extra_repr())
+        tell("masks", f"{optics.masks.extra_repr()}, noise of seed {args.mask_seed}")
+        tell("PSFs", light_in_words(bank, optics))
+        tell("capture", f"{optics.compositing}, {optics.border} border, {optics.color_space} colour, {optics.sensor}")
+
+        with stages("capture"):
+            coded = optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(args.seed))
+    tell("clamped", clamped_in_words(optics, scene.depth))
+    with stages("write"):
+        write_image(output, coded, bits=args.bits)
+    tell("wrote", f"{output}, {coded.shape[-1]} x {coded.shape[-2]} px, {args.bits} bits")
+    tell("time", stages.summary())

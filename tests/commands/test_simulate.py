@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy import PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy.cli import main
+from kornia_tidy.commands.options import middle_depths
+from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.data.rgbd import read_rgbd
+from tests.base import DATA, BaseTester, needs_data
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    """A small dead-leaves scene on disk, in the folder in which the command runs."""
+    image, depth = dead_leaves(72, 80, depth_range=(0.3, math.inf), num_leaves=200, seed=3)
+    write_image(tmp_path / "image.png", image)
+    write_depth(tmp_path / "depth.pfm", depth)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class TestSimulate(BaseTester):
+    def test_smoke_writes_beside_nothing_else(self, scene, capsys):
+        assert main(["simulate", "image.png", "--depth", "depth.pfm", "--fidelity", "draft"]) == 0
+        assert {p.name for p in scene.iterdir()} == {"image.png", "depth.pfm", "image_coded.png"}
+        told = capsys.readouterr()
+        assert told.err == ""
+        for word in (
+            "80 x 72 px",
+            "f/17.6",
+            "5 learnable masks",
+            "px holds red",
+            "no pixel",
+            "together",
+        ):
+            assert word in told.out
+
+    def test_feature_five_lines_of_python_give_the_same(self, scene):
+        assert main(["simulate", "image.png", "--depth", "depth.pfm", "-o", "out.png"]) == 0
+        image, depth, _ = read_rgbd("image.png", "depth.pfm")
+        masks = PixelwiseMask(5, generator=seeded(0))
+        coded = TiDyOptics(masks)(image, depth, generator=seeded(0)).detach()
+        assert float((read_image("out.png") - coded).abs().max()) <= 0.5 / 255 + 1e-6
+        assert float((image - coded).abs().mean()) > 0.05  # it did something
+
+    @pytest.mark.filterwarnings("always")
+    def test_feature_every_option_reaches_the_camera(self, scene, capsys):
+        options = (
+            "--bits 16 --masks 2 --mask-seed 7 --seed 8 --sigma 0.02 --fidelity draft --compositing scatter "
+            "--border valid --color-space linear --focal-length 0.04 --aperture-diameter 0.002 --focus-distance 0.8 "
+            "--depth-range 0.5 8 --pixel-pitch 1e-5"
+        )
+        assert main(["simulate", "image.png", "--depth", "depth.pfm", "-o", "out.png", *options.split()]) == 0
+        assert "beyond the camera's range -6.67 to +4.45" in capsys.readouterr().err
+        image, depth, _ = read_rgbd("image.png", "depth.pfm")
+        with pytest.warns(UserWarning, match="beyond the camera's range"), torch.no_grad():
+            coded = TiDyOptics(
+                PixelwiseMask(2, generator=seeded(7)),
+                camera=ThinLensCamera(0.04, 0.002, 0.8, 1e-5, (0.5, 8.0)),
+                sensor=SensorNoise(0.02),
+                fidelity="draft",
+                compositing="scatter",
+                border="valid",
+                color_space="linear",
+            )(image, depth, generator=seeded(8))
+        self.assert_close(read_image("out.png"), coded, rtol=0, atol=0.5 / 65535 + 1e-6)
+
+    @needs_data
+    @pytest.mark.parametrize("name", ["middlebury-teddy", "nyu-fastdepth"])
+    def test_feature_five_lines_of_python_give_the_same_on_a_real_scene(self, name, tmp_path):
+        entries = json.loads((DATA / "scenes.json").read_text())
+        entry = next(e for e in entries if e["name"] == name)
+        image_path, depth_path = str(DATA / entry["image"]), str(DATA / entry["depth"])
+        invalid = [float(v) for v in str(entry["invalid"]).split(",") if v and v != "None"]
+        calibration = {k: entry[k] for k in ("focal_px", "baseline_m", "doffs_px") if k in entry}
+        options = [f"--depth-kind={entry['kind']}", f"--depth-scale={entry['scale']}"]
+        options += [f"--invalid={v}" for v in invalid]
+        options += [f"--{k.replace('_', '-')}={v}" for k, v in calibration.items()]
+        out = str(tmp_path / "out.png")
+        assert main(["simulate", image_path, "--depth", depth_path, "-o", out, "--fidelity", "draft", *options]) == 0
+
+        scene = read_rgbd(
+            image_path, depth_path, scale=entry["scale"], kind=entry["kind"], invalid=invalid, **calibration
+        )
+        masks = PixelwiseMask(5, generator=seeded(0))
+        coded = TiDyOptics(masks, fidelity="draft")(scene.image, scene.depth, generator=seeded(0)).detach()
+        assert float((read_image(out) - coded).abs().max()) <= 1 / 255
+
+    def test_feature_another_seed_gives_another_capture(self, scene):
+        command = ["simulate", "image.png", "--depth", "depth.pfm", "--fidelity", "draft"]
+        for name, option in (("a", []), ("b", ["--seed", "1"]), ("c", ["--mask-seed", "1"])):
+            assert main([*command, "-o", f"{name}.png", *option]) == 0
+        a, b, c = (read_image(f"{name}.png") for name in "abc")
+        assert not torch.equal(a, b)
+        assert not torch.equal(a, c)
+
+    def test_feature_grey_picture(self, scene):
+        write_image("grey.png", read_image("image.png")[:1])
+        assert main(["simulate", "grey.png", "--depth", "depth.pfm", "--fidelity", "draft"]) == 0
+        assert read_image("grey_coded.png").shape == (1, 72, 80)
+
+    @pytest.mark.filterwarnings("always")
+    def test_feature_fitted_camera_has_the_scene_in_its_range(self, scene, capsys):
+        depth = torch.linspace(2, 3, 72 * 80).view(1, 72, 80)
+        write_depth("far.pfm", depth)
+        assert main(["simulate", "image.png", "--depth", "far.pfm", "--fidelity", "draft", "--fit-depth"]) == 0
+        told = capsys.readouterr().out
+        assert "psi +20.00 to -20.00" in told
+        clamped = int(told.split("clamped")[1].split(" of ")[0])
+        assert 0.008 * depth.numel() <= clamped <= 0.011 * depth.numel()  # half a percent at either end
+
+    @pytest.mark.parametrize(
+        ("arguments", "sentence"),
+        [
+            ("missing.png --depth depth.pfm", "cannot read missing.png: there is no such file"),
+            ("image.png --depth missing.pfm", "cannot read missing.pfm: there is no such file"),
+            ("image.png --depth empty.png", "cannot read empty.png: the file is empty"),
+            ("image.png --depth small.pfm", "image and depth must have the same size"),
+            ("image.png --depth depth.pfm --invalid x", "invalid float value"),
+            ("image.png --depth depth.pfm --depth-kind disparity", "disparity without calibration"),
+            ("image.png --depth depth.pfm --depth-scale 0", "scale must be positive"),
+            ("image.png --depth depth.pfm --masks 0", "num_masks must be positive and finite, got 0"),
+            ("image.png --depth depth.pfm --sigma -1", "sigma must be zero or positive"),
+            ("image.png --depth depth.pfm --focal-length 0.7", "focus_distance must be beyond the focal length"),
+            ("image.png --depth depth.pfm --focus-distance inf", "needs depth_range"),
+            ("image.png --depth depth.pfm --fit-depth --focus-distance 1", "--fit-depth chooses --focus-distance"),
+            ("image.png --depth flat.pfm --fit-depth", "--fit-depth needs a scene with a range of depths"),
+            ("image.png --depth depth.pfm --fidelity paper --color-space srgb", "fidelity 'paper' means"),
+            ("image.png --depth depth.pfm --seed -1", "a seed must be a whole number from 0"),
+            ("image.png --depth depth.pfm -o out.gif", "suffix of an image file must be one of"),
+            ("image.png --depth depth.pfm -o out.jpg --bits 16", "bits of a .jpg file must be one of 8, got 16"),
+            ("image.png --depth depth.pfm -o nowhere/out.png", "there is no folder nowhere"),
+            ("image.png --depth depth.pfm -o image.png", "cannot write image.png: it is the input"),
+        ],
+    )
+    def test_exception_is_one_sentence_and_nothing_is_written(self, arguments, sentence, scene, capsys):
+        (scene / "empty.png").touch()
+        write_depth("small.pfm", torch.ones(1, 8, 8))
+        write_depth("flat.pfm", torch.ones(1, 72, 80))
+        before = {p: p.stat().st_mtime_ns for p in scene.iterdir()}
+        try:
+            status = main(["simulate", *arguments.split()])
+        except SystemExit as exit_:  # argparse's own
+            status = exit_.code
+        assert status == 2
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert "error: " in last
+        assert sentence in last
+        assert {p: p.stat().st_mtime_ns for p in scene.iterdir()} == before
+
+
+class TestMiddleDepths(BaseTester):
+    def test_feature_half_a_percent_of_outliers_does_not_count(self):
+        depth = torch.full((1, 1000), 2.0)
+        depth[0, :500] = 1.0
+        depth[0, 0], depth[0, -1] = 0.01, 1000.0
+        assert middle_depths(depth, torch.ones_like(depth, dtype=torch.bool)) == (1.0, 2.0)
+
+    def test_feature_filled_holes_do_not_count(self):
+        depth = torch.tensor([[0.1, 1.0, 2.0, 50.0]])
+        assert middle_depths(depth, torch.tensor([[False, True, True, False]])) == (1.0, 2.0)
+
+    def test_feature_a_sky_is_part_of_the_scene(self):
+        depth = torch.from_numpy(np.repeat([1.0, math.inf], 50))[None]
+        assert middle_depths(depth, depth > 0) == (1.0, math.inf)
+
+    def test_exception_one_depth(self):
+        with pytest.raises(ValueError, match="this one lies at 2 m"):
+            middle_depths(torch.full((1, 9), 2.0), torch.ones(1, 9, dtype=torch.bool))

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+import torch
+
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.figures import HEIGHT, WIDTH, depth_at, explain
+from tests.base import BaseTester
+
+QUICK = Fidelity(window=23, layer_spacing=6.67)
+
+
+def figure_of(optics, height=64, width=80, channels=3):
+    image = torch.rand(channels, height, width)
+    depth = torch.linspace(0.3, 3.0, height * width).view(1, height, width)
+    return explain(image, depth, optics, image, image)
+
+
+class TestExplain(BaseTester):
+    @pytest.mark.parametrize(("masks", "channels", "height"), [(5, 3, 64), (2, 1, 120), (7, 3, 80)])
+    def test_feature_no_text_leaves_the_picture_or_covers_another(self, masks, channels, height):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        figure = figure_of(TiDyOptics(PixelwiseMask(masks), fidelity=QUICK), height=height, channels=channels)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        texts = [t for t in figure.texts if t.get_text()]
+        for axes in figure.axes:
+            texts += [t for t in axes.get_xticklabels() if t.get_text()]
+        boxes = [(t.get_text(), t.get_window_extent(canvas.get_renderer())) for t in texts]
+        assert len(boxes) > 25
+        for text, box in boxes:
+            assert figure.bbox.contains(box.x0, box.y0), text
+            assert figure.bbox.contains(box.x1, box.y1), text
+        for i, (text, box) in enumerate(boxes):
+            for other, second in boxes[:i]:
+                assert not box.overlaps(second), (text, other)
+
+    def test_feature_all_five_masks_and_six_rows_of_psfs_are_drawn(self):
+        figure = figure_of(TiDyOptics(PixelwiseMask(5), fidelity=QUICK))
+        pictures = [axes.images[0].get_array().shape for axes in figure.axes]
+        assert sum(shape == (23, 23) for shape in pictures) == 5
+        assert sum(shape == (23, 23, 3) for shape in pictures) == 6 * 7
+        assert sum(shape[:2] == (64, 80) for shape in pictures) == 4
+        assert figure.get_size_inches().tolist() == [WIDTH, HEIGHT]
+
+    def test_feature_headers_run_from_near_to_infinity(self):
+        figure = figure_of(TiDyOptics(PixelwiseMask(2), fidelity=QUICK))
+        words = [t.get_text() for t in figure.texts]
+        depths = [w for w in words if w.endswith(" m")]
+        assert (depths[0], depths[3], depths[-1]) == ("0.3 m", "0.59 m", "∞ m")
+        assert [w for w in words if w.startswith("ψ")][0::6] == ["ψ = +20", "ψ = −20"]
+
+    def test_exception_without_matplotlib_says_what_to_install(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+        with pytest.raises(ImportError, match=r"pip install 'kornia-tidy\[plot\]'"):
+            figure_of(TiDyOptics(PixelwiseMask(2), fidelity=QUICK))
+
+    def test_exception_camera_without_metres(self):
+        with pytest.raises(TypeError, match="got DefocusRange"):
+            figure_of(TiDyOptics(PixelwiseMask(2), camera=DefocusRange(), fidelity=QUICK))
+
+
+class TestDepthAt(BaseTester):
+    @pytest.mark.parametrize("depth", [0.3, 0.595, 2.0, math.inf])
+    def test_feature_inverts_the_cameras_defocus(self, depth):
+        camera = ThinLensCamera()
+        defocus = float(camera.defocus(torch.tensor(depth, dtype=torch.float64)))
+        assert depth_at(defocus, camera) == pytest.approx(depth, rel=1e-9)
