@@ -139,9 +139,10 @@ def sensor_kernels(
         >>> sensor_kernels([0.0] * 21, 0.4, 23, 23, 0.1, 1.05, 1e-3).shape
         torch.Size([21, 23, 4, 23])
     """
-    order = gauss_legendre_order(2 * math.pi * extent * float(step), tolerance)
+    pixel = float(step.detach()) if isinstance(step, Tensor) else step
+    order = gauss_legendre_order(2 * math.pi * extent * pixel, tolerance)
     frequency = pixel_frequencies(step, window, order, device)
-    integrals = cell_integrals(defocus, frequency, float(step) * window / 2, num_cells, pitch)
+    integrals = cell_integrals(defocus, frequency, pixel * window / 2, num_cells, pitch)
     _, weights = gauss_legendre(order, device)
     scale = (weights.sqrt() * step**0.5).repeat(window)  # squared by the intensity, once for each axis
     return (integrals * scale[:, None]).unflatten(1, (window, order))
