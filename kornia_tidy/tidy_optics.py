@@ -24,6 +24,7 @@ from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.scene.compositing import render
+from kornia_tidy.scene.convolution import check_border
 from kornia_tidy.sensor.noise import SensorNoise
 
 COLOR_SPACES = ("srgb", "linear", "paper")
@@ -154,7 +155,8 @@ class TiDyOptics(nn.Module):
             if len(image) < 2 or depth is not None:
                 raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
             coded = self.capture(image[0], image[1], params, generator)
-            return type(image)([coded, self._cropped(image[1]), *image[2:]])
+            parts = (coded, self._cropped(image[1]), *image[2:])
+            return type(image)(*parts) if hasattr(image, "_fields") else type(image)(parts)
         return self.capture(image, depth, params, generator)
 
     def capture(
@@ -380,6 +382,7 @@ class TiDyOptics(nn.Module):
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
                 f"{tuple(depth.shape)}"
             )
+        check_border(self.border, *image.shape[-2:], self.window)
         if self.check_inputs and not torch.compiler.is_compiling():
             check_finite("image", image)
             self.camera.defocus(depth.detach(), check_inputs=True)
@@ -430,7 +433,8 @@ def _refit_window(optics: TiDyOptics, _: Any) -> None:
 
 
 def _any_channels(function: Any, image: Tensor) -> Tensor:
-    """Apply a function of kornia's that wants three channels to images of one."""
+    """Apply a function of kornia's that wants three channels to images of any number."""
     if image.shape[1] == 3:
         return function(image)
-    return function(image.expand(-1, 3, -1, -1))[:, :1]
+    planes = image.flatten(0, 1)[:, None]
+    return function(planes.expand(-1, 3, -1, -1))[:, 0].reshape(image.shape)

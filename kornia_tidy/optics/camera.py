@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import overload
 
+import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_depth, check_positive
@@ -36,7 +38,21 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
         tensor([ 20.0200, -20.0200])
     """
     scale = math.pi * aperture_radius**2 / REFERENCE_WAVELENGTH
-    return scale * (depth.reciprocal() - 1 / focus_distance)  # inverse depth: infinity is a plain zero
+    # Inverse depth: infinity is a plain zero.
+    return (scale * (_at_least_float32(depth).reciprocal() - 1 / _at_least_float32(focus_distance))).to(depth.dtype)
+
+
+def _number(value: float | Tensor) -> float:
+    return float(value.detach()) if isinstance(value, Tensor) else float(value)
+
+
+@overload
+def _at_least_float32(value: Tensor) -> Tensor: ...
+@overload
+def _at_least_float32(value: float | Tensor) -> float | Tensor: ...
+def _at_least_float32(value: float | Tensor) -> float | Tensor:
+    """Half precision would move the focus by a thousandth, which is up to a twentieth of a radian."""
+    return value.to(torch.promote_types(value.dtype, torch.float32)) if isinstance(value, Tensor) else value
 
 
 class ThinLensCamera(nn.Module):
@@ -85,7 +101,7 @@ class ThinLensCamera(nn.Module):
         check_positive("focal_length", focal_length, "metres")
         check_positive("aperture_diameter", aperture_diameter, "metres")
         check_positive("pixel_pitch", pixel_pitch, "metres")
-        focus = float(focus_distance.detach() if isinstance(focus_distance, Tensor) else focus_distance)
+        focus = _number(focus_distance)
         if not focus > focal_length:
             raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
         self.focal_length = focal_length
@@ -118,7 +134,7 @@ class ThinLensCamera(nn.Module):
     @property
     def image_distance(self) -> float | Tensor:
         """Distance from the lens to the sensor in metres, at which the focus distance is sharp."""
-        return 1 / (1 / self.focal_length - 1 / self.focus_distance)
+        return 1 / (1 / self.focal_length - 1 / _at_least_float32(self.focus_distance))
 
     def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
         """Return the defocus map of a depth map. See :func:`thin_lens_defocus`.
@@ -174,7 +190,7 @@ class ThinLensCamera(nn.Module):
 
         Example:
             >>> import torch
-        >>> camera = ThinLensCamera.for_scene((0.5, 4.0))
+            >>> camera = ThinLensCamera.for_scene((0.5, 4.0))
             >>> camera.defocus(torch.tensor([0.5, 4.0])).round(decimals=3)
             tensor([ 20., -20.])
         """
@@ -194,9 +210,8 @@ class ThinLensCamera(nn.Module):
         """Describe the lens in a person's words."""
         near, far = self.depth_range
         lo, hi = self.defocus_range
-        focus = self.focus_distance.item() if isinstance(self.focus_distance, Tensor) else self.focus_distance
         return (
-            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {focus:.4g} m, "
+            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {_number(self.focus_distance):.4g} m, "
             f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
         )
 
@@ -259,7 +274,7 @@ class DefocusRange(nn.Module):
                 bad = depth[~valid][0].item()
                 raise ValueError(f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}")
         lo, hi = self.defocus_range
-        return lo + (hi - lo) * depth
+        return (lo + (hi - lo) * _at_least_float32(depth)).to(depth.dtype)
 
     def resized(self, scale: float) -> DefocusRange:
         """Return this camera for images resized by ``scale``, so that PSFs keep their size in the scene."""
