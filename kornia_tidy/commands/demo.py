@@ -15,10 +15,10 @@ from tqdm import tqdm
 from kornia_tidy.commands.options import add_depth_options, middle_depths, read_scene, seed
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.data.files import write_bytes
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.figures import explain, require_matplotlib
+from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.phase_masks import PixelwiseMask
 from kornia_tidy.tidy_optics import TiDyOptics

@@ -192,4 +192,4 @@ def _chunk_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
 
 # What torch.compiler.assume_constant_result does, without the compiler it imports (2 s): NumPy is not traced through.
 for _function in (gauss_legendre_order, _gauss_legendre):
-    _function._dynamo_marked_constant = True  # ty: ignore[unresolved-attribute]
+    setattr(_function, "_dynamo_marked_constant", True)  # noqa: B010 (a function has no such attribute to a checker)
