@@ -61,7 +61,7 @@ def autocorrelation_witness(phase: Tensor, aperture: Tensor, weights: Tensor | N
     if not bool(((aperture == 0) | (aperture == 1)).all()):
         raise ValueError("the witness needs a binary aperture, got values other than 0 and 1")
     masks, size = phase.shape[0], phase.shape[-1]
-    weights = torch.full((masks,), 1 / masks) if weights is None else weights
+    weights = torch.full((masks,), 1 / masks, dtype=torch.float64) if weights is None else weights
     field = pupil_field(phase.double(), aperture, 1.0)
     # Through the PSF, as a camera would measure it: zero-padded so that no lag wraps around.
     psf = torch.fft.fft2(field, s=(2 * size, 2 * size)).abs().square()

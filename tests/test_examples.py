@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import pytest
+import torch
+
+from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data.image_files import write_image
+from tests.base import BaseTester
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+
+
+@pytest.fixture
+def example(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(EXAMPLES)  # not by file, so that a data loader's workers can import it too
+    return importlib.import_module(request.param)
+
+
+def picture(path: Path) -> torch.Tensor:
+    read = cv2.imread(str(path))
+    assert read is not None, f"{path} is not a picture"
+    return torch.from_numpy(read)
+
+
+@pytest.mark.parametrize("example", NAMES, indirect=True)
+class TestEveryExample(BaseTester):
+    def test_smoke_help_teaches(self, example, capsys):
+        with pytest.raises(SystemExit) as leaving:
+            example.main(["--help"])
+        assert leaving.value.code == 0
+        assert f"python examples/{example.__name__}.py" in capsys.readouterr().out
+
+    def test_exception_unknown_options_are_refused(self, example):
+        with pytest.raises(SystemExit):
+            example.main(["--nonsense"])
+
+
+@pytest.mark.parametrize("example", ["simulate_photo"], indirect=True)
+class TestSimulatePhoto(BaseTester):
+    def test_feature_the_made_up_scene_is_blurred(self, example, tmp_path, capsys):
+        coded = example.main(["--size", "96", "--output", str(tmp_path)])
+        before, after = picture(tmp_path / "scene.png").float(), picture(coded).float()
+        assert before.shape == after.shape == (96, 96, 3)
+        assert after.std() < before.std()
+        assert "f/17.6" in capsys.readouterr().out
+
+    def test_feature_own_files_and_a_seed_repeat_the_same_photo(self, example, tmp_path):
+        image, depth = torch.rand(3, 70, 80), torch.full((1, 70, 80), 1.25)
+        write_image(tmp_path / "image.png", image)
+        write_depth(tmp_path / "depth.png", depth, scale=0.001)
+        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.png")]
+        runs = [
+            picture(example.main([*files, "--depth-scale", "0.001", "--output", str(tmp_path / name)])) for name in "ab"
+        ]
+        assert runs[0].shape == (70, 80, 3)
+        assert torch.equal(*runs)
+
+    def test_feature_a_scene_too_near_for_the_default_lens_gets_its_own(self, example):
+        camera = example.camera_for(torch.tensor([0.1, 0.3]))
+        self.assert_close(camera.defocus(torch.tensor([0.1, 0.3])), torch.tensor([20.0, -20.0]), atol=1e-3)
+
+    def test_exception_image_and_depth_go_together(self, example, capsys):
+        with pytest.raises(SystemExit):
+            example.main(["--image", "a.png"])
+        assert "go together" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+@pytest.mark.parametrize("example", ["dataloader_transform"], indirect=True)
+class TestDataLoaderTransform(BaseTester):
+    @pytest.mark.parametrize("workers", ["0", "2"])
+    def test_feature_workers_give_the_same_bits(self, example, workers, capsys):
+        batches = example.main(["--items", "3", "--size", "64", "--batch", "2", "--workers", workers])
+        assert [tuple(batch.shape) for batch in batches] == [(2, 3, 64, 64), (1, 3, 64, 64)]
+        out = capsys.readouterr().out
+        assert "bit for bit the same: True" in out
+        assert "gradients: False" in out
+
+
+@pytest.mark.parametrize("example", ["learn_point_psf"], indirect=True)
+class TestLearnPointPSF(BaseTester):
+    def test_feature_learnt_masks_beat_a_plain_lens(self, example, tmp_path):
+        lens = example.TiDyOptics(example.PixelwiseMask(1, initial="flat"), fidelity=example.FIDELITY)
+        plain = float(example.point_error(lens).detach())
+        finals = example.main(["--masks", "1", "2", "--trials", "2", "--iterations", "60", "--output", str(tmp_path)])
+        assert sorted(finals) == [1, 2]
+        assert max(error for errors in finals.values() for error in errors) < plain
+        assert picture(tmp_path / "learn_point_psf.png").float().std() > 20
+
+    def test_feature_the_error_is_the_squared_distance_to_the_impulse(self, example):
+        optics = example.TiDyOptics(example.PixelwiseMask(2), fidelity=example.FIDELITY)
+        psfs = optics.psf_bank(channels=1).psfs
+        impulse = torch.zeros_like(psfs)
+        impulse[..., 11, 11] = 1
+        self.assert_close(example.point_error(optics), (psfs - impulse).square().sum((1, 2, 3)).mean())
+
+
+@pytest.mark.parametrize("example", ["nonconvex_psfs"], indirect=True)
+class TestNonconvexPSFs(BaseTester):
+    def test_feature_only_single_masks_reach_one(self, example, tmp_path):
+        witnesses = example.main(["--masks", "3", "--sets", "20", "--output", str(tmp_path)])
+        assert (witnesses[1] - 1).abs().max() < 1e-9
+        assert max(witnesses[2].max(), witnesses[3].max()) < 1
+        assert picture(tmp_path / "nonconvex_psfs.png").float().std() > 20
