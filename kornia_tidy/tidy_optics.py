@@ -377,6 +377,8 @@ class TiDyOptics(nn.Module):
         if not batched:
             image, depth = image[None], depth[None]
         self._spectrum(image.shape[1])
+        if image.numel() == 0:
+            raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
         if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
             raise ValueError(
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "

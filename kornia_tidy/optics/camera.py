@@ -62,7 +62,7 @@ class ThinLensCamera(nn.Module):
         focal_length: in metres.
         aperture_diameter: diameter of the pupil in metres.
         focus_distance: distance imaged sharply, in metres; ``inf`` is allowed. A float stays fixed; a tensor becomes
-            a learnable parameter.
+            a learnable parameter (and a capture no longer compiles to a single graph, as its sampling follows it).
         pixel_pitch: distance between the sensor's pixels in metres.
         depth_range: nearest and farthest depth in metres that the PSFs are prepared for. Default: from half the focus
             distance to infinity, which is symmetric in defocus.
