@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -15,6 +17,7 @@ from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
+from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
@@ -126,6 +129,7 @@ class TiDyOptics(nn.Module):
         self.check_inputs = check_inputs
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
         self._clamped: Tensor | None = None
+        self._memory = BankMemory()
         self._warned = False
         if paper:
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
@@ -173,7 +177,7 @@ class TiDyOptics(nn.Module):
             light = self.decode(image.to(dtype))
             defocus = self.camera.defocus(depth.to(dtype), check_inputs=False)
             self._count_clamped(defocus)
-            bank = self.psf_bank(channels=image.shape[1], dtype=dtype)
+            bank = self.psf_bank(image.shape[1], dtype, self._present_nodes(defocus))
             light = render(
                 light,
                 defocus,
@@ -204,16 +208,36 @@ class TiDyOptics(nn.Module):
         sensor = cast("SensorNoise", self.sensor)
         return sensor.draw(shape, device=image.device, dtype=self._compute_dtype(image), generator=generator)
 
-    def psf_bank(self, channels: int | None = None, dtype: torch.dtype | None = None) -> PSFBank:
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+    ) -> PSFBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
+
+        Without gradients, PSFs are remembered while masks and camera stay as they are.
 
         Args:
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
             dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
+            defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
         """
         spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
         dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
-        bank = self._bank(spectrum, self.defocus_nodes, self.window, self.fidelity.pixel_tolerance, dtype)
+        nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+        states, weights = self.modulator(self.masks.phase.to(dtype))
+        step = self._pixel_step()
+        tolerance = self.fidelity.pixel_tolerance
+        build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
+        learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
+        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
+            bank = build(nodes)
+        else:
+            dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
+            paper = self.fidelity.propagation == "paper"
+            setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
+            bank = self._memory.recall(setting, states, weights, nodes, build)
         return bank.with_stray_light(self.fidelity.stray_light)
 
     @property
@@ -266,7 +290,8 @@ class TiDyOptics(nn.Module):
         """PSFs at both ends of the range and at focus, good enough to see where the light goes."""
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-        return self._bank(self.spectrum, nodes, size, 0.1, torch.float32).psfs
+        states, weights = self.modulator(self.masks.phase.to(torch.float32))
+        return self._build(states, weights, self.spectrum, self._pixel_step(), size, 0.1, nodes).psfs
 
     # ------------------------------------------------------------------ colour
 
@@ -326,7 +351,7 @@ class TiDyOptics(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: nothing of the last capture."""
-        return {**super().__getstate__(), "_clamped": None}
+        return {**super().__getstate__(), "_clamped": None, "_memory": BankMemory()}
 
     # ------------------------------------------------------------------ inside
 
@@ -345,15 +370,36 @@ class TiDyOptics(nn.Module):
             pupil = self.__dict__["_pupil"] = Pupil(amplitude, MASK_SPAN / amplitude.shape[-1])
         return pupil
 
-    def _bank(
-        self, spectrum: Spectrum, nodes: tuple[float, ...], window: int, tolerance: float, dtype: torch.dtype
+    def _build(
+        self,
+        states: Tensor,
+        weights: Tensor,
+        spectrum: Spectrum,
+        step: float | Tensor,
+        window: int,
+        tolerance: float,
+        nodes: tuple[float, ...],
     ) -> PSFBank:
-        phase, weights = self.modulator(self.masks.phase.to(dtype))
         dispersion = [self.masks.dispersion(w) for w in spectrum.wavelengths]
         if self.fidelity.propagation == "paper":
-            return paper_psf_bank(phase, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
-        step = self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
-        return exact_psf_bank(phase, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
+            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
+        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
+
+    def _pixel_step(self) -> float | Tensor:
+        """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
+        return self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
+
+    def _present_nodes(self, defocus: Tensor) -> tuple[float, ...]:
+        """The nodes that this defocus map lies between: PSFs of other depths are not computed."""
+        nodes = self.defocus_nodes
+        if torch.compiler.is_compiling():
+            return nodes
+        lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
+        # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
+        extra = int(defocus.requires_grad)
+        first = max(0, bisect_right(nodes, lowest) - 1 - extra)
+        last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
+        return nodes[min(first, last) : last + 1]
 
     def _spectrum(self, channels: int) -> Spectrum:
         if channels == len(self.spectrum.weights):

@@ -14,7 +14,7 @@ from kornia_tidy.optics.pupil import Pupil, pupil_field
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
-_CACHE: OrderedDict[tuple[object, ...], Tensor] = OrderedDict()
+_CACHE: OrderedDict[tuple[float, float, Geometry, torch.device, torch.dtype], Tensor] = OrderedDict()
 _CACHE_BYTES = 256 * 2**20
 
 
@@ -81,11 +81,15 @@ def _kernels(
         return sensor_kernels(defocus, step.double(), *geometry, device).to(dtype)
     if torch.compiler.is_compiling():
         return sensor_kernels(defocus, step, *geometry, device).to(dtype)
-    key = (defocus, step, geometry, device, dtype)
-    if key not in _CACHE:
+    keys = [(psi, step, geometry, device, dtype) for psi in defocus]
+    missing = [key for key in keys if key not in _CACHE]
+    if missing:
         with torch.inference_mode(False), torch.no_grad():
-            _CACHE[key] = sensor_kernels(defocus, step, *geometry, device).to(dtype)
-        while len(_CACHE) > 1 and sum(kernels.nbytes for kernels in _CACHE.values()) > _CACHE_BYTES:
-            _CACHE.popitem(last=False)
-    _CACHE.move_to_end(key)
-    return _CACHE[key]
+            made = sensor_kernels([key[0] for key in missing], step, *geometry, device).to(dtype)
+        _CACHE.update(zip(missing, made.unbind(), strict=True))
+    for key in keys:
+        _CACHE.move_to_end(key)
+    kernels = torch.stack([_CACHE[key] for key in keys])
+    while len(_CACHE) * _CACHE[keys[-1]].nbytes > _CACHE_BYTES and len(_CACHE) > len(keys):
+        _CACHE.popitem(last=False)
+    return kernels
