@@ -17,8 +17,9 @@ class Fidelity:
             discretisation (one FFT on the 23x23 pupil, point samples), which wraps light around beyond psi = 14.7.
         pixel_tolerance: error allowed to the integral over a sensor pixel of the finest pattern the pupil can make
             there; that of a whole PSF is some ten times smaller. Only for exact propagation.
-        layers: how a pixel takes its PSF from the nodes in defocus: ``"nearest"`` or ``"linear"``.
-        layer_spacing: distance between nodes in radians of defocus.
+        layers: how a pixel takes its PSF from those computed: ``"nearest"``, ``"linear"``, ``"cubic"``, or
+            ``"bandlimited"``, which is nearly exact while they lie closer than 2.8 rad (for 470 nm).
+        layer_spacing: distance between the computed PSFs in radians of defocus.
         window: side of the PSFs in pixels, odd. Default: measured, by the next two.
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
         max_window: largest side of the PSF window in pixels.
@@ -32,7 +33,7 @@ class Fidelity:
 
     Example:
         >>> Fidelity.preset("balanced").layers
-        'linear'
+        'bandlimited'
         >>> Fidelity.preset("draft").replace(layer_spacing=2.0).name
         'draft, changed'
     """
@@ -51,7 +52,7 @@ class Fidelity:
 
     def __post_init__(self) -> None:
         check_choice("propagation", self.propagation, ("exact", "paper"))
-        check_choice("layers", self.layers, ("nearest", "linear"))
+        check_choice("layers", self.layers, ("nearest", "linear", "cubic", "bandlimited"))
         check_choice("stray_light", self.stray_light, ("renormalize", "veil", "discard"))
         check_positive("pixel_tolerance", self.pixel_tolerance)
         check_positive("layer_spacing", self.layer_spacing, "radians")
@@ -82,9 +83,10 @@ class Fidelity:
 PRESETS = {
     "paper": Fidelity("paper", propagation="paper", layers="nearest", stray_light="discard", correlate=True),
     "draft": Fidelity("draft", pixel_tolerance=1e-1, layers="nearest", enclosed_energy=0.6, max_window=41),
-    "balanced": Fidelity(),
+    "balanced": Fidelity(layers="bandlimited"),
     "reference": Fidelity(
         "reference",
+        layers="bandlimited",
         pixel_tolerance=1e-6,
         layer_spacing=1.0,
         enclosed_energy=0.9,

@@ -6,6 +6,7 @@ import warnings
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from functools import partial
+from math import ceil, floor, pi
 from typing import Any, cast
 
 import torch
@@ -19,13 +20,14 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
+from kornia_tidy.optics.defocus_interpolation import REFINEMENT, TAPS, defocus_band, interpolated_bank
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, adam_groups
 from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
 from kornia_tidy.optics.pupil import Pupil
-from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import check_border
 from kornia_tidy.sensor.noise import SensorNoise
@@ -177,13 +179,13 @@ class TiDyOptics(nn.Module):
             light = self.decode(image.to(dtype))
             defocus = self.camera.defocus(depth.to(dtype), check_inputs=False)
             self._count_clamped(defocus)
-            bank = self.psf_bank(image.shape[1], dtype, self._present_nodes(defocus))
+            bank = self._scene_bank(image.shape[1], dtype, defocus)
             light = render(
                 light,
                 defocus,
                 bank,
                 self.compositing,
-                layers=self.fidelity.layers,
+                layers="nearest" if self.fidelity.layers == "nearest" else "linear",
                 border=self.border,
                 correlate=self.fidelity.correlate,
             )
@@ -226,19 +228,7 @@ class TiDyOptics(nn.Module):
         spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
         dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
-        states, weights = self.modulator(self.masks.phase.to(dtype))
-        step = self._pixel_step()
-        tolerance = self.fidelity.pixel_tolerance
-        build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
-        learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
-        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
-            bank = build(nodes)
-        else:
-            dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
-            paper = self.fidelity.propagation == "paper"
-            setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
-            bank = self._memory.recall(setting, states, weights, nodes, build)
-        return bank.with_stray_light(self.fidelity.stray_light)
+        return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
@@ -264,6 +254,11 @@ class TiDyOptics(nn.Module):
             The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
         settings = self.fidelity
+        if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
+            raise ValueError(
+                f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
+                f"{min(self.spectrum.wavelengths) * 1e9:.0f} nm, got {settings.layer_spacing}"
+            )
         fixed = PAPER_SIZE if settings.propagation == "paper" else settings.window
         size = fixed or min(33, settings.max_window)
         while True:
@@ -385,21 +380,42 @@ class TiDyOptics(nn.Module):
             return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
         return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
 
+    def _computed_bank(self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...]) -> PSFBank:
+        """PSFs at these nodes, computed or remembered, before anything is done about stray light."""
+        states, weights = self.modulator(self.masks.phase.to(dtype))
+        step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
+        build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
+        learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
+        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
+            return build(nodes)
+        dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
+        paper = self.fidelity.propagation == "paper"
+        setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
+        return self._memory.recall(setting, states, weights, nodes, build)
+
+    def _scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
+        """PSFs at the layers that a scene's defocus lies between: those of other depths are not computed."""
+        spectrum, kind = self._spectrum(channels), self.fidelity.layers
+        nodes = self.defocus_nodes
+        if kind in ("nearest", "linear"):
+            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus))
+        else:
+            spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
+            count = REFINEMENT * (len(nodes) - 1)
+            targets = _around(tuple(nodes[0] + spacing / REFINEMENT * i for i in range(count + 1)), defocus)
+            first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
+            last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
+            samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
+            bank = self._computed_bank(spectrum, dtype, samples)
+            bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
+        return bank.with_stray_light(self.fidelity.stray_light)
+
+    def _band(self) -> float:
+        return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
+
     def _pixel_step(self) -> float | Tensor:
         """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
         return self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
-
-    def _present_nodes(self, defocus: Tensor) -> tuple[float, ...]:
-        """The nodes that this defocus map lies between: PSFs of other depths are not computed."""
-        nodes = self.defocus_nodes
-        if torch.compiler.is_compiling():
-            return nodes
-        lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-        # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
-        extra = int(defocus.requires_grad)
-        first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-        last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-        return nodes[min(first, last) : last + 1]
 
     def _spectrum(self, channels: int) -> Spectrum:
         if channels == len(self.spectrum.weights):
@@ -478,6 +494,18 @@ class TiDyOptics(nn.Module):
 
 def _refit_window(optics: TiDyOptics, _: Any) -> None:
     optics.fit_window()
+
+
+def _around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
+    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
+    if torch.compiler.is_compiling():
+        return nodes
+    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
+    # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
+    extra = int(defocus.requires_grad)
+    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
+    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
+    return nodes[min(first, last) : last + 1]
 
 
 def _any_channels(function: Any, image: Tensor) -> Tensor:

@@ -29,12 +29,15 @@ class Pupil:
     """Light it lets through, in units of squared amplitude times pupil radii squared."""
     extent: float = field(init=False)
     """Half width of the open part in pupil radii; twice it bounds the frequencies in a PSF."""
+    max_rho2: float = field(init=False)
+    """Largest squared distance of an open cell from the axis; it bounds how fast a PSF changes with defocus."""
 
     def __post_init__(self) -> None:
         size = self.amplitude.shape[-1]
-        farthest = (torch.nonzero(self.amplitude) - (size - 1) / 2).abs().max()
+        cells = torch.nonzero(self.amplitude) - (size - 1) / 2
         object.__setattr__(self, "light", float(self.amplitude.double().square().sum()) * self.cell_pitch**2)
-        object.__setattr__(self, "extent", (float(farthest) + 0.5) * self.cell_pitch)
+        object.__setattr__(self, "extent", (float(cells.abs().max()) + 0.5) * self.cell_pitch)
+        object.__setattr__(self, "max_rho2", float(cells.square().sum(1).max()) * self.cell_pitch**2)
 
 
 def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:

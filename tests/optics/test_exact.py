@@ -39,7 +39,7 @@ class TestExtremes(BaseTester):
         """L1 error relative to the light in the window, in blue, where defocus is strongest."""
         height = np.random.default_rng(1).uniform(0, 1.2e-6, (23, 23)) * (kind == "random")
         camera = DefocusRange(-60, 60)
-        fidelity = Fidelity.preset(name).replace(layer_spacing=20.0, stray_light="discard")
+        fidelity = Fidelity.preset(name).replace(layers="linear", layer_spacing=20.0, stray_light="discard")
         optics = TiDyOptics(PixelwiseMask(initial=torch.from_numpy(height)), camera, fidelity=fidelity)
         with torch.no_grad():
             psfs = optics.psf_bank().psfs[:, 2].double().numpy()
