@@ -70,29 +70,31 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     check_float_tensor("nodes", nodes, 1, "(D,)")
     if not torch.compiler.is_compiling() and not bool((nodes.diff() > 0).all()):
         raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
-    clamped, _ = clamp_defocus(defocus, nodes)
-    if len(nodes) == 1:
-        return torch.zeros_like(clamped, dtype=torch.int64), torch.zeros_like(clamped)
-    nodes = nodes.to(clamped.dtype)
+    dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
+    defocus, nodes = defocus.to(dtype), nodes.to(dtype)
+    if mode == "nearest" or len(nodes) == 1:
+        middles = (nodes[1:] + nodes[:-1]) / 2
+        lower = torch.bucketize(defocus.detach().contiguous(), middles.detach())
+        return lower, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
+    clamped = defocus.clamp(nodes[0], nodes[-1])
     # Inner nodes only: the end nodes belong to the first and last interval.
     lower = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
-    fraction = (clamped - nodes[lower]) / (nodes[lower + 1] - nodes[lower])
-    if mode == "nearest":
-        return lower + (fraction > 0.5), torch.zeros_like(fraction)
-    return lower, fraction
+    return lower, (clamped - nodes.take(lower)) / nodes.diff().take(lower)
 
 
-def layer_weight(lower: Tensor, fraction: Tensor, index: int) -> Tensor:
+def layer_weight(lower: Tensor, fraction: Tensor | None, index: int) -> Tensor:
     """Return the weight of one layer at every pixel, from what :func:`assign_layers` returned.
 
     Args:
         lower: (B, 1, H, W) int64 index of the layer below.
-        fraction: (B, 1, H, W) share of the layer above.
+        fraction: (B, 1, H, W) share of the layer above, or None for none.
         index: the layer wanted.
 
     Returns:
-        (B, 1, H, W) weight in [0, 1], of ``fraction``'s dtype.
+        (B, 1, H, W) weight in [0, 1], of ``fraction``'s dtype, or bool if that is None.
     """
+    if fraction is None:
+        return lower == index
     return torch.where(lower == index, 1 - fraction, torch.where(lower == index - 1, fraction, 0))
 
 
@@ -119,7 +121,7 @@ def layer_weights(defocus: Tensor, nodes: Tensor, mode: str) -> Tensor:
     return torch.cat([layer_weight(lower, fraction, index) for index in range(len(nodes))], dim=1)
 
 
-def present_layers(lower: Tensor, fraction: Tensor, count: int) -> list[int]:
+def present_layers(lower: Tensor, fraction: Tensor | None, count: int) -> list[int]:
     """Return the layers out of ``count`` that a scene contains, ascending. Waits for the device once, for all layers.
 
     While compiling, all layers are returned: which are present depends on the data. Where gradients with respect to
@@ -127,7 +129,7 @@ def present_layers(lower: Tensor, fraction: Tensor, count: int) -> list[int]:
 
     Args:
         lower: (B, 1, H, W) int64 index of the layer below, from :func:`assign_layers`.
-        fraction: (B, 1, H, W) share of the layer above.
+        fraction: (B, 1, H, W) share of the layer above, or None for none.
         count: the number of layers D.
 
     Example:
@@ -137,8 +139,11 @@ def present_layers(lower: Tensor, fraction: Tensor, count: int) -> list[int]:
     """
     if torch.compiler.is_compiling():
         return list(range(count))
-    sloped = fraction.requires_grad
     present = torch.zeros(count, dtype=torch.bool, device=lower.device)
+    if fraction is None:
+        present[lower] = True
+        return [index for index, here in enumerate(present.tolist()) if here]
+    sloped = fraction.requires_grad
     present[lower if sloped else torch.where(fraction < 1, lower, lower + 1)] = True
     present[lower + 1 if sloped else torch.where(fraction > 0, lower + 1, lower)] = True
     return [index for index, here in enumerate(present.tolist()) if here]
