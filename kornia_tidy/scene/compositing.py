@@ -8,6 +8,7 @@ times faster and in bounded memory. Light is linear throughout.
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import EllipsisType
 from typing import Protocol
 
 import torch
@@ -219,7 +220,8 @@ def _gather_dense(
     image: Tensor, lower: Tensor, fraction: Tensor | None, psfs: Tensor, *, veil: Tensor | None, border: str
 ) -> Tensor:
     psf_size = psfs.shape[-1]
-    lower, fraction = _shrink(lower, psf_size // 2, border), _shrink(fraction, psf_size // 2, border)
+    inside = _output_pixels(psf_size // 2, border)
+    lower, fraction = lower[inside], None if fraction is None else fraction[inside]
     size = padded_size(*image.shape[-2:], psf_size, border)
     light = to_spectrum(pad_border(image, psf_size // 2, border), size)
     haze = None if veil is None else veil[:, None, :, None, None] * image.mean((-2, -1), keepdim=True)
@@ -252,9 +254,9 @@ def _scatter_dense(
 def _gather_tiled(
     image: Tensor, lower: Tensor, fraction: Tensor | None, psfs: Tensor, *, veil: Tensor | None, border: str
 ) -> Tensor:
-    radius = psfs.shape[-1] // 2
-    lower, fraction = _shrink(lower, radius, border), _shrink(fraction, radius, border)
-    coded = blur_then_mix(pad_border(image, radius, border), psfs, lower, fraction)
+    inside = _output_pixels(psfs.shape[-1] // 2, border)
+    lower, fraction = lower[inside], None if fraction is None else fraction[inside]
+    coded = blur_then_mix(image, psfs, lower, fraction, border)
     if veil is None:
         return coded
     return coded + _own_veil(lower, fraction, veil) * image.mean((-2, -1), keepdim=True)
@@ -263,22 +265,16 @@ def _gather_tiled(
 def _scatter_tiled(
     image: Tensor, lower: Tensor, fraction: Tensor | None, psfs: Tensor, *, veil: Tensor | None, border: str
 ) -> Tensor:
-    radius = psfs.shape[-1] // 2
-    # Black beyond the border may lie in any layer: in one that is there anyway.
-    sides = "replicate" if border == "zero" else border
-    far_lower = pad_border(lower.to(image.dtype), radius, sides).long()
-    far_fraction = None if fraction is None else pad_border(fraction, radius, sides)
-    coded = split_then_blur(pad_border(image, radius, border), psfs, far_lower, far_fraction)
+    coded = split_then_blur(image, psfs, lower, fraction, border)
     if veil is None:
         return coded
     return coded + (_own_veil(lower, fraction, veil) * image).mean((-2, -1), keepdim=True)
 
 
-def _shrink(labels: Tensor | None, radius: int, border: str) -> Tensor | None:
-    """Leave the pixels of (B, 1, H, W) that the output has."""
-    if labels is None or border != "valid" or radius == 0:
-        return labels
-    return labels[..., radius:-radius, radius:-radius]
+def _output_pixels(radius: int, border: str) -> tuple[EllipsisType, slice, slice]:
+    """Index of the pixels of (B, 1, H, W) that the output has."""
+    kept = slice(radius, -radius) if border == "valid" and radius > 0 else slice(None)
+    return ..., kept, kept
 
 
 def _own_veil(lower: Tensor, fraction: Tensor | None, veil: Tensor) -> Tensor:

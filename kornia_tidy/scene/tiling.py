@@ -14,48 +14,60 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.tiles import Chunk, Labels, Plan, make_plan
 
 
-def blur_then_mix(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None) -> Tensor:
-    """Convolve a plane with each layer's PSF and let each pixel take its layers: gather without borders.
+def blur_then_mix(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, border: str) -> Tensor:
+    """Convolve an image with each layer's PSF and let each pixel take its layers: gather.
 
     Args:
-        plane: (B, C, H + P - 1, W + P - 1) light.
-        psfs: (D, C, P, P) of the plane's dtype.
-        lower: (B, 1, H, W) or (1, 1, H, W) int64 index of each pixel's layer.
+        image: (B, C, H, W) light.
+        psfs: (D, C, P, P) of the image's dtype.
+        lower: int64 index of each pixel's layer, (B or 1, 1) and the height and width of the output.
         fraction: share of the next layer, like ``lower``, or None for none.
+        border: what lies beyond the image, see :mod:`kornia_tidy.scene.convolution`.
 
     Returns:
-        (B, C, H, W). It has gradients with respect to plane, psfs and fraction, but no second ones.
+        (B, C, H, W), or smaller by P - 1 for ``"valid"``. It has gradients with respect to image, psfs and fraction,
+        but no second ones.
     """
-    return _apply(_BlurThenMix, plane, psfs, lower, fraction)
+    plan, fraction = _plan(image, psfs, lower, fraction)
+    spare = (plan.grid.covered_height - plan.grid.height, plan.grid.covered_width - plan.grid.width)
+    plane = pad_border(image, psfs.shape[-1] // 2, border, spare)
+    return _BlurThenMix.apply(plane, psfs, fraction, plan)
 
 
-def split_then_blur(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None) -> Tensor:
-    """Convolve the light of each layer's pixels with its PSF and add up: scatter without borders.
+def split_then_blur(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, border: str) -> Tensor:
+    """Convolve the light of each layer's pixels with its PSF and add up: scatter.
 
     Args:
-        plane: (B, C, H, W) light.
-        psfs: (D, C, P, P) of the plane's dtype.
-        lower: (B, 1, H, W) or (1, 1, H, W) int64 index of each pixel's layer.
+        image: (B, C, H, W) light.
+        psfs: (D, C, P, P) of the image's dtype.
+        lower: (B or 1, 1, H, W) int64 index of each pixel's layer.
         fraction: share of the next layer, like ``lower``, or None for none.
+        border: what lies beyond the image, see :mod:`kornia_tidy.scene.convolution`.
 
     Returns:
-        (B, C, H - P + 1, W - P + 1). It has gradients with respect to plane, psfs and fraction, but no second ones.
+        As :func:`blur_then_mix`.
     """
-    return _apply(_SplitThenBlur, plane, psfs, lower, fraction)
+    radius = psfs.shape[-1] // 2
+    # Black beyond the border may lie in any layer: in one that is there anyway.
+    sides = "replicate" if border == "zero" else border
+    lower = pad_border(lower.to(image.dtype), radius, sides).long()
+    fraction = None if fraction is None else pad_border(fraction, radius, sides)
+    plan, fraction = _plan(image, psfs, lower, fraction)
+    plane = pad_border(image, radius, border)
+    return _SplitThenBlur.apply(plane, psfs, fraction, plan)
 
 
-def _apply(
-    function: type[torch.autograd.Function], plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None
-) -> Tensor:
-    lower = lower[:, 0].expand(len(plane), -1, -1)
-    fraction = None if fraction is None else fraction[:, 0].expand(len(plane), -1, -1)
+def _plan(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None) -> tuple[Plan, Tensor | None]:
+    """Return the plan, and the fraction as (B, H, W)."""
+    lower = lower[:, 0].expand(len(image), -1, -1)
+    fraction = None if fraction is None else fraction[:, 0].expand(len(image), -1, -1)
     sloped = fraction is not None and fraction.requires_grad and torch.is_grad_enabled()
     labels = Labels(lower, None if fraction is None else fraction.detach(), sloped)
-    plan = make_plan(labels, len(psfs), psfs.shape[-1], plane.shape[1])
-    return function.apply(plane, psfs, fraction, plan)
+    return make_plan(labels, len(psfs), psfs.shape[-1], image.shape[1]), fraction
 
 
 class _BlurThenMix(torch.autograd.Function):
@@ -93,7 +105,7 @@ class _BlurThenMix(torch.autograd.Function):
                 _add_windows(full, torch.fft.ifft2(_sum_layers(own, turned, chunk)), plan, chunk)
         if full is not None:
             full = full[..., : plane.shape[-2], : plane.shape[-1]]
-        return full, slopes.of_psfs(psfs, plan), slopes.fraction, None
+        return full, slopes.of_psfs(psfs, plan, turned=False), slopes.fraction, None
 
 
 class _SplitThenBlur(torch.autograd.Function):
@@ -122,14 +134,14 @@ class _SplitThenBlur(torch.autograd.Function):
             light = torch.fft.fft2(_windows(full, plan, chunk))
             if slopes.psfs is not None:
                 own = torch.fft.fft2(_put(plane, places, plan, chunk))
-                slopes.add_psfs(light, torch.conj_physical(own), chunk)
+                slopes.add_psfs(torch.conj_physical(light), own, chunk)
             if mixed is not None or slopes.fraction is not None:
                 terms = _take(torch.fft.ifft2(_product(light, turned, chunk)), places)
                 if slopes.fraction is not None:
                     slopes.add_fraction(terms, plane, chunk)
                 if mixed is not None:
                     _mix_into(mixed, terms, plan, chunk)
-        return mixed, slopes.of_psfs(psfs, plan), slopes.fraction, None
+        return mixed, slopes.of_psfs(psfs, plan, turned=True), slopes.fraction, None
 
 
 class _Slopes:
@@ -142,21 +154,27 @@ class _Slopes:
 
     def add_fraction(self, terms: list[list[Tensor]], factor: Tensor, chunk: Chunk) -> None:
         """What a pixel gains when its light moves to the layer above, times the gradient or the light it has."""
+        assert self.fraction is not None
         for channel, (below, above) in enumerate(terms):
             self.fraction[chunk.batch, chunk.y, chunk.x] += (above - below) * factor[chunk.pixels(channel)]
 
     def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk) -> None:
-        """Light of the windows and of the layers' own pixels, one of them conjugate: a correlation."""
-        for layer, run in chunk.runs:
-            self.psfs[layer] += light.index_select(0, chunk.block[run]).mul_(own[run]).sum(0)
+        """Correlate the layers' own pixels with the light of their windows, of which ``light`` is the conjugate."""
+        assert self.psfs is not None
+        if light.device.type != "cpu":
+            self.psfs.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
+            return
+        for run in chunk.runs:
+            for block, pair in zip(light[run.blocks], own[run.pairs], strict=True):
+                self.psfs[run.layer].addcmul_(block, pair)
 
-    def of_psfs(self, psfs: Tensor, plan: Plan) -> Tensor | None:
+    def of_psfs(self, psfs: Tensor, plan: Plan, *, turned: bool) -> Tensor | None:
         """Left and right tiles correlate with themselves in the real part, with each other in the imaginary part."""
         if self.psfs is None:
             return None
         side = psfs.shape[-1]
         slope = torch.zeros_like(psfs)
-        slope[plan.present] = torch.fft.ifft2(self.psfs).real[..., :side, :side]
+        slope[plan.present] = torch.fft.ifft2(self.psfs.conj() if turned else self.psfs).real[..., :side, :side]
         return slope
 
 
@@ -165,27 +183,35 @@ def _spectra(psfs: Tensor, plan: Plan) -> Tensor:
     return torch.fft.fft2(psfs.index_select(0, plan.present), s=(plan.grid.size, plan.grid.size))
 
 
+# Products are of slices on a processor, to pass over memory as rarely as possible, and of all pairs at once on an
+# accelerator, to start as few kernels as possible.
+
+
 def _product(light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
     """Each pair's light times the spectrum of its layer: (pairs, C, size, size)."""
-    product = light.index_select(0, chunk.block)
-    for layer, run in chunk.runs:
-        product[run].mul_(spectra[layer])
+    if light.device.type != "cpu":
+        return light.index_select(0, chunk.block).mul_(spectra.index_select(0, chunk.layer))
+    product = light.new_empty(len(chunk.block), *light.shape[1:])
+    for run in chunk.runs:
+        torch.mul(light[run.blocks], spectra[run.layer], out=product[run.pairs])
     return product
 
 
 def _sum_layers(own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
-    """Each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
-    for layer, run in chunk.runs:
-        own[run].mul_(spectra[layer])
+    """Each block's sum over its layers of their light times their spectrum. May write over ``own``."""
     images, rows, columns = chunk.extent
-    return own.new_zeros(images * rows * columns, *own.shape[1:]).index_add_(0, chunk.block, own)
+    total = own.new_zeros(images * rows * columns, *own.shape[1:])
+    if own.device.type != "cpu":
+        return total.index_add_(0, chunk.block, own.mul_(spectra.index_select(0, chunk.layer)))
+    for run in chunk.runs:
+        total[run.blocks].addcmul_(own[run.pairs], spectra[run.layer])
+    return total
 
 
 def _tiled_plane(plane: Tensor, plan: Plan) -> Tensor:
     """A black plane that holds the windows of all blocks."""
-    grid = plan.grid
-    overlap = grid.size - grid.tile
-    height, width = grid.rows * grid.tile + overlap, 2 * grid.columns * grid.tile + overlap
+    overlap = plan.grid.size - plan.grid.tile
+    height, width = plan.grid.covered_height + overlap, plan.grid.covered_width + overlap
     return plane.new_zeros(*plane.shape[:2], height, width)
 
 
@@ -225,11 +251,11 @@ def _places(plan: Plan, chunk: Chunk, offset: int) -> list[Tensor]:
     A tile's first pixel stands at ``offset``, ``offset`` of its plane.
     """
     size, tile, device = plan.grid.size, plan.grid.tile, plan.place.device
-    y = torch.arange(chunk.y.start, chunk.y.stop, device=device).remainder_(tile).add_(offset).mul_(2 * size)
-    x = torch.arange(chunk.x.start, chunk.x.stop, device=device)
-    inside = y[:, None] + (2 * (x % tile + offset) + x // tile % 2 - chunk.first_pair * plan.stride)
+    y = torch.arange(chunk.y.stop - chunk.y.start, device=device) % tile
+    x = torch.arange(chunk.x.stop - chunk.x.start, device=device)
+    inside = ((y + offset) * (2 * size))[:, None] + (2 * (x % tile + offset) + x // tile % 2)
     keys = plan.labels.terms(chunk.batch, chunk.y, chunk.x)
-    return [plan.place.take(key).add_(inside) for key in keys]
+    return [plan.place.index_select(0, key.reshape(-1)).view(key.shape).add_(inside) for key in keys]
 
 
 def _take(planes: Tensor, places: list[Tensor]) -> list[list[Tensor]]:

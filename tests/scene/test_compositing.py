@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import convolve2d
 
-from kornia_tidy.scene.compositing import gather, render, scatter
+from kornia_tidy.scene.compositing import METHODS, gather, render, scatter
 from kornia_tidy.scene.convolution import BORDERS
 from tests.base import SHARED, BaseTester
 from tests.scene.scenes import Bank, brute_render, brute_weights, make_bank, make_scene
@@ -61,25 +61,26 @@ class TestRender(BaseTester):
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
-    def test_feature_equals_the_sum_over_pixels(self, compositing, layers, border, device):
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_equals_the_sum_over_pixels(self, compositing, layers, border, method, device):
         for count, channels, size, height, width in ((4, 1, 3, 5, 6), (1, 2, 5, 5, 7), (3, 1, 1, 2, 3)):
             bank = make_bank(count, channels, size, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, 2, height, width)
-            expected, coded = (
-                function(image, defocus, bank, compositing=compositing, layers=layers, border=border)
-                for function in (brute_render, render)
-            )
+            options = {"compositing": compositing, "layers": layers, "border": border}
+            expected = brute_render(image, defocus, bank, **options)
+            coded = render(image, defocus, bank, method=method, **options)
             self.assert_close(coded, expected, rtol=0, atol=1e-14)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
-    def test_feature_equals_the_independent_model(self, compositing, border):
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_equals_the_independent_model(self, compositing, border, method):
         model = oracle()
         bank = make_bank(6, 3, 11)
         image, defocus = make_scene(bank, 1, 33, 40)
         label = model.nearest(defocus[0, 0].numpy(), bank.defocus.numpy())
         expected = getattr(model, compositing)(image[0].numpy(), label, bank.psfs.numpy(), border)
-        coded = render(image, defocus, bank, compositing, layers="nearest", border=border)
+        coded = render(image, defocus, bank, compositing, layers="nearest", border=border, method=method)
         self.assert_close(coded[0], torch.from_numpy(expected), rtol=0, atol=1e-12)
 
     def test_feature_correlation_equals_the_independent_model(self):
@@ -202,13 +203,14 @@ class TestRender(BaseTester):
     # What is skipped, shared and shaped
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
-    def test_feature_absent_layers_are_not_looked_at(self, compositing, device, dtype):
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_absent_layers_are_not_looked_at(self, compositing, method, device, dtype):
         bank = make_bank(6, 1, 5, dtype=dtype, device=device)
         image, _ = make_scene(bank)
         defocus = torch.full((2, 1, 9, 12), -7.0, device=device, dtype=dtype)  # between nodes 1 and 2
-        expected = render(image, defocus, bank, compositing)
+        expected = render(image, defocus, bank, compositing, method=method)
         bank.psfs[[0, 3, 4, 5]] = float("nan")
-        assert torch.equal(render(image, defocus, bank, compositing), expected)
+        assert torch.equal(render(image, defocus, bank, compositing, method=method), expected)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     def test_feature_one_defocus_map_serves_all_images(self, compositing, device, dtype):

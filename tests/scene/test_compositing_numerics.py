@@ -1,4 +1,4 @@
-"""Gradients, memory, numeric types and compilation of the dense renderer; its physics is in test_compositing."""
+"""Gradients, memory, numeric types and compilation; the physics is in test_compositing, tiles in test_tiling."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy.scene.compositing import render
+from kornia_tidy.scene.compositing import METHODS, render
 from kornia_tidy.scene.convolution import BORDERS
 from tests.base import BaseTester
 from tests.scene.scenes import Bank, make_bank, make_scene
@@ -20,19 +20,21 @@ class TestRenderNumerics(BaseTester):
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("border", BORDERS)
-    def test_gradcheck(self, compositing, border, device):
+    @pytest.mark.parametrize("method", METHODS)
+    def test_gradcheck(self, compositing, border, method, device):
         bank = make_bank(3, 2, 3, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 5, 6)
         middles = torch.tensor([-25.0, -17.0, -8.0, 3.0], device=device, dtype=torch.float64)  # away from the nodes
         defocus = middles[torch.randint(4, (2, 1, 5, 6), device=device)]
 
         def function(image, defocus, psfs, veil):
-            return render(image, defocus, Bank(psfs, bank.defocus, veil), compositing, border=border)
+            return render(image, defocus, Bank(psfs, bank.defocus, veil), compositing, border=border, method=method)
 
         self.gradcheck(function, (image, defocus, bank.psfs, bank.veil))
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
-    def test_feature_defocus_exactly_on_a_node_has_the_slope_above(self, compositing, device):
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_defocus_exactly_on_a_node_has_the_slope_above(self, compositing, method, device):
         """The next layer has no weight anywhere, and yet the gradient must see it."""
         bank = make_bank(3, 1, 3, device=device)
         image, _ = make_scene(bank, 1, 6, 6)
@@ -40,7 +42,7 @@ class TestRenderNumerics(BaseTester):
 
         def total(defocus):
             ramp = torch.arange(36.0, device=device, dtype=torch.float64).view(1, 1, 6, 6)
-            return (render(image, defocus, bank, compositing) * ramp).sum()
+            return (render(image, defocus, bank, compositing, method=method) * ramp).sum()
 
         defocus = torch.full((1, 1, 6, 6), -11.0, device=device, dtype=torch.float64, requires_grad=True)
         slope = torch.autograd.grad(total(defocus), defocus)[0].sum()
@@ -49,7 +51,7 @@ class TestRenderNumerics(BaseTester):
 
     # Memory
 
-    def test_feature_gather_keeps_no_blurred_image_a_layer_for_the_gradients(self, device):
+    def test_feature_dense_gather_keeps_no_blurred_image_a_layer_for_the_gradients(self, device):
         """Bytes that autograd saves grow by one spectrum of a PSF and two masks a layer, not by the batch's light."""
 
         def saved_bytes(layers):
@@ -65,7 +67,7 @@ class TestRenderNumerics(BaseTester):
                 return tensor
 
             with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-                render(image, defocus.requires_grad_(), bank)
+                render(image, defocus.requires_grad_(), bank, method="dense")
             return sum(size for size, _ in kept.values())
 
         blurred = 8 * 64 * 64 * 4
