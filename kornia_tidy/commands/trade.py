@@ -137,8 +137,8 @@ def run(args: argparse.Namespace) -> None:
     with tqdm(total=len(settings), desc="trade", file=sys.stderr, leave=False, unit="setting") as progress:
         try:
             for setting in settings:
-                name = f"{setting.knob} {setting.value}"
-                progress.set_postfix_str(f"reference, then {name}" if todo and not rows else name)
+                step = f"{setting.knob} {setting.value}"
+                progress.set_postfix_str(f"reference, then {step}" if todo and not rows else step)
                 rows.append(next(steps))
                 _write(folder, TradeRun(conditions, (*rows, *_others(known, rows))))
                 progress.update()
