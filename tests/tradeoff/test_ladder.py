@@ -40,5 +40,5 @@ class TestLadder(BaseTester):
         assert [s.value for s in ladder(base, ["window"])] == [9, 17, 33, 65, 129, 21]
 
     def test_exception_names_the_knobs(self):
-        with pytest.raises(ValueError, match="knob must be one of 'preset', 'layers', .* got 'speed'"):
+        with pytest.raises(ValueError, match=r"knob must be one of 'preset', 'layers', .* got 'speed'"):
             ladder(knobs=["speed"])
