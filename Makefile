@@ -14,7 +14,8 @@ help:
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
 	@echo "make test     the tests; ARGS='-k camera' runs some of them"
 	@echo "make lint     style, spelling and types"
-	@echo "make bench    the benchmarks"
+	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
+	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
 	@echo "make clean    removes .venv, outputs and caches"
 	@echo
 	@echo "PYTHON=python3.12 chooses the interpreter (3.11 or newer) for the environment in $(VENV)."
@@ -33,7 +34,10 @@ lint: $(READY)
 
 # The usual options of pytest leave the benchmarks out.
 bench: $(READY)
-	@$(BIN)/python -m pytest -q --override-ini addopts= tests/benchmarks $(ARGS)
+	@mkdir -p outputs
+	@$(BIN)/python -m pytest -q --override-ini addopts= tests/benchmarks \
+		--benchmark-quiet --benchmark-json=outputs/benchmarks.json $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.table outputs/benchmarks.json | tee outputs/benchmarks.md
 
 clean:
 	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis .benchmarks

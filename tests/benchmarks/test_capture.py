@@ -1,30 +1,30 @@
-"""How long a capture takes; `make bench`."""
+"""How long a whole capture takes, and a step of training."""
 
 from __future__ import annotations
+
+from contextlib import nullcontext
 
 import pytest
 import torch
 
-from kornia_tidy import TiDyOptics
+from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.optics import AliasingWarning
 
 
-@pytest.fixture
-def scene():
-    return torch.rand(1, 3, 256, 256), torch.linspace(0.3, 3.0, 256 * 256).view(1, 1, 256, 256)
+@pytest.fixture(params=["paper", "draft", "balanced"])
+def optics(request, device):
+    with pytest.warns(AliasingWarning) if request.param == "paper" else nullcontext():
+        return TiDyOptics(PixelwiseMask(5), fidelity=request.param).to(device)
 
 
-@pytest.mark.parametrize("fidelity", ["draft", "balanced"])
+def facts(optics):
+    return {"masks": 5, "layers": len(optics.defocus_nodes), "window": optics.window, "wavelengths": 3, "pupil": 23}
+
+
 class TestCapture:
-    def test_psf_bank(self, benchmark, fidelity):
-        optics = TiDyOptics(fidelity=fidelity)
+    def test_capture(self, bench, optics, scene):
         with torch.no_grad():
-            benchmark(optics.psf_bank)
+            bench(lambda: optics(*scene), **facts(optics))
 
-    def test_capture(self, benchmark, fidelity, scene):
-        optics = TiDyOptics(fidelity=fidelity)
-        with torch.no_grad():
-            benchmark(optics, *scene)
-
-    def test_capture_and_gradients(self, benchmark, fidelity, scene):
-        optics = TiDyOptics(fidelity=fidelity)
-        benchmark(lambda: optics(*scene).sum().backward())
+    def test_capture_and_gradients(self, bench, optics, scene):
+        bench(lambda: torch.autograd.grad(optics(*scene).mean(), optics.masks.phase), **facts(optics))

@@ -1,0 +1,220 @@
+"""A sweep on disk and on paper: JSON with its conditions, CSV for spreadsheets, a table for people."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, get_args, get_type_hints
+
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.tradeoff.conditions import Conditions
+from kornia_tidy.tradeoff.ladder import PRESET
+from kornia_tidy.tradeoff.measure import TradeRow, pareto
+
+FORMAT = "kornia_tidy.trade/1"
+_KNOB = "fidelity."  # in front of a column of the CSV that is a knob of the fidelity
+
+
+@dataclass(frozen=True)
+class TradeRun:
+    """Rows and the conditions they were all measured under."""
+
+    conditions: Conditions
+    rows: tuple[TradeRow, ...]
+
+
+def write_json(path: str | os.PathLike[str], run: TradeRun) -> None:
+    """Write a sweep, all or nothing.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+    """
+    document = {
+        "format": FORMAT,
+        "conditions": asdict(run.conditions),
+        "rows": [asdict(row) for row in run.rows],
+    }
+    write_bytes(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: str | os.PathLike[str]) -> TradeRun:
+    """Read a sweep written by :func:`write_json`, and check every name and type in it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a sweep, or not of this version's schema.
+    """
+    data = read_bytes(path)
+    try:
+        document = json.loads(data)
+        _check_names("the file", document, {"format", "conditions", "rows"})
+        if document["format"] != FORMAT:
+            raise ValueError(f"its format is {document['format']!r}, not {FORMAT!r}")
+        if not isinstance(document["rows"], list):
+            raise ValueError("rows must be a list")
+        conditions = Conditions(**_checked("conditions", Conditions, document["conditions"]))
+        return TradeRun(conditions, tuple(_row(entry) for entry in document["rows"]))
+    except ValueError as error:  # json's and Unicode's errors are of this kind too
+        raise ValueError(f"{path} is not a readable sweep: {error}") from None
+
+
+def write_csv(path: str | os.PathLike[str], rows: Iterable[TradeRow]) -> None:
+    """Write the rows for a spreadsheet, all or nothing; an empty cell is None.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+    """
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _columns(), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        entry = asdict(row)
+        entry |= {_KNOB + name: value for name, value in entry.pop("fidelity").items()}
+        writer.writerow({name: "" if value is None else value for name, value in entry.items()})
+    write_bytes(path, text.getvalue().encode())
+
+
+def read_csv(path: str | os.PathLike[str]) -> list[TradeRow]:
+    """Read rows written by :func:`write_csv`.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if its columns or values are not those of a sweep.
+    """
+    data = read_bytes(path)
+    try:
+        reader = csv.DictReader(io.StringIO(data.decode()))
+        _check_names("the header", dict.fromkeys(reader.fieldnames or ()), set(_columns()))
+        return [_row(_typed(cells)) for cells in reader]
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{path} is not a readable sweep: {error}") from None
+
+
+def markdown(rows: Sequence[TradeRow]) -> str:
+    """Return the rows as a table in Markdown; the bold ones are on the Pareto front of time and error.
+
+    Example:
+        >>> print(markdown([]).splitlines()[0])
+        | knob | value | layers | window | RMSE | max error | capture, ms | cached bank, ms | memory, MiB |
+    """
+    training = any(row.training_seconds is not None for row in rows)
+    names = ["knob", "value", "layers", "window", "RMSE", "max error", "capture, ms", "cached bank, ms"]
+    names += ["with gradients, ms"] if training else []
+    names += ["memory, MiB"] + (["with gradients, MiB"] if training else [])
+    lines = [f"| {' | '.join(names)} |", f"|{' --- |' * 2}{' ---: |' * (len(names) - 2)}"]
+    front = pareto(rows)
+    for row in rows:
+        cells = [row.knob, value_in_words(row), str(row.layers), str(row.window)]
+        cells += [error_in_words(row.rmse), error_in_words(row.max_error)]
+        cells += [_milliseconds(row.capture_seconds, row.capture_spread)]
+        cells += [_milliseconds(row.render_seconds, row.render_spread)]
+        cells += [_milliseconds(row.training_seconds, row.training_spread)] if training else []
+        cells += [_mebibytes(row.capture_bytes)] + ([_mebibytes(row.training_bytes)] if training else [])
+        if row in front:
+            cells[1] = f"**{cells[1]}**"
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def value_in_words(row: TradeRow) -> str:
+    """Return what a knob was turned to, as a person would write it.
+
+    Args:
+        row: one row of a sweep.
+    """
+    if row.value is None:
+        return f"{row.window}, measured"
+    if isinstance(row.value, bool):
+        return "on" if row.value else "off"
+    return f"{row.value:g}" if isinstance(row.value, float) else str(row.value)
+
+
+def error_in_words(error: float) -> str:
+    """Return an error in two digits.
+
+    Example:
+        >>> error_in_words(0.01234), error_in_words(0.0000321), error_in_words(0.0)
+        ('0.012', '3.2e-05', '0')
+    """
+    return "0" if error == 0 else f"{error:.2g}"
+
+
+def _milliseconds(median: float | None, spread: float | None) -> str:
+    if median is None or spread is None:
+        return ""
+    digits = max(0, 2 - len(f"{int(1e3 * median)}"))
+    return f"{1e3 * median:.{digits}f} ± {1e3 * spread:.{digits}f}"
+
+
+def _mebibytes(count: int | None) -> str:
+    return "" if count is None else f"{count / 2**20:.0f}"
+
+
+# ------------------------------------------------------------------ the schema: names and types of the dataclasses
+
+
+def _row(entry: Any) -> TradeRow:
+    values = _checked("a row", TradeRow, entry)
+    knobs = _checked("a row's fidelity", Fidelity, values["fidelity"])
+    whole: dict[str, Any] = {**values, "fidelity": Fidelity(**knobs)}
+    row = TradeRow(**whole)
+    if row.knob != PRESET and row.value != knobs.get(row.knob):
+        raise ValueError(f"a row says {row.knob} = {row.value!r}, its fidelity has {knobs.get(row.knob)!r}")
+    return row
+
+
+def _checked(what: str, kind: type, entry: Any) -> dict[str, Any]:
+    """Return an entry whose names and types are those of a dataclass, or say what is wrong."""
+    hints = get_type_hints(kind)
+    _check_names(what, entry, set(hints))
+    for name, value in entry.items():
+        allowed = get_args(hints[name]) or (hints[name],)
+        if Fidelity in allowed:
+            allowed = (dict,)
+        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed and name != "value"):
+            if float in allowed and type(value) is int:  # JSON's 2 may have been a 2.0 elsewhere
+                continue
+            raise ValueError(f"{name} in {what} must be {hints[name]}, got {value!r}")
+    return entry
+
+
+def _check_names(what: str, entry: Any, names: set[str]) -> None:
+    if not isinstance(entry, dict):
+        raise ValueError(f"{what} must hold {', '.join(sorted(names))}, got {type(entry).__name__}")
+    if wrong := names ^ set(entry):
+        kinds = [f"{'no' if name in names else 'an unknown'} {name}" for name in sorted(map(str, wrong))]
+        raise ValueError(f"{what} has {', '.join(kinds)}")
+
+
+def _columns() -> list[str]:
+    plain = [field.name for field in fields(TradeRow) if field.name != "fidelity"]
+    return plain + [_KNOB + field.name for field in fields(Fidelity)]
+
+
+def _typed(cells: dict[str, str]) -> dict[str, Any]:
+    """Return a row of a CSV with its cells in the types that its names have."""
+    knobs = get_type_hints(Fidelity)
+    hints = {**get_type_hints(TradeRow), **{_KNOB + name: hint for name, hint in knobs.items()}}
+    hints["value"] = knobs.get(cells["knob"], str)
+    entry: dict[str, Any] = {name: _parsed(text, hints[name]) for name, text in cells.items()}
+    entry["fidelity"] = {name: entry.pop(_KNOB + name) for name in knobs}
+    return entry
+
+
+def _parsed(text: str, hint: Any) -> Any:
+    kinds = get_args(hint) or (hint,)
+    if text == "" and type(None) in kinds:
+        return None
+    if bool in kinds:
+        if text not in ("True", "False"):
+            raise ValueError(f"expected True or False, got {text!r}")
+        return text == "True"
+    for kind in (int, float):
+        if kind in kinds:
+            return kind(text)
+    return text

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy.tradeoff import Conditions
+from kornia_tidy.tradeoff.conditions import code_hash, device_name, scene_hash
+from tests.base import BaseTester
+from tests.tradeoff.samples import CONDITIONS
+
+IMAGE, DEPTH = torch.rand(3, 8, 8), torch.ones(1, 8, 8)
+QUICK = Fidelity(window=9)
+
+
+def optics(**parts):
+    masks = PixelwiseMask(2, generator=torch.Generator().manual_seed(parts.pop("seed", 0)))
+    return TiDyOptics(masks, **{"fidelity": QUICK, **parts})
+
+
+class TestSceneHash(BaseTester):
+    def test_feature_is_the_same_for_the_same_and_for_what_does_not_matter(self):
+        first = scene_hash(optics(), IMAGE, DEPTH)
+        assert first == scene_hash(optics(), IMAGE.clone(), DEPTH)
+        assert first == scene_hash(optics(fidelity="draft", sensor=SensorNoise(0.5)).eval(), IMAGE, DEPTH)
+
+    @pytest.mark.parametrize(
+        "parts",
+        [
+            {"seed": 1},
+            {"camera": ThinLensCamera(pixel_pitch=8.0001e-6)},
+            {"camera": ThinLensCamera(focus_distance=torch.tensor(0.595))},
+            {"compositing": "scatter"},
+            {"border": "zero"},
+            {"color_space": "linear"},
+            {"aperture": torch.ones(23, 23)},
+        ],
+        ids=str,
+    )
+    def test_feature_tells_every_part_of_the_camera(self, parts):
+        assert scene_hash(optics(**parts), IMAGE, DEPTH) != scene_hash(optics(), IMAGE, DEPTH)
+
+    def test_feature_tells_image_and_depth(self):
+        hashes = {
+            scene_hash(optics(), image, depth)
+            for image, depth in ((IMAGE, DEPTH), (IMAGE + 1e-6, DEPTH), (IMAGE, DEPTH + 1e-6), (IMAGE.double(), DEPTH))
+        }
+        assert len(hashes) == 4
+
+
+class TestConditions(BaseTester):
+    def test_smoke_here_and_now(self):
+        here = Conditions.here_and_now("a scene", optics(), IMAGE, DEPTH)
+        assert (here.height, here.width, here.channels, here.masks) == (8, 8, 3, 2)
+        assert here.torch == torch.__version__
+        assert here.date.endswith("+00:00")
+        assert here.same(Conditions.here_and_now("another name", optics(), IMAGE, DEPTH))
+
+    @pytest.mark.parametrize(
+        ("change", "same"),
+        [
+            ({"date": "2030-01-01T00:00:00+00:00"}, True),
+            ({"commit": "abc"}, True),
+            ({"scene": "renamed"}, True),
+            ({"scene_hash": "0"}, False),
+            ({"code_hash": "0"}, False),
+            ({"threads": 1}, False),
+            ({"device": "another"}, False),
+            ({"torch": "2.5.1"}, False),
+            ({"reference": "balanced"}, False),
+        ],
+    )
+    def test_feature_which_rows_may_stand_side_by_side(self, change, same):
+        assert CONDITIONS.same(replace(CONDITIONS, **change)) is same
+
+    def test_feature_the_code_is_that_of_a_capture(self, tmp_path, monkeypatch):
+        import shutil
+        from pathlib import Path
+
+        import kornia_tidy
+
+        before = code_hash()
+        copy = tmp_path / "kornia_tidy"
+        shutil.copytree(Path(kornia_tidy.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
+        monkeypatch.setattr(kornia_tidy, "__file__", str(copy / "__init__.py"))
+        assert code_hash() == before
+        (copy / "figures.py").write_text("")
+        assert code_hash() == before
+        (copy / "scene" / "layers.py").write_text("")
+        assert code_hash() != before
+
+    def test_smoke_device_name(self):
+        assert device_name(torch.device("cpu")).endswith("CPUs")
