@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 from kornia_tidy.checks import check_choice, check_positive
 
+LAYERS = ("nearest", "linear", "cubic", "bandlimited")
+
 
 @dataclass(frozen=True)
 class Fidelity:
@@ -52,7 +54,7 @@ class Fidelity:
 
     def __post_init__(self) -> None:
         check_choice("propagation", self.propagation, ("exact", "paper"))
-        check_choice("layers", self.layers, ("nearest", "linear", "cubic", "bandlimited"))
+        check_choice("layers", self.layers, LAYERS)
         check_choice("stray_light", self.stray_light, ("renormalize", "veil", "discard"))
         check_positive("pixel_tolerance", self.pixel_tolerance)
         check_positive("layer_spacing", self.layer_spacing, "radians")

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.fidelity import PRESETS, Fidelity
+from kornia_tidy.fidelity import LAYERS, PRESETS, Fidelity
 from kornia_tidy.optics.psf_bank import STRAY_LIGHT
-from kornia_tidy.scene.layers import LAYER_MODES
 
 Value = str | float | int | None
 PRESET = "preset"  # stands where a knob's name would
 LADDERS: dict[str, tuple[Value, ...]] = {
     PRESET: tuple(PRESETS),
-    "layers": LAYER_MODES,
-    "layer_spacing": (8.0, 4.0, 2.0, 1.0, 0.5),
+    "layers": LAYERS,
+    "layer_spacing": (2.5, 2.0, 1.0, 0.5),
     "pixel_tolerance": (1.0, 1e-1, 2e-2, 1e-3, 1e-6),  # the first samples the middle of a pixel, no more
     "window": (9, 17, 33, 65, 129),
     "enclosed_energy": (0.5, 0.6, 0.7, 0.8, 0.9),
@@ -47,7 +46,7 @@ def ladder(base: str | Fidelity = "balanced", knobs: Sequence[str] = tuple(LADDE
 
     Example:
         >>> [(step.value, step.fidelity.layer_spacing) for step in ladder("draft", ["layer_spacing"])][:2]
-        [(8.0, 8.0), (4.0, 4.0)]
+        [(2.5, 2.5), (2.0, 2.0)]
     """
     base = Fidelity.preset(base) if isinstance(base, str) else base
     settings = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ class TradeRow:
         capture_seconds: a capture whose masks have changed since the last one: PSF bank and rendering, no gradients.
             Median over the repeats, here and below; what depends on neither masks nor scene is kept.
         capture_spread: its interquartile range in seconds.
-        render_seconds: a capture whose PSF bank is there already.
+        render_seconds: a capture whose PSFs are remembered from the one before.
         render_spread: its interquartile range in seconds.
         training_seconds: a capture and the gradients of its mean with respect to the masks; None if not measured.
         training_spread: its interquartile range in seconds.
@@ -170,7 +169,6 @@ def measure(
             whole = seconds(capture_once, repeats, device)
             camera = _camera(optics, fidelity)  # a new one has nothing of an earlier capture to free
             memory = peak_bytes(capture_once, device)
-            camera.psf_bank = functools.cache(camera.psf_bank)
             rendering = seconds(lambda: camera(light, depth), repeats, device)
         gradients, gradients_memory = None, None
         if training:

@@ -5,8 +5,7 @@ from dataclasses import fields
 import pytest
 
 from kornia_tidy import Fidelity
-from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.scene.layers import LAYER_MODES
+from kornia_tidy.fidelity import LAYERS, PRESETS
 from kornia_tidy.tradeoff.ladder import LADDERS, ladder
 from tests.base import BaseTester
 
@@ -33,7 +32,7 @@ class TestLadder(BaseTester):
     def test_feature_presets_and_modes_are_all_there(self):
         settings = ladder()
         assert [s.value for s in settings if s.knob == "preset"] == list(PRESETS)
-        assert [s.value for s in settings if s.knob == "layers"] == list(LAYER_MODES)
+        assert [s.value for s in settings if s.knob == "layers"] == list(LAYERS)
 
     def test_feature_a_setting_of_ones_own_is_a_base_too(self):
         base = Fidelity("mine", window=21)

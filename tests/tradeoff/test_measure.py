@@ -62,18 +62,19 @@ class TestMeasure(BaseTester):
 
     def test_feature_every_captures_masks_are_new_and_rendering_keeps_its_bank(self, monkeypatch):
         versions, banks = [], []
-        original = TiDyOptics.psf_bank
+        original = TiDyOptics._computed_bank
 
         def counted(self, *args, **kwargs):
             versions.append(self.masks.phase._version)
             banks.append(torch.is_grad_enabled())
             return original(self, *args, **kwargs)
 
-        monkeypatch.setattr(TiDyOptics, "psf_bank", counted)
+        monkeypatch.setattr(TiDyOptics, "_computed_bank", counted)
         image, depth = scene()
         measure(TiDyOptics(fidelity=QUICK), image, depth, QUICK, torch.zeros_like(image), repeats=3, training=True)
-        # error, (warm-up, 3) captures, memory, 1 bank for all renderings; memory, (warm-up, 3) with gradients
-        assert banks == [False] * 7 + [True] * 5
+        # error, (warm-up, 3) captures, memory, (warm-up, 3) renderings; memory, (warm-up, 3) with gradients
+        assert banks == [False] * 10 + [True] * 5
+        assert versions[6:10] == [versions[6]] * 4
         assert versions[1:6] == list(range(versions[0] + 1, versions[0] + 6))
 
     def test_feature_leaves_the_camera_as_it_was(self):
