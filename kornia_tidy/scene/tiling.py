@@ -161,7 +161,7 @@ class _Slopes:
     def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk) -> None:
         """Correlate the layers' own pixels with the light of their windows, of which ``light`` is the conjugate."""
         assert self.psfs is not None
-        if light.device.type != "cpu":
+        if not _by_slices(light):
             self.psfs.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
             return
         for run in chunk.runs:
@@ -183,13 +183,14 @@ def _spectra(psfs: Tensor, plan: Plan) -> Tensor:
     return torch.fft.fft2(psfs.index_select(0, plan.present), s=(plan.grid.size, plan.grid.size))
 
 
-# Products are of slices on a processor, to pass over memory as rarely as possible, and of all pairs at once on an
-# accelerator, to start as few kernels as possible.
+def _by_slices(planes: Tensor) -> bool:
+    """Slices pass over a processor's memory less often; all pairs at once start fewer kernels on an accelerator."""
+    return planes.device.type == "cpu"
 
 
 def _product(light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
     """Each pair's light times the spectrum of its layer: (pairs, C, size, size)."""
-    if light.device.type != "cpu":
+    if not _by_slices(light):
         return light.index_select(0, chunk.block).mul_(spectra.index_select(0, chunk.layer))
     product = light.new_empty(len(chunk.block), *light.shape[1:])
     for run in chunk.runs:
@@ -201,7 +202,7 @@ def _sum_layers(own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
     """Each block's sum over its layers of their light times their spectrum. May write over ``own``."""
     images, rows, columns = chunk.extent
     total = own.new_zeros(images * rows * columns, *own.shape[1:])
-    if own.device.type != "cpu":
+    if not _by_slices(own):
         return total.index_add_(0, chunk.block, own.mul_(spectra.index_select(0, chunk.layer)))
     for run in chunk.runs:
         total[run.blocks].addcmul_(own[run.pairs], spectra[run.layer])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kornia_tidy.scene import tiles
+from kornia_tidy.scene import tiles, tiling
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.tiles import Labels, choose_grid, make_plan
@@ -182,6 +182,20 @@ class TestTiledRender(BaseTester):
             for method in ("tiled", "dense")
         ]
         self.assert_close(*slopes, rtol=1e-10, atol=1e-12)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.usefixtures("small_tiles")
+    def test_feature_products_by_slices_and_of_all_pairs_are_equal(self, compositing, device, monkeypatch):
+        bank = make_bank(5, 2, 5, device=device)
+        image, defocus = make_scene(bank, 2, 31, 46)
+        results = []
+        for by_slices in (True, False):
+            monkeypatch.setattr(tiling, "_by_slices", lambda _, choice=by_slices: choice)
+            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs)]
+            coded = render(*inputs[:2], Bank(inputs[2], bank.defocus), compositing)
+            results.append((coded, *torch.autograd.grad(coded.square().sum(), inputs)))
+        for one, other in zip(*results, strict=True):
+            self.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     def test_exception_second_gradients_are_left_to_the_dense_render(self, compositing, device):
