@@ -40,9 +40,12 @@ Without --image and --depth the scene is made here (dead leaves).
 """
 
 EPILOG = """\
-Results go to FOLDER/trade.json, trade.csv and trade.png after every setting, and a table
-to the screen at the end. Interrupt with Ctrl-C and run the same again: it goes on where
-it was. Another scene, machine or version of the code starts anew.
+Results go to FOLDER/trade.json and trade.csv after every setting, a picture of them to
+trade.png and a table to the screen at the end. Interrupt with Ctrl-C and run the same
+again: it goes on where it was. Another scene, machine or version of the code starts anew.
+
+A knob cannot lower the error below what the others leave: a base that is exact but slow,
+--base reference, shows what each of them does alone.
 
 Times tell most on a machine that does nothing else. PyTorch uses as many threads as the
 environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.
