@@ -35,7 +35,7 @@ class Fidelity:
 
     Example:
         >>> Fidelity.preset("balanced").layers
-        'bandlimited'
+        'linear'
         >>> Fidelity.preset("draft").replace(layer_spacing=2.0).name
         'draft, changed'
     """
@@ -85,7 +85,7 @@ class Fidelity:
 PRESETS = {
     "paper": Fidelity("paper", propagation="paper", layers="nearest", stray_light="discard", correlate=True),
     "draft": Fidelity("draft", pixel_tolerance=1e-1, layers="nearest", enclosed_energy=0.6, max_window=41),
-    "balanced": Fidelity(layers="bandlimited"),
+    "balanced": Fidelity(),
     "reference": Fidelity(
         "reference",
         layers="bandlimited",

@@ -20,7 +20,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.defocus_interpolation import REFINEMENT, TAPS, defocus_band, interpolated_bank
+from kornia_tidy.optics.defocus_interpolation import FINE_SPACING, TAPS, defocus_band, interpolated_bank
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
@@ -401,8 +401,9 @@ class TiDyOptics(nn.Module):
             bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus))
         else:
             spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
-            count = REFINEMENT * (len(nodes) - 1)
-            targets = _around(tuple(nodes[0] + spacing / REFINEMENT * i for i in range(count + 1)), defocus)
+            finer = ceil(spacing / FINE_SPACING)
+            fine = tuple(nodes[0] + spacing / finer * i for i in range(finer * (len(nodes) - 1) + 1))
+            targets = _around(fine, defocus)
             first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
             last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
