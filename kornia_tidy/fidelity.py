@@ -88,7 +88,6 @@ PRESETS = {
     "balanced": Fidelity(),
     "reference": Fidelity(
         "reference",
-        layers="bandlimited",
         pixel_tolerance=1e-6,
         layer_spacing=1.0,
         enclosed_energy=0.9,

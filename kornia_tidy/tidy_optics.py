@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
@@ -31,6 +32,9 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import check_border
 from kornia_tidy.sensor.noise import SensorNoise
+
+if TYPE_CHECKING:
+    from kornia_tidy.planning import RenderPlan
 
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
@@ -174,6 +178,7 @@ class TiDyOptics(nn.Module):
     ) -> Tensor:
         """Take a picture of an image and its depth. See :meth:`forward`."""
         image, depth, batched = self._checked(image, depth)
+        check_border(self.border, *image.shape[-2:], self.window)
         dtype = self._compute_dtype(image)
         with torch.autocast(image.device.type, enabled=False):
             light = self.decode(image.to(dtype))
@@ -236,6 +241,47 @@ class TiDyOptics(nn.Module):
         lo, hi = self.camera.defocus_range
         intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
+
+    # ------------------------------------------------------------------ how exactly to compute
+
+    def with_fidelity(self, fidelity: str | Fidelity) -> TiDyOptics:
+        """Return this camera at another fidelity. The parts are shared, so masks learn through both.
+
+        Args:
+            fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
+        """
+        other = copy.copy(self)
+        for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
+            other.__dict__[kind] = dict(self.__dict__[kind])
+        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        return other
+
+    @torch.no_grad()
+    def plan(self, depth: Tensor, image: Tensor | None = None, tolerance: float = 1e-3) -> RenderPlan:
+        """Return the cheapest way to capture a scene within an error. See :mod:`kornia_tidy.planning`.
+
+        Args:
+            depth: (B, 1, H, W) or (1, H, W), as for a capture.
+            image: (B, C, H, W) or (C, H, W). Default: photographs as they usually are, of the spectrum's channels.
+            tolerance: root mean square error of the noise-free linear capture against ``reference``, full scale 1.
+
+        Returns:
+            A plan for the masks as they are now, whose ``fidelity`` is for :meth:`with_fidelity`.
+
+        Example:
+            >>> optics = TiDyOptics(PixelwiseMask(1, initial="flat"))
+            >>> plan = optics.plan(torch.full((1, 96, 96), 0.9), tolerance=1e-2)
+            >>> plan.predicted_error <= 1e-2
+            True
+        """
+        from kornia_tidy.planning import Planner  # noqa: PLC0415 (only who plans waits for it)
+
+        shape = (len(self.spectrum.weights), *depth.shape[-2:])
+        blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
+        blank, depth, _ = self._checked(blank, depth)
+        light = None if image is None else self.decode(blank.to(self._compute_dtype(blank)))
+        defocus = self.camera.defocus(depth.to(self._compute_dtype(depth)), check_inputs=False)
+        return Planner(self, blank.shape[1]).scene(defocus, light).plan(tolerance)
 
     # ------------------------------------------------------------------ the window of the PSFs
 
@@ -447,7 +493,6 @@ class TiDyOptics(nn.Module):
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
                 f"{tuple(depth.shape)}"
             )
-        check_border(self.border, *image.shape[-2:], self.window)
         if self.check_inputs and not torch.compiler.is_compiling():
             check_finite("image", image)
             self.camera.defocus(depth.detach(), check_inputs=True)

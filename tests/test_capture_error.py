@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import scipy.ndimage
+import scipy.special
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy.capture_error import (
+    CONTRAST,
+    PSFSurvey,
+    chebyshev_nodes,
+    chebyshev_weights,
+    defocus_histogram,
+    natural_power,
+    nodes_needed,
+    power_spectrum,
+    region_power,
+)
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.planning import Planner
+from tests.base import BaseTester
+
+
+class TestInterpolation(BaseTester):
+    @settings(max_examples=20, deadline=None)
+    @given(st.floats(-30, 0), st.floats(1, 40), st.integers(2, 12))
+    def test_property_polynomials_are_exact(self, lo, length, count):
+        nodes = chebyshev_nodes(lo, lo + length, count)
+        at = torch.cat([torch.linspace(lo, lo + length, 7, dtype=torch.float64), nodes])
+        polynomial = torch.special.chebyshev_polynomial_t(2 * (at - lo) / length - 1, count - 1)
+        known = torch.special.chebyshev_polynomial_t(2 * (nodes - lo) / length - 1, count - 1)
+        self.assert_close(chebyshev_weights(at, nodes) @ known, polynomial, atol=1e-9, rtol=0)
+
+    @pytest.mark.parametrize(("half_range", "bandwidth"), [(20.0, 1.3), (8.0, 1.1), (1.0, 2.2), (100.0, 1.5)])
+    def test_feature_enough_nodes_for_the_bandwidth(self, half_range, bandwidth):
+        """The terms left out of exp(i b L t) in Chebyshev polynomials are 2 J_n(bL)."""
+        left_out = scipy.special.jv(range(nodes_needed(half_range, bandwidth), 1000), half_range * bandwidth)
+        assert 2 * abs(left_out).sum() < 1e-5
+
+    def test_feature_surveyed_psfs_carry_those_of_every_defocus(self):
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
+        survey = PSFSurvey(
+            lambda nodes: optics.psf_bank(3, None, nodes), (-20, 20), Planner(optics, 3).geometry.bandwidth
+        )
+        psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
+        direct = optics.psf_bank(3, None, psi).with_stray_light("renormalize").psfs.detach()
+        weights = chebyshev_weights(torch.tensor(psi, dtype=torch.float64), survey.nodes)
+        surveyed = torch.einsum("an,ncpq->acpq", weights, survey.psfs.double())
+        energy = survey.energy(psi, 31)
+        self.assert_close(energy, optics.psf_bank(3, None, psi).energy.detach(), atol=1e-5, rtol=0)
+        assert float((surveyed / energy[..., None, None] - direct).abs().sum((-2, -1)).max()) < 1e-4
+
+    def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
+        """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
+        optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
+        assert 1.05**2 * 530 / 470 <= Planner(optics, 1).geometry.bandwidth <= 1.2 * 530 / 470
+
+
+class TestPower(BaseTester):
+    @settings(max_examples=20, deadline=None)
+    @given(st.integers(9, 24), st.integers(9, 24), st.sampled_from([1, 3, 5]), st.integers(0, 1000))
+    def test_property_power_times_filter_is_the_mean_square(self, height, width, side, seed):
+        generator = torch.Generator().manual_seed(seed)
+        light = torch.rand(2, 1, height, width, dtype=torch.float64, generator=generator)
+        kernel = torch.randn(side, side, dtype=torch.float64, generator=generator)
+        kernel -= kernel.mean()
+        blurred = [scipy.ndimage.convolve(plane[0].numpy(), kernel.numpy(), mode="wrap") for plane in light]
+        expected = sum((plane**2).mean() for plane in blurred) / 2
+        size = 2 * side + 1  # no shift of the kernel against itself reaches round
+        response = torch.fft.rfft2(kernel, s=(size, size)).abs().square()
+        self.assert_close(
+            (power_spectrum(light, "circular", size) * response).sum(), torch.tensor(expected), atol=1e-12
+        )
+
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "zero"])
+    def test_feature_borders_are_accounted_for(self, border):
+        """A small image and a wide blur, where half of the light is made up."""
+        generator = torch.Generator().manual_seed(0)
+        light = torch.rand(1, 1, 30, 30, dtype=torch.float64, generator=generator)
+        kernel = torch.ones(15, 15, dtype=torch.float64) / 225
+        kernel[7, 7] -= 1
+        mode = {"reflect": "mirror", "replicate": "nearest", "zero": "constant"}[border]
+        measured = (scipy.ndimage.convolve(light[0, 0].numpy(), kernel.numpy(), mode=mode) ** 2).mean()
+        response = torch.fft.rfft2(kernel, s=(31, 31)).abs().square()
+        assert 0.9 < float((power_spectrum(light, border, 31) * response).sum()) / measured < 1.6
+
+    def test_feature_large_images_are_read_in_blocks(self, monkeypatch):
+        light = torch.rand(1, 1, 64, 48, dtype=torch.float64)
+        whole = power_spectrum(light, "reflect", 7)
+        monkeypatch.setattr("kornia_tidy.capture_error._BLOCK", 32)
+        self.assert_close(power_spectrum(light, "reflect", 7).sum(), whole.sum(), rtol=0.05, atol=0)
+
+    def test_feature_a_typical_photograph_has_its_contrast_and_slope(self):
+        power = natural_power(2, 64)
+        assert float(power[0].sum()) == pytest.approx(CONTRAST**2)
+        assert float(power[1, 0, 4] / power[1, 0, 8]) == pytest.approx(4)
+        assert float(power[0, 0, 0]) == 0
+
+    def test_feature_one_depth_has_no_outlines(self):
+        light = torch.rand(1, 3, 20, 20)
+        flat = region_power(light, torch.full((1, 1, 20, 20), 3.0), "reflect", 15)
+        self.assert_close(flat, power_spectrum(light, "reflect", 15), atol=1e-12, rtol=0)
+        white = torch.ones(1, 1, 20, 20)
+        assert float(region_power(white, torch.rand(1, 1, 20, 20), "circular", 15).sum()) > 0.1
+
+
+class TestHistogram(BaseTester):
+    def test_feature_isolated_depths_are_kept_exactly(self):
+        psi, share = defocus_histogram(torch.tensor([[0.1, 0.1], [7.3, math.inf]]), -20, 20)
+        self.assert_close(psi, torch.tensor([0.1, 7.3, 20.0]), atol=1e-6, rtol=0)
+        assert share.tolist() == [0.5, 0.25, 0.25]

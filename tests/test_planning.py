@@ -1,0 +1,344 @@
+"""Plans: measured errors stay within the tolerance asked, on real and on random scenes, and near those predicted."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn.functional import conv2d, interpolate, pad
+
+from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.planning import LAYER_SPACINGS, REFERENCE, PlannedScene, Planner, largest_window, window_ladder
+from kornia_tidy.scene.compositing import render
+from kornia_tidy.scene.layers import LAYER_MODES
+from tests.base import BaseTester, needs_data
+from tests.scenes import ENTRIES, load_scene
+
+NAMES = tuple(ENTRIES)
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
+
+
+class Rig:
+    """A camera, its planner, and captures of both plan and reference with banks made once."""
+
+    def __init__(self, optics: TiDyOptics, channels: int = 3) -> None:
+        self.optics = optics
+        self.planner = Planner(optics, channels)
+        self.channels = channels
+        self._banks: dict[Fidelity, PSFBank] = {}
+
+    @torch.no_grad()
+    def capture(self, light: Tensor, defocus: Tensor, fidelity: Fidelity) -> Tensor:
+        key = fidelity.replace(name="")
+        if key not in self._banks:
+            self._banks[key] = self.optics.with_fidelity(fidelity).psf_bank(self.channels)
+        dtype = torch.float64 if fidelity.double else torch.float32
+        return render(
+            light.to(dtype),
+            defocus.to(dtype),
+            self._banks[key],
+            self.optics.compositing,
+            layers=fidelity.layers,
+            border=self.optics.border,
+        ).double()
+
+    def error(self, light: Tensor, defocus: Tensor, fidelity: Fidelity, reference: Fidelity) -> float:
+        difference = self.capture(light, defocus, fidelity) - self.capture(light, defocus, reference)
+        return float(difference.square().mean().sqrt())
+
+
+def real_scene(name: str, optics: TiDyOptics, side: int) -> tuple[Tensor, Tensor]:
+    scene = load_scene(name)
+    scale = side / max(scene.image.shape[-2:])
+    size = [round(length * scale) for length in scene.image.shape[-2:]]
+    image = interpolate(scene.image[None], size, mode="area")
+    return optics.decode(image), optics.camera.defocus(interpolate(scene.depth[None], size, mode="nearest"))
+
+
+def smooth(shape: tuple[int, ...], width: float, generator: torch.Generator) -> Tensor:
+    """Gaussian noise of unit variance, correlated over a width in pixels."""
+    offset = torch.arange(-int(3 * width), int(3 * width) + 1)
+    bell = torch.exp(-(offset**2) / (2 * width**2))
+    planes = torch.randn(shape, generator=generator).flatten(0, -3)[:, None]
+    blurred = conv2d(pad(planes, (len(bell) // 2,) * 4, mode="circular"), (bell[:, None] * bell)[None, None])
+    return (blurred / blurred.std()).reshape(shape)
+
+
+IMAGES = {
+    "white": lambda shape, g: torch.rand(shape, generator=g),
+    "smooth": lambda shape, g: (0.5 + 0.2 * smooth(shape, 2.0, g)).clamp(0, 1),
+    "shapes": lambda shape, g: (smooth(shape, 4.0, g) > 0).float(),
+}
+DEPTHS = {
+    "white": lambda shape, g: torch.rand(shape, generator=g),
+    "smooth": lambda shape, g: (0.5 + 0.25 * smooth(shape, 5.0, g)).clamp(0, 1),
+    "plane": lambda shape, g: torch.linspace(0, 1, shape[-1]).expand(shape),
+    "flat": lambda shape, g: torch.rand(1, generator=g).expand(shape),
+}
+MASKS = {
+    "random": lambda g: PixelwiseMask(2, 15, generator=g),
+    "flat": lambda g: PixelwiseMask(1, 11, initial="flat"),
+    "learned": lambda g: PixelwiseMask(initial=0.5e-6 * smooth((1, 23, 23), 2.0, g)),
+}
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """A smooth mask, whose PSFs need 45 pixels: a random one needs 119, and takes ten times as long."""
+    return Rig(TiDyOptics(MASKS["learned"](torch.Generator().manual_seed(0)), sensor=None))
+
+
+@pytest.fixture(scope="module")
+def flat():
+    return TiDyOptics(PixelwiseMask(2, initial="flat"), sensor=None)
+
+
+@pytest.fixture(scope="module")
+def scene(flat) -> PlannedScene:
+    generator = torch.Generator().manual_seed(1)
+    light = IMAGES["smooth"]((2, 3, 60, 72), generator)
+    return Planner(flat, 3).scene(20 * DEPTHS["smooth"]((2, 1, 60, 72), generator) - 18, light)
+
+
+class TestTolerance(BaseTester):
+    @needs_data
+    def test_property_real_scenes_stay_within_the_tolerance_asked(self, rig):
+        self.judge(rig, [(name, 96) for name in NAMES[2::5]])
+
+    @needs_data
+    @pytest.mark.slow
+    def test_property_all_real_scenes_stay_within_the_tolerance_asked(self):
+        self.judge(Rig(TiDyOptics(PixelwiseMask(2), sensor=None)), [(name, 160) for name in NAMES])
+
+    def judge(self, rig, scenes):
+        ratios = []
+        for name, side in scenes:
+            light, defocus = real_scene(name, rig.optics, side)
+            scene = rig.planner.scene(defocus, light)
+            for tolerance in TOLERANCES:
+                plan = scene.plan(tolerance)
+                measured = rig.error(light, defocus, plan.fidelity, plan.reference)
+                assert measured <= plan.predicted_error <= tolerance, f"{name}: {measured:.2e}\n{plan}"
+                ratios.append(plan.predicted_error / measured)
+        assert float(torch.tensor(ratios).median()) < 2
+
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
+    @settings(max_examples=2, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(
+        st.sampled_from(sorted(IMAGES)),
+        st.sampled_from(sorted(DEPTHS)),
+        st.sampled_from(sorted(MASKS)),
+        st.sampled_from(["gather", "scatter"]),
+        st.tuples(st.floats(0.3, 1.0), st.sampled_from([2.0, 10.0, float("inf")])),
+        st.tuples(st.floats(-8, -2), st.floats(2, 8)),
+        st.floats(4e-6, 9e-6),
+        st.tuples(st.integers(33, 48), st.integers(33, 48)),
+        st.integers(0, 2**31),
+    )
+    def test_property_random_scenes_masks_and_cameras_stay_within_the_tolerance_asked(
+        self, border, image, depth, masks, compositing, depth_range, defocus_range, pitch, size, seed
+    ):
+        generator = torch.Generator().manual_seed(seed)
+        optics = TiDyOptics(
+            MASKS[masks](generator),
+            ThinLensCamera.for_scene(depth_range, defocus_range, pixel_pitch=pitch),
+            sensor=None,
+            compositing=compositing,
+            border=border,
+            fidelity=Fidelity(window=3),
+        )
+        light = IMAGES[image]((1, 3, *size), generator)
+        lo, hi = defocus_range
+        defocus = lo + (hi - lo) * DEPTHS[depth]((1, 1, *size), generator)
+        rig = Rig(optics)
+        scene = rig.planner.scene(defocus, light)
+        for tolerance in TOLERANCES:
+            plan = scene.plan(tolerance)
+            assert plan.predicted_error <= tolerance
+            measured = rig.error(light, defocus, plan.fidelity, plan.reference)
+            assert measured <= tolerance, f"{measured:.2e}\n{plan}"
+
+    @needs_data
+    def test_property_a_photograph_not_given_is_expected_to_be_a_contrasty_one(self, rig):
+        for name in NAMES[::7]:
+            light, defocus = real_scene(name, rig.optics, 96)
+            plan = rig.planner.scene(defocus).plan(1e-2)
+            assert rig.error(light, defocus, plan.fidelity, plan.reference) <= 1e-2
+
+    @needs_data
+    @pytest.mark.parametrize("layers", LAYER_MODES)
+    @pytest.mark.parametrize(("spacing", "narrower"), [(8.0, 0), (2.0, 10), (0.5, 0)])
+    def test_feature_every_kind_of_layers_is_predicted(self, layers, spacing, narrower, rig):
+        light, defocus = real_scene(NAMES[0], rig.optics, 96)
+        scene = rig.planner.scene(defocus, light)
+        window = scene.reference.window
+        assert window is not None
+        fidelity = scene.reference.replace(
+            layers=layers, layer_spacing=spacing, window=window - narrower, pixel_tolerance=2e-2, double=False
+        )
+        measured = rig.error(light, defocus, fidelity, scene.reference)
+        assert 1 < scene.error(fidelity) / measured < 2
+
+
+class TestPlan(BaseTester):
+    def test_smoke_plan_and_capture(self, flat):
+        image, depth = torch.rand(2, 3, 60, 72), 0.4 + torch.rand(2, 1, 60, 72)
+        plan = flat.plan(depth, image, tolerance=1e-2)
+        planned = flat.with_fidelity(plan.fidelity)
+        assert planned(image, depth).shape == image.shape
+        assert planned.window == plan.fidelity.window
+
+    def test_feature_is_the_planner_in_one_call(self, flat):
+        image, depth = torch.rand(3, 60, 72), 0.4 + torch.rand(1, 60, 72)
+        scene = Planner(flat, 3).scene(flat.camera.defocus(depth[None]), flat.decode(image[None]))
+        assert flat.plan(depth, image, 1e-2) == scene.plan(1e-2)
+        assert flat.plan(depth, tolerance=1e-2) == Planner(flat, 3).scene(flat.camera.defocus(depth[None])).plan(1e-2)
+
+    def test_property_a_looser_tolerance_costs_no_more(self, scene):
+        plans = [scene.plan(tolerance) for tolerance in (1e-5, *reversed(TOLERANCES), 1.0)]
+        costs = [plan.operations for plan in plans]
+        assert costs == sorted(costs, reverse=True)
+        assert costs[0] <= plans[0].reference_operations
+        assert costs[-1] < 0.05 * costs[0]
+
+    def test_feature_an_impossible_tolerance_gives_the_reference_and_says_so(self, scene):
+        plan = scene.plan(1e-12)
+        assert (
+            plan.fidelity
+            == plan.reference
+            == Fidelity.preset("reference").replace(name="reference", window=plan.reference.window)
+        )
+        assert plan.predicted_error == 0
+        assert "nothing cheaper is within the tolerance" in str(plan)
+
+    def test_feature_the_text_tells_what_why_and_how_much(self, scene):
+        plan = scene.plan(1e-3)
+        text = str(plan)
+        assert text.startswith("planned, tolerance 0.001: error ")
+        for words in (
+            f"{plan.layers_present} of {plan.layers_total} {plan.fidelity.layers} layers",
+            "PSFs at 3 wavelengths",
+            f"{plan.fidelity.window}x{plan.fidelity.window} px",
+            f"{plan.layers_total - plan.layers_present} layers at depths that the scene does not have",
+            "float64 (error ",
+            f"{plan.operations:.1e} operations",
+        ):
+            assert words in text
+
+    def test_feature_predicted_error_is_the_sum_of_its_parts(self, scene):
+        plan = scene.plan(1e-3)
+        assert plan.predicted_error == pytest.approx(sum(error for _, error in plan.error_parts))
+        assert scene.error(plan.fidelity) == plan.predicted_error
+
+    def test_feature_the_references_window_is_that_of_the_preset(self, flat, scene):
+        assert scene.reference.window == flat.with_fidelity("reference").window
+
+    def test_feature_the_references_own_error_is_that_of_linear_layers(self, rig):
+        """Against the reference with eight times as many layers, where what is left is a sixty-fourth."""
+        generator = torch.Generator().manual_seed(2)
+        light, defocus = IMAGES["smooth"]((1, 3, 48, 48), generator), torch.linspace(-6, 6, 48).expand(1, 1, 48, 48)
+        plan = rig.planner.scene(defocus, light).plan(1e-12)
+        fine = plan.reference.replace(layer_spacing=1 / 8)
+        nodes = tuple(node for node in rig.optics.with_fidelity(fine).defocus_nodes if abs(node) < 6.2)
+        with torch.no_grad():
+            bank = rig.optics.with_fidelity(fine).psf_bank(3, None, nodes)
+        truth = render(light.double(), defocus.double(), bank, layers="linear")
+        measured = float((rig.capture(light, defocus, plan.reference) - truth).square().mean().sqrt())
+        assert plan.reference_error == pytest.approx(measured, rel=0.2)
+
+    def test_feature_small_images_get_a_reference_that_fits_their_border(self):
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None)
+        image, depth = torch.rand(3, 20, 24), torch.full((1, 20, 24), 0.5)
+        plan = optics.plan(depth, image, tolerance=1e-2)
+        assert plan.reference.window == 39
+        assert optics.with_fidelity(plan.reference)(image, depth).shape == image.shape
+
+    @pytest.mark.parametrize("size", [(1, 1), (2, 5), (3, 40)])
+    def test_cardinality_tiny_images(self, size, flat):
+        image, depth = torch.rand(3, *size), torch.full((1, *size), 0.5)
+        plan = flat.plan(depth, image, tolerance=1e-3)
+        assert flat.with_fidelity(plan.fidelity)(image, depth).shape == image.shape
+
+    def test_cardinality_one_channel_one_node_and_float64(self):
+        optics = TiDyOptics(PixelwiseMask(1, initial="flat"), DefocusRange(-1.0, 1.0), DwellTimes(), None)
+        depth = torch.rand(1, 1, 40, 40, dtype=torch.float64)
+        plan = optics.plan(depth, torch.rand(1, 1, 40, 40, dtype=torch.float64))
+        assert plan.wavelengths == 1
+        assert plan.layers_total <= 5
+
+    def test_feature_layers_counted_are_those_rendered(self, flat):
+        """All depths between two nodes, at the end of the range: two of them hold the scene."""
+        defocus = torch.linspace(-19.9, -19.6, 48).expand(1, 1, 48, 48)
+        plan = Planner(flat, 3).scene(defocus, torch.rand(1, 3, 48, 48)).plan(1e-12)
+        assert (plan.layers_present, plan.layers_total) == (2, 41)
+
+    def test_feature_masks_may_learn_and_be_planned_for(self, flat):
+        plan = flat.plan(torch.full((1, 40, 40), 0.5), tolerance=1e-2)
+        assert flat.masks.phase.requires_grad
+        coded = flat.with_fidelity(plan.fidelity)(torch.rand(3, 40, 40), torch.full((1, 40, 40), 0.5))
+        coded.square().mean().backward()
+        assert float(flat.masks.phase.grad.abs().max()) > 0
+        flat.masks.phase.grad = None
+
+    def test_feature_a_paper_camera_can_be_planned_exactly(self):
+        paper = TiDyOptics(PixelwiseMask(1), DefocusRange(-10, 10), sensor=None, fidelity="paper")
+        plan = paper.plan(torch.rand(1, 48, 48), tolerance=1e-1)
+        assert plan.fidelity.propagation == "exact"
+
+    def test_exception_names_the_tolerance(self, scene):
+        with pytest.raises(ValueError, match="tolerance must be positive and finite, got -1"):
+            scene.plan(-1.0)
+
+    def test_exception_depth_is_checked(self, flat):
+        with pytest.raises(ValueError, match=r"depth must be positive metres, got 0\.0"):
+            flat.plan(torch.zeros(1, 40, 40))
+
+    def test_exception_errors_are_of_exact_fidelities_with_a_window(self, scene):
+        with pytest.raises(ValueError, match=r"propagation 'exact' and stray_light 'renormalize', got 'paper'"):
+            scene.error(Fidelity.preset("paper"))
+        with pytest.raises(ValueError, match=r"a fixed window up to the reference's .* got None"):
+            scene.error(Fidelity.preset("balanced"))
+        with pytest.raises(ValueError, match=r"a fixed window up to the reference's .* got 999"):
+            scene.error(Fidelity(window=999))
+
+
+class TestWithFidelity(BaseTester):
+    def test_feature_parts_are_shared_until_swapped(self):
+        optics = TiDyOptics(PixelwiseMask(1, initial="flat"), sensor=None)
+        other = optics.with_fidelity("draft")
+        assert other.masks is optics.masks
+        assert (optics.fidelity.name, other.fidelity.name) == ("balanced", "draft")
+        other.masks = PixelwiseMask(2)
+        assert len(optics.masks.phase) == 1
+
+    def test_feature_equals_a_camera_made_so(self):
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None)
+        made = TiDyOptics(optics.masks, sensor=None, fidelity=Fidelity(window=15, layer_spacing=4.0))
+        image, depth = torch.rand(3, 40, 40), 0.4 + torch.rand(1, 40, 40)
+        self.assert_close(optics.with_fidelity(made.fidelity)(image, depth), made(image, depth), atol=0, rtol=0)
+
+
+class TestWindows(BaseTester):
+    def test_feature_ladders_are_odd_ascending_and_end_at_the_largest(self):
+        for largest in (1, 3, 5, 31, 129):
+            ladder = window_ladder(largest)
+            assert ladder[-1] == largest
+            assert all(window % 2 == 1 and window > 0 for window in ladder)
+            assert all(a < b <= 1.5 * a + 2 for a, b in pairwise(ladder))
+
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular", "valid"])
+    @pytest.mark.parametrize("side", [1, 2, 3, 8, 21])
+    def test_property_the_largest_window_can_be_rendered(self, border, side):
+        window = min(largest_window(border, side, side + 3), 51)
+        bank = PSFBank(torch.ones(1, 1, window, window), torch.zeros(1), torch.ones(1, 1))
+        coded = render(torch.ones(1, 1, side, side + 3), torch.zeros(1, 1, side, side + 3), bank, border=border)
+        assert coded.shape[-1] >= (side + 3) // 2
+
+    def test_feature_candidates_hold_the_references_knobs(self):
+        assert REFERENCE.layer_spacing in LAYER_SPACINGS
+        assert REFERENCE.layers in LAYER_MODES
