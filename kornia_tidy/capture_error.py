@@ -35,8 +35,8 @@ def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
     """Return the Chebyshev points of the first kind on [lo, hi], ascending, (count,) float64.
 
     Example:
-        >>> chebyshev_nodes(-1, 1, 3).round(decimals=3).tolist()
-        [-0.866, 0.0, 0.866]
+        >>> chebyshev_nodes(0, 2, 3).round(decimals=3).tolist()
+        [0.134, 1.0, 1.866]
     """
     angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (math.pi / count)
     return (lo + hi) / 2 - (hi - lo) / 2 * angle.cos()
@@ -269,7 +269,7 @@ class SceneErrors:
             psfs: the changes there, (len(nodes), C, P, P).
         """
         spectra = torch.fft.rfft2(psfs.double(), s=(self._size, self._size))
-        squares = (spectra.abs().square() * self._power).sum((-2, -1)).mean(1).clamp(min=0)
+        squares = (_power(spectra) * self._power).sum((-2, -1)).mean(1).clamp(min=0)
         above = torch.bucketize(self._psi, torch.tensor(nodes, dtype=torch.float64)).clamp(max=len(nodes) - 1)
         worse = torch.maximum(squares[above], squares[(above - 1).clamp(min=0)])
         return math.sqrt(float(worse @ self._share))
@@ -313,10 +313,14 @@ def _endless(block: Tensor, border: str, size: int) -> Tensor:
 def _covariance(plane: Tensor, size: int) -> Tensor:
     """Return the covariance of a periodic plane with itself at shifts up to half of ``size``, (C, size, size)."""
     height, width = plane.shape[-2:]
-    power = torch.fft.rfft2(plane).abs().square().mean(0) / (height * width)
+    power = _power(torch.fft.rfft2(plane)).mean(0) / (height * width)
     covariance = torch.fft.irfft2(power, s=(height, width)).cpu()
     lags = torch.fft.fftfreq(size, 1 / size).round().long()
     return covariance[:, (lags % height)[:, None], lags % width]
+
+
+def _power(spectrum: Tensor) -> Tensor:
+    return spectrum.real.square() + spectrum.imag.square()
 
 
 def _half_plane(power: Tensor, size: int) -> Tensor:

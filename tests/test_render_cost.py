@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from torch.utils.flop_counter import FlopCounterMode
@@ -12,12 +13,14 @@ from kornia_tidy.render_cost import bank_operations, rendering_operations, windo
 from tests.base import BaseTester
 
 MEMORY = """
-import resource, sys, warnings, torch
+import sys, warnings, torch
 from kornia_tidy import Fidelity, TiDyOptics
 from kornia_tidy.planning import Planner
 from kornia_tidy.render_cost import memory_bytes
 import torch._dynamo  # counted as no part of the capture
 warnings.simplefilter("ignore")
+def peak():
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")) * 1024
 torch.set_num_threads(1)
 side, window = int(sys.argv[1]), int(sys.argv[2])
 fidelity = Fidelity(window=window)
@@ -25,10 +28,10 @@ optics = TiDyOptics(sensor=None, fidelity=fidelity, color_space="linear")
 image, depth = torch.rand(1, 3, side, side), 0.3 + 5 * torch.rand(1, 1, side, side)
 with torch.no_grad():
     optics(image[..., :80, :80], depth[..., :80, :80] * 0 + 0.3)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak()
     optics(image, depth)
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-print(memory_bytes(Planner(optics, 3).geometry, image.shape, "reflect", fidelity, 21) / (used * 1024))
+    used = peak() - before
+print(memory_bytes(Planner(optics, 3).geometry, image.shape, "reflect", fidelity, 21) / used)
 """
 
 
@@ -55,8 +58,10 @@ class TestCost(BaseTester):
             window_side(Fidelity())
 
     @pytest.mark.slow
+    @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of memory is read from Linux's /proc")
     @pytest.mark.parametrize(("side", "window"), [(1024, 23), (768, 65)])
     def test_feature_memory_is_what_the_process_takes(self, side, window):
         run = [sys.executable, "-c", MEMORY, str(side), str(window)]
-        done = subprocess.run(run, capture_output=True, text=True, check=True)
+        done = subprocess.run(run, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
         assert 0.7 < float(done.stdout) < 1.4
