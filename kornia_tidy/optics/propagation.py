@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -177,8 +178,10 @@ def pixel_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     if step >= len(kernels):
         return _chunk_energies(field, weights, kernels)
     # Too large to hold at once: depth by depth, and the backward pass computes each chunk again.
-    chunks = [checkpoint(_chunk_energies, field, weights, chunk, use_reentrant=False) for chunk in kernels.split(step)]
-    return torch.cat(chunks)
+    chunk_energies = _chunk_energies
+    if torch.is_grad_enabled():  # checkpoint imports the compiler (2 s), so only where it is needed
+        chunk_energies = partial(checkpoint, _chunk_energies, use_reentrant=False)
+    return torch.cat([chunk_energies(field, weights, chunk) for chunk in kernels.split(step)])
 
 
 def _chunk_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
