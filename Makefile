@@ -38,6 +38,7 @@ bench: $(READY)
 	@$(BIN)/python -m pytest -q --override-ini addopts= tests/benchmarks \
 		--benchmark-quiet --benchmark-json=outputs/benchmarks.json $(ARGS)
 	@$(BIN)/python -m tests.benchmarks.table outputs/benchmarks.json | tee outputs/benchmarks.md
+	@$(BIN)/python -m pytest -q -s --override-ini addopts= tests/benchmarks/rendering_against_peers.py
 
 clean:
 	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis .benchmarks

@@ -1,6 +1,8 @@
 """Speed of rendering, ours and others' side by side, each checked to give the same image.
 
-Run with ``pytest tests/benchmarks/test_scene_benchmark.py -s``. The scene is a small random one and, where the shared
+Not named ``test_``: it times the real scene for minutes, which the check that every suite runs once must not.
+
+Run with ``pytest tests/benchmarks/rendering_against_peers.py -s``. The scene is a small random one and, where the shared
 data is present, Aloe (1110 x 1282, thin leaves: hard for tiles), its disparity laid linearly on [-20, 20] rad. PSFs are
 random. Ratios are taken within one run, the candidates in turn, from medians.
 """
