@@ -2,9 +2,9 @@
 
 Not named ``test_``: it times the real scene for minutes, which the check that every suite runs once must not.
 
-Run with ``pytest tests/benchmarks/rendering_against_peers.py -s``. The scene is a small random one and, where the shared
-data is present, Aloe (1110 x 1282, thin leaves: hard for tiles), its disparity laid linearly on [-20, 20] rad. PSFs are
-random. Ratios are taken within one run, the candidates in turn, from medians.
+Run with ``pytest tests/benchmarks/rendering_against_peers.py -s``. The scene is a small random one and, where the
+shared data is present, Aloe (1110 x 1282, thin leaves: hard for tiles), its disparity laid linearly on [-20, 20] rad.
+PSFs are random. Ratios are taken within one run, the candidates in turn, from medians.
 """
 
 from __future__ import annotations
