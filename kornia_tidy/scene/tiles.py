@@ -23,8 +23,9 @@ from kornia_tidy.scene.convolution import next_fast_size
 
 # Sides of transforms. A factor of 5 is left out: it nearly doubles the time of a sample.
 SIZES = (8, 12, 16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 576, 768, 1024, 1152, 1536, 2048)
-# Bytes that the planes of a chunk may take: in a processor's cache, or enough to keep an accelerator busy.
-CHUNK_BYTES = {"cpu": 16 << 20}
+# Bytes that the planes of a chunk may take: near a processor's cache (and below what makes an allocator give memory
+# back and fetch it again), or enough to keep an accelerator busy.
+CHUNK_BYTES = {"cpu": 6 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 
 
