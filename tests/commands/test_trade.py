@@ -10,7 +10,7 @@ from kornia_tidy.cli import main
 from kornia_tidy.commands import trade
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
-from kornia_tidy.scene.layers import LAYER_MODES
+from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.tradeoff import read_csv, read_json
 from kornia_tidy.tradeoff import sweep as real_sweep
 from tests.base import BaseTester
@@ -39,12 +39,12 @@ class TestTrade(BaseTester):
         assert main(["trade", *QUICK, "--knobs", "layers", "--training", "-o", str(folder)]) == 0
         told = capsys.readouterr().out
         run = read_json(folder / "trade.json")
-        assert [row.value for row in run.rows] == list(LAYER_MODES)
+        assert [row.value for row in run.rows] == list(LAYERS)
         assert list(run.rows) == read_csv(folder / "trade.csv")
         assert run.conditions.reference == "paper"
-        assert [row.rmse == 0 for row in run.rows] == [mode == "nearest" for mode in LAYER_MODES]
+        assert [row.rmse == 0 for row in run.rows] == [mode == "nearest" for mode in LAYERS]
         assert all(row.training_seconds > 0 for row in run.rows)
-        assert told.count("| layers | ") == len(LAYER_MODES) + 1  # and the column of that name
+        assert told.count("| layers | ") == len(LAYERS) + 1  # and the column of that name
         assert read_image(folder / "trade.png").shape == (3, 930, 1500)
         assert {p.name for p in folder.iterdir()} == {"trade.json", "trade.csv", "trade.png"}
         assert all(str(path) in told for path in folder.iterdir())
@@ -60,15 +60,15 @@ class TestTrade(BaseTester):
         with monkeypatch.context() as patch:
             patch.setattr(trade, "sweep", interrupted)
             assert main(command) == 130
-        assert "2 of 5 settings are written" in capsys.readouterr().out
-        assert [row.value for row in read_json(tmp_path / "trade.json").rows] == [8.0, 4.0]
+        assert "2 of 4 settings are written" in capsys.readouterr().out
+        assert [row.value for row in read_json(tmp_path / "trade.json").rows] == [2.5, 2.0]
         assert main(command) == 0
-        assert measured == [8.0, 4.0, 2.0, 1.0, 0.5]
-        assert "3 different ones to be measured" in capsys.readouterr().out
-        assert len(read_json(tmp_path / "trade.json").rows) == 5
+        assert measured == [2.5, 2.0, 1.0, 0.5]
+        assert "2 different ones to be measured" in capsys.readouterr().out
+        assert len(read_json(tmp_path / "trade.json").rows) == 4
 
         assert main([*command, "--seed", "1"]) == 0  # another scene
-        assert len(measured) == 10
+        assert len(measured) == 8
         assert "of another scene, machine or code" in capsys.readouterr().out
 
     @pytest.mark.usefixtures("measured")
