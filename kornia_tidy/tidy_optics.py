@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import warnings
-from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
-from functools import partial
-from math import ceil, floor, pi
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -18,19 +14,12 @@ from torch.utils.data import get_worker_info
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics.aperture import check_aperture, circular_aperture
-from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.defocus_interpolation import FINE_SPACING, TAPS, defocus_band, interpolated_bank
-from kornia_tidy.optics.exact import exact_psf_bank
-from kornia_tidy.optics.modulator import DwellTimes
-from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
-from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, adam_groups
-from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
-from kornia_tidy.optics.pupil import Pupil
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
-from kornia_tidy.scene.compositing import render
-from kornia_tidy.scene.convolution import check_border
+from kornia_tidy.optics.coded_lens import CodedLens
+from kornia_tidy.optics.phase_masks import PhaseMasks, adam_groups
+from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.scene.compositing import COMPOSITING, render
+from kornia_tidy.scene.convolution import BORDERS, check_border
 from kornia_tidy.sensor.noise import SensorNoise
 
 if TYPE_CHECKING:
@@ -41,7 +30,7 @@ DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers kn
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
 
-class TiDyOptics(nn.Module):
+class TiDyOptics(CodedLens):
     r"""A programmable camera: an image and its depth go in, a coded capture comes out, gradients reach the masks.
 
     The chain is: decode to linear light, blur by the PSFs of each pixel's depth (averaged over the masks shown during
@@ -112,35 +101,25 @@ class TiDyOptics(nn.Module):
         aperture: Tensor | None = None,
         check_inputs: bool = True,
     ) -> None:
-        super().__init__()
-        self.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
-        paper = self.fidelity.propagation == "paper"
+        fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        paper = fidelity.propagation == "paper"
         color_space = color_space or ("paper" if paper else "srgb")
         check_choice("color_space", color_space, COLOR_SPACES)
-        check_choice("compositing", compositing, ("gather", "scatter"))
-        check_choice("border", border, ("reflect", "replicate", "zero", "circular", "valid"))
+        check_choice("compositing", compositing, tuple(COMPOSITING))
+        check_choice("border", border, BORDERS)
         if paper and (color_space != "paper" or compositing != "gather"):
             raise ValueError(
                 f"fidelity 'paper' means color_space='paper' and compositing='gather', got {color_space!r} and "
                 f"{compositing!r}: leave them out, or use another fidelity"
             )
-        self.masks = PixelwiseMask() if masks is None else masks
-        self.camera = ThinLensCamera() if camera is None else camera
-        self.modulator = DwellTimes() if modulator is None else modulator
+        super().__init__(masks, camera, modulator, fidelity, spectrum, aperture)
         self.sensor = sensor
-        self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
         self.compositing = compositing
         self.color_space = color_space
         self.border = border
         self.check_inputs = check_inputs
-        self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
         self._clamped: Tensor | None = None
-        self._memory = BankMemory()
         self._warned = False
-        if paper:
-            warn_if_aliased(self.camera.defocus_range, self.spectrum)
-        self.register_load_state_dict_post_hook(_refit_window)
-        self.fit_window()
 
     # ------------------------------------------------------------------ the camera at work
 
@@ -184,7 +163,7 @@ class TiDyOptics(nn.Module):
             light = self.decode(image.to(dtype))
             defocus = self.camera.defocus(depth.to(dtype), check_inputs=False)
             self._count_clamped(defocus)
-            bank = self._scene_bank(image.shape[1], dtype, defocus)
+            bank = self.scene_bank(image.shape[1], dtype, defocus)
             light = render(
                 light,
                 defocus,
@@ -215,46 +194,7 @@ class TiDyOptics(nn.Module):
         sensor = cast("SensorNoise", self.sensor)
         return sensor.draw(shape, device=image.device, dtype=self._compute_dtype(image), generator=generator)
 
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-    ) -> PSFBank:
-        """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
-
-        Without gradients, PSFs are remembered while masks and camera stay as they are.
-
-        Args:
-            channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
-            dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
-            defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
-        """
-        spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
-        dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
-        nodes = self.defocus_nodes if defocus is None else tuple(defocus)
-        return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
-
-    @property
-    def defocus_nodes(self) -> tuple[float, ...]:
-        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
-        lo, hi = self.camera.defocus_range
-        intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
-        return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
-
     # ------------------------------------------------------------------ how exactly to compute
-
-    def with_fidelity(self, fidelity: str | Fidelity) -> TiDyOptics:
-        """Return this camera at another fidelity. The parts are shared, so masks learn through both.
-
-        Args:
-            fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
-        """
-        other = copy.copy(self)
-        for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
-            other.__dict__[kind] = dict(self.__dict__[kind])
-        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
-        return other
 
     @torch.no_grad()
     def plan(self, depth: Tensor, image: Tensor | None = None, tolerance: float = 1e-3) -> RenderPlan:
@@ -269,6 +209,7 @@ class TiDyOptics(nn.Module):
             A plan for the masks as they are now, whose ``fidelity`` is for :meth:`with_fidelity`.
 
         Example:
+            >>> from kornia_tidy import PixelwiseMask
             >>> optics = TiDyOptics(PixelwiseMask(1, initial="flat"))
             >>> plan = optics.plan(torch.full((1, 96, 96), 0.9), tolerance=1e-2)
             >>> plan.predicted_error <= 1e-2
@@ -282,57 +223,6 @@ class TiDyOptics(nn.Module):
         light = None if image is None else self.decode(blank.to(self._compute_dtype(blank)))
         defocus = self.camera.defocus(depth.to(self._compute_dtype(depth)), check_inputs=False)
         return Planner(self, blank.shape[1]).scene(defocus, light).plan(tolerance)
-
-    # ------------------------------------------------------------------ the window of the PSFs
-
-    @property
-    def window(self) -> int:
-        """Side of the PSFs in pixels: given by the fidelity, or measured by :meth:`fit_window`."""
-        return self.fit_window() if self._window is None else self._window
-
-    def fit_window(self) -> int:
-        """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
-
-        It is done on construction, after ``load_state_dict`` and when a part is swapped; masks in training keep their
-        window until this is called again. A window or a preset that fixes the side is only measured.
-
-        Returns:
-            The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
-        """
-        settings = self.fidelity
-        if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
-            raise ValueError(
-                f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
-                f"{min(self.spectrum.wavelengths) * 1e9:.0f} nm, got {settings.layer_spacing}"
-            )
-        fixed = PAPER_SIZE if settings.propagation == "paper" else settings.window
-        size = fixed or min(33, settings.max_window)
-        while True:
-            psfs = self._sampled_psfs(size)
-            window = fixed or enclosing_window(psfs, settings.enclosed_energy)
-            if window is not None or size == settings.max_window:
-                break
-            size = min(2 * size - 1, settings.max_window)
-        self._window = window or size
-        margin = (size - self._window) // 2
-        shares = psfs[..., margin : size - margin, margin : size - margin].sum((2, 3))
-        self._held = (float(shares.min()), float(shares.max()))
-        if window is None:
-            warnings.warn(
-                f"the largest PSF window allowed, {size} px, holds {self._held[0]:.0%} of the light where it should "
-                f"hold {settings.enclosed_energy:.0%}; the rest is handled by {settings.stray_light!r}: raise "
-                f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
-                stacklevel=2,
-            )
-        return self._window
-
-    @torch.no_grad()
-    def _sampled_psfs(self, size: int) -> Tensor:
-        """PSFs at both ends of the range and at focus, good enough to see where the light goes."""
-        lo, hi = self.camera.defocus_range
-        nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-        states, weights = self.modulator(self.masks.phase.to(torch.float32))
-        return self._build(states, weights, self.spectrum, self._pixel_step(), size, 0.1, nodes).psfs
 
     # ------------------------------------------------------------------ colour
 
@@ -384,94 +274,11 @@ class TiDyOptics(nn.Module):
             f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
         )
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
-        super().__setattr__(name, value)
-        if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
-            self.__dict__.update(_window=None, _pupil=None)
-
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: nothing of the last capture."""
-        return {**super().__getstate__(), "_clamped": None, "_memory": BankMemory()}
+        return {**super().__getstate__(), "_clamped": None}
 
     # ------------------------------------------------------------------ inside
-
-    @property
-    def pupil(self) -> Pupil:
-        """The aperture over the masks' pixels."""
-        size = self.masks.phase.shape[-1]
-        pupil = self.__dict__["_pupil"]
-        if pupil is None:
-            amplitude = circular_aperture(size, MASK_SPAN / size) if self._aperture is None else self._aperture
-            if amplitude.shape[-1] % size:
-                raise ValueError(
-                    f"aperture must have a whole number of cells for each of the {size} mask pixels, got "
-                    f"{tuple(amplitude.shape)}"
-                )
-            pupil = self.__dict__["_pupil"] = Pupil(amplitude, MASK_SPAN / amplitude.shape[-1])
-        return pupil
-
-    def _build(
-        self,
-        states: Tensor,
-        weights: Tensor,
-        spectrum: Spectrum,
-        step: float | Tensor,
-        window: int,
-        tolerance: float,
-        nodes: tuple[float, ...],
-    ) -> PSFBank:
-        dispersion = [self.masks.dispersion(w) for w in spectrum.wavelengths]
-        if self.fidelity.propagation == "paper":
-            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
-        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
-
-    def _computed_bank(self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...]) -> PSFBank:
-        """PSFs at these nodes, computed or remembered, before anything is done about stray light."""
-        states, weights = self.modulator(self.masks.phase.to(dtype))
-        step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
-        build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
-        learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
-        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
-            return build(nodes)
-        dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
-        paper = self.fidelity.propagation == "paper"
-        setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
-        return self._memory.recall(setting, states, weights, nodes, build)
-
-    def _scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
-        """PSFs at the layers that a scene's defocus lies between: those of other depths are not computed."""
-        spectrum, kind = self._spectrum(channels), self.fidelity.layers
-        nodes = self.defocus_nodes
-        if kind in ("nearest", "linear"):
-            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus))
-        else:
-            spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
-            finer = ceil(spacing / FINE_SPACING)
-            fine = tuple(nodes[0] + spacing / finer * i for i in range(finer * (len(nodes) - 1) + 1))
-            targets = _around(fine, defocus)
-            first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
-            last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
-            samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
-            bank = self._computed_bank(spectrum, dtype, samples)
-            bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
-        return bank.with_stray_light(self.fidelity.stray_light)
-
-    def _band(self) -> float:
-        return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
-
-    def _pixel_step(self) -> float | Tensor:
-        """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
-        return self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
-
-    def _spectrum(self, channels: int) -> Spectrum:
-        if channels == len(self.spectrum.weights):
-            return self.spectrum
-        if channels == 1:
-            return Spectrum.monochrome()
-        raise ValueError(
-            f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}"
-        )
 
     def _compute_dtype(self, image: Tensor) -> torch.dtype:
         return torch.float64 if self.fidelity.double or image.dtype == torch.float64 else torch.float32
@@ -536,22 +343,6 @@ class TiDyOptics(nn.Module):
         image, depth = sample["image"], sample[keys[0]]
         coded = self.capture(image, depth, params, generator)
         return {**sample, "image": coded, "all_in_focus": self._cropped(image), keys[0]: self._cropped(depth)}
-
-
-def _refit_window(optics: TiDyOptics, _: Any) -> None:
-    optics.fit_window()
-
-
-def _around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
-    if torch.compiler.is_compiling():
-        return nodes
-    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-    # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad)
-    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-    return nodes[min(first, last) : last + 1]
 
 
 def _any_channels(function: Any, image: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy import tidy_optics as module
+from kornia_tidy.optics import coded_lens as module
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=5.0)

@@ -1,0 +1,271 @@
+"""The lens with a programmable mask: from masks, camera and spectrum to the PSFs that a scene needs."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from functools import partial
+from math import ceil, floor, pi
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.aperture import check_aperture, circular_aperture
+from kornia_tidy.optics.bank_memory import BankMemory
+from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
+from kornia_tidy.optics.defocus_interpolation import FINE_SPACING, TAPS, defocus_band, interpolated_bank
+from kornia_tidy.optics.exact import exact_psf_bank
+from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
+from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask
+from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
+from kornia_tidy.optics.pupil import Pupil
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+
+
+class CodedLens(nn.Module):
+    """A lens whose phase mask changes during one exposure: all that decides how a point of light spreads.
+
+    Its parts can be swapped: ``masks``, ``modulator``, ``camera``, ``spectrum``, ``fidelity``. It knows no scene but
+    for the range of its defocus. :class:`kornia_tidy.TiDyOptics` is one that takes pictures.
+
+    Args:
+        masks: phase masks. Default: five learnable 23x23 masks of uniform noise.
+        camera: turns depth into defocus. Default: :class:`ThinLensCamera` as it comes.
+        modulator: turns masks into the states shown and their weights. Default: equal dwell times.
+        fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
+        spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
+        aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
+
+    Example:
+        >>> lens = CodedLens()
+        >>> lens.psf_bank(defocus=[-10.0, 0.0]).psfs.shape[:2]
+        torch.Size([2, 3])
+    """
+
+    def __init__(
+        self,
+        masks: PhaseMasks | None = None,
+        camera: ThinLensCamera | DefocusRange | None = None,
+        modulator: nn.Module | None = None,
+        fidelity: str | Fidelity = "balanced",
+        spectrum: Spectrum | None = None,
+        aperture: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        self.masks = PixelwiseMask() if masks is None else masks
+        self.camera = ThinLensCamera() if camera is None else camera
+        self.modulator = DwellTimes() if modulator is None else modulator
+        self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
+        self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
+        self._memory = BankMemory()
+        if self.fidelity.propagation == "paper":
+            warn_if_aliased(self.camera.defocus_range, self.spectrum)
+        self.register_load_state_dict_post_hook(_refit_window)
+        self.fit_window()
+
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+    ) -> PSFBank:
+        """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
+
+        Without gradients, PSFs are remembered while masks and camera stay as they are.
+
+        Args:
+            channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
+            dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
+            defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
+        """
+        spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
+        dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
+        nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+        return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
+
+    @property
+    def defocus_nodes(self) -> tuple[float, ...]:
+        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
+        lo, hi = self.camera.defocus_range
+        intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
+        return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
+
+    def with_fidelity(self, fidelity: str | Fidelity) -> Self:
+        """Return this lens at another fidelity. The parts are shared, so masks learn through both.
+
+        Args:
+            fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
+        """
+        other = copy.copy(self)
+        for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
+            other.__dict__[kind] = dict(self.__dict__[kind])
+        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        return other
+
+    # ------------------------------------------------------------------ the window of the PSFs
+
+    @property
+    def window(self) -> int:
+        """Side of the PSFs in pixels: given by the fidelity, or measured by :meth:`fit_window`."""
+        return self.fit_window() if self._window is None else self._window
+
+    def fit_window(self) -> int:
+        """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
+
+        It is done on construction, after ``load_state_dict`` and when a part is swapped; masks in training keep their
+        window until this is called again. A window or a preset that fixes the side is only measured.
+
+        Returns:
+            The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
+        """
+        settings = self.fidelity
+        if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
+            raise ValueError(
+                f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
+                f"{min(self.spectrum.wavelengths) * 1e9:.0f} nm, got {settings.layer_spacing}"
+            )
+        fixed = PAPER_SIZE if settings.propagation == "paper" else settings.window
+        size = fixed or min(33, settings.max_window)
+        while True:
+            psfs = self._sampled_psfs(size)
+            window = fixed or enclosing_window(psfs, settings.enclosed_energy)
+            if window is not None or size == settings.max_window:
+                break
+            size = min(2 * size - 1, settings.max_window)
+        self._window = window or size
+        margin = (size - self._window) // 2
+        shares = psfs[..., margin : size - margin, margin : size - margin].sum((2, 3))
+        self._held = (float(shares.min()), float(shares.max()))
+        if window is None:
+            warnings.warn(
+                f"the largest PSF window allowed, {size} px, holds {self._held[0]:.0%} of the light where it should "
+                f"hold {settings.enclosed_energy:.0%}; the rest is handled by {settings.stray_light!r}: raise "
+                f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
+                stacklevel=2,
+            )
+        return self._window
+
+    @torch.no_grad()
+    def _sampled_psfs(self, size: int) -> Tensor:
+        """PSFs at both ends of the range and at focus, good enough to see where the light goes."""
+        lo, hi = self.camera.defocus_range
+        nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
+        states, weights = self.modulator(self.masks.phase.to(torch.float32))
+        return self._build(states, weights, self.spectrum, self._pixel_step(), size, 0.1, nodes).psfs
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
+        super().__setattr__(name, value)
+        if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
+            self.__dict__.update(_window=None, _pupil=None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what travels with pickle and deepcopy: no PSFs."""
+        return {**super().__getstate__(), "_memory": BankMemory()}
+
+    # ------------------------------------------------------------------ inside
+
+    @property
+    def pupil(self) -> Pupil:
+        """The aperture over the masks' pixels."""
+        size = self.masks.phase.shape[-1]
+        pupil = self.__dict__["_pupil"]
+        if pupil is None:
+            amplitude = circular_aperture(size, MASK_SPAN / size) if self._aperture is None else self._aperture
+            if amplitude.shape[-1] % size:
+                raise ValueError(
+                    f"aperture must have a whole number of cells for each of the {size} mask pixels, got "
+                    f"{tuple(amplitude.shape)}"
+                )
+            pupil = self.__dict__["_pupil"] = Pupil(amplitude, MASK_SPAN / amplitude.shape[-1])
+        return pupil
+
+    def _build(
+        self,
+        states: Tensor,
+        weights: Tensor,
+        spectrum: Spectrum,
+        step: float | Tensor,
+        window: int,
+        tolerance: float,
+        nodes: tuple[float, ...],
+    ) -> PSFBank:
+        dispersion = [self.masks.dispersion(w) for w in spectrum.wavelengths]
+        if self.fidelity.propagation == "paper":
+            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
+        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
+
+    def _computed_bank(self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...]) -> PSFBank:
+        """PSFs at these nodes, computed or remembered, before anything is done about stray light."""
+        states, weights = self.modulator(self.masks.phase.to(dtype))
+        step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
+        build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
+        learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
+        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
+            return build(nodes)
+        dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
+        paper = self.fidelity.propagation == "paper"
+        setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
+        return self._memory.recall(setting, states, weights, nodes, build)
+
+    def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
+        """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
+
+        Args:
+            channels: of the image, as in :meth:`psf_bank`.
+            dtype: float32 or float64.
+            defocus: the scene's defocus in radians, any shape.
+        """
+        spectrum, kind = self._spectrum(channels), self.fidelity.layers
+        nodes = self.defocus_nodes
+        if kind in ("nearest", "linear"):
+            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus))
+        else:
+            spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
+            finer = ceil(spacing / FINE_SPACING)
+            fine = tuple(nodes[0] + spacing / finer * i for i in range(finer * (len(nodes) - 1) + 1))
+            targets = _around(fine, defocus)
+            first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
+            last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
+            samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
+            bank = self._computed_bank(spectrum, dtype, samples)
+            bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
+        return bank.with_stray_light(self.fidelity.stray_light)
+
+    def _band(self) -> float:
+        return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
+
+    def _pixel_step(self) -> float | Tensor:
+        """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
+        return self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
+
+    def _spectrum(self, channels: int) -> Spectrum:
+        if channels == len(self.spectrum.weights):
+            return self.spectrum
+        if channels == 1:
+            return Spectrum.monochrome()
+        raise ValueError(
+            f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}"
+        )
+
+
+def _refit_window(lens: CodedLens, _: Any) -> None:
+    lens.fit_window()
+
+
+def _around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
+    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
+    if torch.compiler.is_compiling():
+        return nodes
+    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
+    # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
+    extra = int(defocus.requires_grad)
+    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
+    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
+    return nodes[min(first, last) : last + 1]
