@@ -43,7 +43,7 @@ def load_scene(name: str) -> tuple[Tensor, Tensor]:
     known = disparity > 0
     lowest, highest = disparity[known].min(), disparity[known].max()
     psi = np.where(known, (disparity - lowest) / (highest - lowest) * 40 - 20, -20).astype(np.float32)
-    return torch.from_numpy(image).permute(2, 0, 1)[None] / 255, torch.from_numpy(psi)[None, None]
+    return torch.from_numpy(image).permute(2, 0, 1)[None].contiguous() / 255, torch.from_numpy(psi)[None, None]
 
 
 def make_bank(layers: int, size: int) -> Bank:
