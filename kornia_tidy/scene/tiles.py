@@ -12,7 +12,7 @@ block, then by layer.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -21,49 +21,57 @@ from torch import Tensor
 
 from kornia_tidy.scene.convolution import next_fast_size
 
-# Sides of transforms. A factor of 5 is left out: it nearly doubles the time of a sample.
-SIZES = (8, 12, 16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 576, 768, 1024, 1152, 1536, 2048)
+# Sides of transforms whose samples take the least time.
+SIZES = (8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 256, 288, 384, 512, 576, 768, 1024, 1536, 2048)
 # Bytes that the planes of a chunk may take: near a processor's cache (and below what makes an allocator give memory
 # back and fetch it again), or enough to keep an accelerator busy.
-CHUNK_BYTES = {"cpu": 6 << 20}
+CHUNK_BYTES = {"cpu": 12 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
+# What a complex sample costs, in nanoseconds on a core of a 2.5 GHz Xeon in float32: its transform, for each octave of
+# the samples; to cut it out of the image; to fetch its spectrum, multiply it, and take its pixels.
+COST_TRANSFORM, COST_BLOCK, COST_PAIR = 0.09, 1.8, 1.5
 
 
 @dataclass(frozen=True)
 class Labels:
-    """The layers of each pixel: all light to layer ``first``, or shared with the next one.
+    """The layers of each pixel: all light to layer ``first``, or a share of it to layer ``second``.
 
     Args:
         first: (B, H, W) int64 index of a layer.
-        fraction: (B, H, W) share of layer ``first + 1``, or None for nearest layers.
-        sloped: the gradient with respect to ``fraction`` is wanted, so that a share of zero matters too.
+        second: (B, H, W) int64 index of a layer, ``first`` again where a pixel lies in one only; None for nearest.
+        fraction: (B, H, W) share of ``second``, or None for nearest layers.
     """
 
     first: Tensor
+    second: Tensor | None
     fraction: Tensor | None
-    sloped: bool
+
+    @classmethod
+    def of(cls, lower: Tensor, fraction: Tensor | None) -> Labels:
+        """Return the labels of layers that :func:`~kornia_tidy.scene.layers.assign_layers` gave, (B, H, W) each.
+
+        Where the gradient with respect to ``fraction`` is wanted, a layer with a share of zero counts too.
+        """
+        if fraction is None:
+            return cls(lower, None, None)
+        share = fraction.detach()
+        if fraction.requires_grad and torch.is_grad_enabled():
+            return cls(lower, lower + 1, share)
+        return cls(share.floor().long().add_(lower), share.ceil().long().add_(lower), share)
+
+    def change(self, function: Callable[[Tensor], Tensor]) -> Labels:
+        """Return the labels with a function applied to both indices."""
+        return replace(self, first=function(self.first), second=None if self.second is None else function(self.second))
 
     def terms(self, *where: slice) -> list[Tensor]:
-        """Return the one or two layers of each pixel there. Where two are equal the pixel belongs to that layer."""
-        first = self.first[where]
-        if self.fraction is None:
-            return [first]
-        if self.sloped:
-            return [first, first + 1]
-        fraction = self.fraction[where]
-        return [first + (fraction == 1), first + (fraction > 0)]
-
-    def every(self, step: int) -> Labels:
-        """Return the labels of every ``step``-th row and column."""
-        fraction = None if self.fraction is None else self.fraction[:, ::step, ::step]
-        return replace(self, first=self.first[:, ::step, ::step], fraction=fraction)
+        """Return the one or two indices of each pixel there."""
+        return [term[where] for term in (self.first, self.second) if term is not None]
 
     def present(self, count: int) -> Tensor:
         """Return (count,) bool: which of the indices occur."""
         present = torch.zeros(count, dtype=torch.bool, device=self.first.device)
-        for image in range(len(self.first)):
-            for term in self.terms(slice(image, image + 1)):
-                present.index_fill_(0, term.flatten(), True)
+        for term in self.terms():
+            present.index_fill_(0, term.reshape(-1), True)
         return present
 
 
@@ -109,7 +117,7 @@ class Grid:
         column = torch.arange(0, self.width, step, device=device).div_(2 * self.tile, rounding_mode="floor")
         image = torch.arange(self.batch, device=device)[:, None] * self.rows
         rows = ((image + row) * (self.columns * layers)).unsqueeze(-1)
-        return replace(labels, first=(labels.first + column * layers).add_(rows))
+        return labels.change(lambda first: (first + column * layers).add_(rows))
 
 
 class Run(NamedTuple):
@@ -213,25 +221,31 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     """Return the grid with the lowest cost.
 
     Larger tiles waste less on their overlap, smaller ones hold fewer layers. The pairs of each candidate are counted
-    on every eighth row and column. Cost in nanoseconds, measured on one core of a 2.5 GHz Xeon in float32: a sample of
-    a complex transform takes 0.18 log2(size^2); cutting a block out 1 a sample; fetching its spectrum and multiplying
-    it 1.8 a sample and pair.
+    on every eighth row and column.
     """
     batch, height, width = labels.first.shape
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
     whole = psf_size - 1 + max(height, math.ceil(width / 2))
-    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:6] or [next_fast_size(smallest)]
-    grids = [Grid(batch, height, width, size, size - psf_size + 1) for size in sizes]
+    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
+    grids = [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
     if len(grids) == 1:
         return grids[0]
     step = 8
-    sample = labels.every(step)
+    sample = labels.change(lambda first: first[:, ::step, ::step])
     counts = [grid.number(sample, layers, step).present(grid.blocks * layers).sum() for grid in grids]
     costs = []
     for grid, pairs in zip(grids, torch.stack(counts).tolist(), strict=True):
-        transform = 0.18 * math.log2(grid.size**2)
-        costs.append(grid.size**2 * (grid.blocks * (transform + 1) + pairs * (transform + 1.8)))
+        transform = COST_TRANSFORM * math.log2(grid.size**2)
+        costs.append(grid.size**2 * (grid.blocks * (transform + COST_BLOCK) + pairs * (transform + COST_PAIR)))
     return grids[costs.index(min(costs))]
+
+
+def _fitting_grid(batch: int, height: int, width: int, size: int, psf_size: int) -> Grid:
+    """Return the grid of the fewest blocks, in tiles no larger than needed: the last hang over the least."""
+    largest = size - psf_size + 1
+    rows, columns = math.ceil(height / largest), math.ceil(width / (2 * largest))
+    tile = max(math.ceil(height / rows), math.ceil(width / (2 * columns)), (size + 1) // 2)
+    return Grid(batch, height, width, size, min(tile, largest))
 
 
 Extent = tuple[tuple[int, int], ...]  # first and last image, row and column of blocks

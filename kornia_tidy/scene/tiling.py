@@ -8,6 +8,8 @@ only the inputs are kept; spectra are computed again.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -65,9 +67,7 @@ def _plan(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None) -
     """Return the plan, and the fraction as (B, H, W)."""
     lower = lower[:, 0].expand(len(image), -1, -1)
     fraction = None if fraction is None else fraction[:, 0].expand(len(image), -1, -1)
-    sloped = fraction is not None and fraction.requires_grad and torch.is_grad_enabled()
-    labels = Labels(lower, None if fraction is None else fraction.detach(), sloped)
-    return make_plan(labels, len(psfs), psfs.shape[-1], image.shape[1]), fraction
+    return make_plan(Labels.of(lower, fraction), len(psfs), psfs.shape[-1], image.shape[1]), fraction
 
 
 class _BlurThenMix(torch.autograd.Function):
@@ -75,37 +75,35 @@ class _BlurThenMix(torch.autograd.Function):
     def forward(ctx: Any, plane: Tensor, psfs: Tensor, fraction: Tensor | None, plan: Plan) -> Tensor:
         ctx.save_for_backward(plane, psfs)
         ctx.plan = plan
-        spectra = _spectra(psfs, plan)
+        work = _Work(plan, psfs, psfs.shape[-1] - 1)
         mixed = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
         for chunk in plan.chunks:
-            light = torch.fft.fft2(_windows(plane, plan, chunk))
-            blurred = torch.fft.ifft2(_product(light, spectra, chunk))
-            _mix_into(mixed, _take(blurred, _places(plan, chunk, psfs.shape[-1] - 1)), plan, chunk)
+            light = torch.fft.fft2(work.windows(plane, chunk))
+            work.mix_into(mixed, torch.fft.ifft2(work.product(light, work.spectra, chunk)), chunk)
         return mixed
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (plane, psfs), plan = ctx.saved_tensors, ctx.plan
-        spectra = _spectra(psfs, plan)
-        turned = torch.conj_physical(spectra)  # correlation is the transpose of convolution
-        slopes = _Slopes(ctx.needs_input_grad, plane, spectra, plan)
-        full = _tiled_plane(plane, plan) if slopes.plane else None
+        work = _Work(plan, psfs, psfs.shape[-1] - 1)
+        turned = torch.conj_physical(work.spectra)  # correlation is the transpose of convolution
+        slopes = _Slopes(ctx.needs_input_grad, plane, work)
+        full = work.tiled_plane(plane) if slopes.plane else None
         for chunk in plan.chunks:
-            places = _places(plan, chunk, psfs.shape[-1] - 1)
             if slopes.plane or slopes.psfs is not None:
-                own = torch.fft.fft2(_put(grad, places, plan, chunk))
+                own = torch.fft.fft2(work.put(grad, chunk))
             if slopes.fraction is not None or slopes.psfs is not None:
-                light = torch.fft.fft2(_windows(plane, plan, chunk))
+                light = torch.fft.fft2(work.windows(plane, chunk))
             if slopes.fraction is not None:
-                slopes.add_fraction(_take(torch.fft.ifft2(_product(light, spectra, chunk)), places), grad, chunk)
+                slopes.add_fraction(torch.fft.ifft2(work.product(light, work.spectra, chunk)), grad, chunk)
             if slopes.psfs is not None:
-                slopes.add_psfs(torch.conj_physical(light), own, chunk)
+                slopes.add_psfs(light, own, chunk)
             if full is not None:
-                _add_windows(full, torch.fft.ifft2(_sum_layers(own, turned, chunk)), plan, chunk)
+                work.add_windows(full, torch.fft.ifft2(work.sum_layers(own, turned, chunk)), chunk)
         if full is not None:
             full = full[..., : plane.shape[-2], : plane.shape[-1]]
-        return full, slopes.of_psfs(psfs, plan, turned=False), slopes.fraction, None
+        return full, slopes.of_psfs(psfs, turned=False), slopes.fraction, None
 
 
 class _SplitThenBlur(torch.autograd.Function):
@@ -113,54 +111,185 @@ class _SplitThenBlur(torch.autograd.Function):
     def forward(ctx: Any, plane: Tensor, psfs: Tensor, fraction: Tensor | None, plan: Plan) -> Tensor:
         ctx.save_for_backward(plane, psfs)
         ctx.plan = plan
-        spectra = _spectra(psfs, plan)
-        full = _tiled_plane(plane, plan)
+        work = _Work(plan, psfs, 0)
+        full = work.tiled_plane(plane)
         for chunk in plan.chunks:
-            own = torch.fft.fft2(_put(plane, _places(plan, chunk, 0), plan, chunk))
-            _add_windows(full, torch.fft.ifft2(_sum_layers(own, spectra, chunk)), plan, chunk)
+            own = torch.fft.fft2(work.put(plane, chunk))
+            work.add_windows(full, torch.fft.ifft2(work.sum_layers(own, work.spectra, chunk)), chunk)
         return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (plane, psfs), plan = ctx.saved_tensors, ctx.plan
-        spectra = _spectra(psfs, plan)
-        turned = torch.conj_physical(spectra)
-        slopes = _Slopes(ctx.needs_input_grad, plane, spectra, plan)
+        work = _Work(plan, psfs, 0)
+        turned = torch.conj_physical(work.spectra)
+        slopes = _Slopes(ctx.needs_input_grad, plane, work)
         mixed = torch.empty_like(plane) if slopes.plane else None
         full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
         for chunk in plan.chunks:
-            places = _places(plan, chunk, 0)
-            light = torch.fft.fft2(_windows(full, plan, chunk))
+            light = torch.fft.fft2(work.windows(full, chunk))
             if slopes.psfs is not None:
-                own = torch.fft.fft2(_put(plane, places, plan, chunk))
-                slopes.add_psfs(torch.conj_physical(light), own, chunk)
+                slopes.add_psfs(light, torch.fft.fft2(work.put(plane, chunk)), chunk)
             if mixed is not None or slopes.fraction is not None:
-                terms = _take(torch.fft.ifft2(_product(light, turned, chunk)), places)
+                blurred = torch.fft.ifft2(work.product(light, turned, chunk))
                 if slopes.fraction is not None:
-                    slopes.add_fraction(terms, plane, chunk)
+                    slopes.add_fraction(blurred, plane, chunk)
                 if mixed is not None:
-                    _mix_into(mixed, terms, plan, chunk)
-        return mixed, slopes.of_psfs(psfs, plan, turned=True), slopes.fraction, None
+                    work.mix_into(mixed, blurred, chunk)
+        return mixed, slopes.of_psfs(psfs, turned=True), slopes.fraction, None
+
+
+class _Work:
+    """The steps of one pass over a plan, in memory that every chunk uses again.
+
+    Fetching memory from the system takes as long as the transforms in it.
+
+    Args:
+        plan: what to compute.
+        psfs: (D, C, P, P).
+        offset: where a tile's first pixel stands in its window, down and across.
+    """
+
+    def __init__(self, plan: Plan, psfs: Tensor, offset: int) -> None:
+        self.plan = plan
+        self._memory: dict[tuple[str, torch.dtype], Tensor] = {}
+        self._dtype, self._device = psfs.dtype, psfs.device
+        size, tile = plan.grid.size, plan.grid.tile
+        # (D', C, size, size) spectra of the PSFs of the layers that are present.
+        self.spectra = torch.fft.fft2(psfs.index_select(0, plan.present), s=(size, size))
+        # Where a pixel stands in its window, counted in floats: alike for all rows of blocks.
+        y = torch.arange(max(chunk.y.stop - chunk.y.start for chunk in plan.chunks), device=psfs.device) % tile
+        x = torch.arange(plan.grid.width, device=psfs.device)
+        self._inside = ((y + offset) * (2 * size))[:, None] + (2 * (x % tile + offset) + x // tile % 2)
+
+    def _buffer(self, name: str, shape: Sequence[int], dtype: torch.dtype | None = None) -> Tensor:
+        """Memory by name, with whatever was left in it."""
+        count, key = math.prod(shape), (name, dtype or self._dtype)
+        if key not in self._memory or len(self._memory[key]) < count:
+            self._memory[key] = torch.empty(count, dtype=key[1], device=self._device)
+        return self._memory[key][:count].view(*shape)
+
+    def windows(self, plane: Tensor, chunk: Chunk) -> Tensor:
+        """Cut a chunk's windows out of a plane, which is black beyond its ends: (blocks, C, size, size) complex."""
+        size, tile = self.plan.grid.size, self.plan.grid.tile
+        images, rows, columns = chunk.extent
+        height, width = (rows - 1) * tile + size, (2 * columns - 1) * tile + size
+        part = plane[chunk.batch, :, chunk.y.start : chunk.y.start + height, chunk.x.start : chunk.x.start + width]
+        if part.shape[-2:] != (height, width):
+            whole = self._buffer("part", (images, plane.shape[1], height, width))
+            whole[..., part.shape[-2] :, :] = 0
+            whole[..., : part.shape[-2], part.shape[-1] :] = 0
+            whole[..., : part.shape[-2], : part.shape[-1]] = part
+            part = whole
+        tiles = part.unfold(2, size, tile).unfold(3, size, tile).permute(0, 2, 3, 1, 4, 5)
+        shape = (images, rows, columns, plane.shape[1], size, size)
+        cut = self._buffer("windows", shape, self._dtype.to_complex())
+        return torch.complex(tiles[:, :, 0::2], tiles[:, :, 1::2], out=cut).flatten(0, 2)
+
+    def add_windows(self, plane: Tensor, windows: Tensor, chunk: Chunk) -> None:
+        """Add a chunk's windows to a plane where :meth:`windows` cuts them: its transpose."""
+        size, tile = self.plan.grid.size, self.plan.grid.tile
+        images, rows, columns = chunk.extent
+        halves = torch.view_as_real(windows).unflatten(0, (images, rows, columns)).permute(6, 0, 3, 1, 2, 4, 5)
+        for half, light in enumerate(halves):
+            left = chunk.x.start + half * tile
+            across = plane[chunk.batch, :, :, left : left + (columns - 1) * 2 * tile + size]
+            # Of every second tile, windows overlap with the row above and below only, by less than a tile: first the
+            # tiles, then what hangs over, so that no pixel is met twice in one addition.
+            for start, stop in ((0, tile), (tile, size)):
+                if start < stop:
+                    top = chunk.y.start + start
+                    down = across[:, :, top : top + (rows - 1) * tile + stop - start]
+                    down.unfold(2, stop - start, tile).unfold(3, size, 2 * tile).add_(light[..., start:stop, :])
+
+    def tiled_plane(self, plane: Tensor) -> Tensor:
+        """Return a black plane that holds the windows of all blocks."""
+        grid = self.plan.grid
+        overlap = grid.size - grid.tile
+        return plane.new_zeros(*plane.shape[:2], grid.covered_height + overlap, grid.covered_width + overlap)
+
+    def product(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
+        """Each pair's light times the spectrum of its layer: (pairs, C, size, size)."""
+        if not _by_slices(light):
+            return light.index_select(0, chunk.block).mul_(spectra.index_select(0, chunk.layer))
+        product = self._buffer("pairs", (len(chunk.block), *light.shape[1:]), light.dtype)
+        for run in chunk.runs:
+            torch.mul(light[run.blocks], spectra[run.layer], out=product[run.pairs])
+        return product
+
+    def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
+        """Each block's sum over its layers of their light times their spectrum. May write over ``own``."""
+        images, rows, columns = chunk.extent
+        total = self._buffer("windows", (images * rows * columns, *own.shape[1:]), own.dtype).zero_()
+        if not _by_slices(own):
+            return total.index_add_(0, chunk.block, own.mul_(spectra.index_select(0, chunk.layer)))
+        for run in chunk.runs:
+            total[run.blocks].addcmul_(own[run.pairs], spectra[run.layer])
+        return total
+
+    def places(self, chunk: Chunk) -> list[Tensor]:
+        """Where each of a chunk's pixels stands in the planes of its layers, for the first channel, in floats."""
+        inside = self._inside[: chunk.y.stop - chunk.y.start, chunk.x]
+        found = []
+        for number, key in enumerate(self.plan.labels.terms(chunk.batch, chunk.y, chunk.x)):
+            place = self._buffer(f"places {number}", (key.numel(),), torch.int64)
+            torch.index_select(self.plan.place, 0, key.reshape(-1), out=place)
+            found.append(place.view(key.shape).add_(inside))
+        return found
+
+    def channel(self, planes: Tensor, channel: int) -> Tensor:
+        """Return the floats of planes from the first of a channel on, where :meth:`places` point."""
+        return torch.view_as_real(planes).view(-1)[channel * 2 * self.plan.grid.size**2 :]
+
+    def mix_into(self, mixed: Tensor, planes: Tensor, chunk: Chunk) -> None:
+        """Write each pixel's mean over its layers into (B, C, H, W)."""
+        places, fraction = self.places(chunk), self.plan.labels.fraction
+        for channel in range(mixed.shape[1]):
+            there, own = mixed[chunk.pixels(channel)], self.channel(planes, channel)
+            torch.take(own, places[0], out=there)
+            if fraction is not None:
+                above = torch.take(own, places[1], out=self._buffer("above", there.shape))
+                there.lerp_(above, fraction[chunk.batch, chunk.y, chunk.x])
+
+    def put(self, values: Tensor, chunk: Chunk) -> Tensor:
+        """Share each pixel out to the planes of its layers: (pairs, C, size, size) complex, the transpose of taking."""
+        size, channels, places = self.plan.grid.size, values.shape[1], self.places(chunk)
+        planes = self._buffer("pairs", (len(chunk.block), channels, size, size), self._dtype.to_complex()).zero_()
+        fraction = self.plan.labels.fraction
+        for channel in range(channels):
+            own, light = self.channel(planes, channel), values[chunk.pixels(channel)]
+            if fraction is None:
+                own.put_(places[0], light)
+            else:
+                shared = light * fraction[chunk.batch, chunk.y, chunk.x]
+                own.put_(places[1], shared)
+                own.put_(places[0], torch.where(places[0] == places[1], light, light - shared))
+        return planes
 
 
 class _Slopes:
     """Gradients that a backward pass collects chunk by chunk, where they are wanted."""
 
-    def __init__(self, wanted: tuple[bool, ...], plane: Tensor, spectra: Tensor, plan: Plan) -> None:
+    def __init__(self, wanted: tuple[bool, ...], plane: Tensor, work: _Work) -> None:
+        self.work = work
         self.plane = wanted[0]
-        self.psfs = torch.zeros_like(spectra) if wanted[1] else None
-        self.fraction = plane.new_zeros(plan.labels.first.shape) if wanted[2] else None
+        self.psfs = torch.zeros_like(work.spectra) if wanted[1] else None
+        self.fraction = plane.new_zeros(work.plan.labels.first.shape) if wanted[2] else None
 
-    def add_fraction(self, terms: list[list[Tensor]], factor: Tensor, chunk: Chunk) -> None:
+    def add_fraction(self, blurred: Tensor, factor: Tensor, chunk: Chunk) -> None:
         """What a pixel gains when its light moves to the layer above, times the gradient or the light it has."""
         assert self.fraction is not None
-        for channel, (below, above) in enumerate(terms):
+        places = self.work.places(chunk)
+        for channel in range(factor.shape[1]):
+            own = self.work.channel(blurred, channel)
+            below, above = (own.take(place) for place in places)
             self.fraction[chunk.batch, chunk.y, chunk.x] += (above - below) * factor[chunk.pixels(channel)]
 
     def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk) -> None:
-        """Correlate the layers' own pixels with the light of their windows, of which ``light`` is the conjugate."""
+        """Correlate the layers' own pixels with the light of their windows, which may be written over."""
         assert self.psfs is not None
+        light = torch.conj_physical(light)
         if not _by_slices(light):
             self.psfs.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
             return
@@ -168,125 +297,17 @@ class _Slopes:
             for block, pair in zip(light[run.blocks], own[run.pairs], strict=True):
                 self.psfs[run.layer].addcmul_(block, pair)
 
-    def of_psfs(self, psfs: Tensor, plan: Plan, *, turned: bool) -> Tensor | None:
+    def of_psfs(self, psfs: Tensor, *, turned: bool) -> Tensor | None:
         """Left and right tiles correlate with themselves in the real part, with each other in the imaginary part."""
         if self.psfs is None:
             return None
         side = psfs.shape[-1]
         slope = torch.zeros_like(psfs)
-        slope[plan.present] = torch.fft.ifft2(self.psfs.conj() if turned else self.psfs).real[..., :side, :side]
+        found = torch.fft.ifft2(self.psfs.conj() if turned else self.psfs).real[..., :side, :side]
+        slope[self.work.plan.present] = found
         return slope
-
-
-def _spectra(psfs: Tensor, plan: Plan) -> Tensor:
-    """(D', C, size, size) spectra of the PSFs of the layers that are present."""
-    return torch.fft.fft2(psfs.index_select(0, plan.present), s=(plan.grid.size, plan.grid.size))
 
 
 def _by_slices(planes: Tensor) -> bool:
     """Slices pass over a processor's memory less often; all pairs at once start fewer kernels on an accelerator."""
     return planes.device.type == "cpu"
-
-
-def _product(light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
-    """Each pair's light times the spectrum of its layer: (pairs, C, size, size)."""
-    if not _by_slices(light):
-        return light.index_select(0, chunk.block).mul_(spectra.index_select(0, chunk.layer))
-    product = light.new_empty(len(chunk.block), *light.shape[1:])
-    for run in chunk.runs:
-        torch.mul(light[run.blocks], spectra[run.layer], out=product[run.pairs])
-    return product
-
-
-def _sum_layers(own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
-    """Each block's sum over its layers of their light times their spectrum. May write over ``own``."""
-    images, rows, columns = chunk.extent
-    total = own.new_zeros(images * rows * columns, *own.shape[1:])
-    if not _by_slices(own):
-        return total.index_add_(0, chunk.block, own.mul_(spectra.index_select(0, chunk.layer)))
-    for run in chunk.runs:
-        total[run.blocks].addcmul_(own[run.pairs], spectra[run.layer])
-    return total
-
-
-def _tiled_plane(plane: Tensor, plan: Plan) -> Tensor:
-    """A black plane that holds the windows of all blocks."""
-    overlap = plan.grid.size - plan.grid.tile
-    height, width = plan.grid.covered_height + overlap, plan.grid.covered_width + overlap
-    return plane.new_zeros(*plane.shape[:2], height, width)
-
-
-def _windows(plane: Tensor, plan: Plan, chunk: Chunk) -> Tensor:
-    """Cut a chunk's windows out of a plane, which is black beyond its ends: (blocks, C, size, size) complex."""
-    size, tile = plan.grid.size, plan.grid.tile
-    images, rows, columns = chunk.extent
-    height, width = (rows - 1) * tile + size, (2 * columns - 1) * tile + size
-    part = plane[chunk.batch, :, chunk.y.start : chunk.y.start + height, chunk.x.start : chunk.x.start + width]
-    if part.shape[-2:] != (height, width):
-        part = torch.nn.functional.pad(part, (0, width - part.shape[-1], 0, height - part.shape[-2]))
-    tiles = part.unfold(2, size, tile).unfold(3, size, tile).permute(0, 2, 3, 1, 4, 5)
-    cut = plane.new_empty(images, rows, columns, plane.shape[1], size, size, dtype=plane.dtype.to_complex())
-    return torch.complex(tiles[:, :, 0::2], tiles[:, :, 1::2], out=cut).flatten(0, 2)
-
-
-def _add_windows(plane: Tensor, windows: Tensor, plan: Plan, chunk: Chunk) -> None:
-    """Add a chunk's windows to a plane where :func:`_windows` cuts them: its transpose."""
-    size, tile = plan.grid.size, plan.grid.tile
-    images, rows, columns = chunk.extent
-    halves = torch.view_as_real(windows).unflatten(0, (images, rows, columns)).permute(6, 0, 3, 1, 2, 4, 5)
-    for half, light in enumerate(halves):
-        left = chunk.x.start + half * tile
-        across = plane[chunk.batch, :, :, left : left + (columns - 1) * 2 * tile + size]
-        # Of every second tile, windows overlap with the row above and below only, by less than a tile: first the
-        # tiles, then what hangs over, so that no pixel is met twice in one addition.
-        for start, stop in ((0, tile), (tile, size)):
-            if start < stop:
-                top = chunk.y.start + start
-                down = across[:, :, top : top + (rows - 1) * tile + stop - start]
-                down.unfold(2, stop - start, tile).unfold(3, size, 2 * tile).add_(light[..., start:stop, :])
-
-
-def _places(plan: Plan, chunk: Chunk, offset: int) -> list[Tensor]:
-    """Where each of a chunk's pixels stands in the planes of its layers, for the first channel, counted in floats.
-
-    A tile's first pixel stands at ``offset``, ``offset`` of its plane.
-    """
-    size, tile, device = plan.grid.size, plan.grid.tile, plan.place.device
-    y = torch.arange(chunk.y.stop - chunk.y.start, device=device) % tile
-    x = torch.arange(chunk.x.stop - chunk.x.start, device=device)
-    inside = ((y + offset) * (2 * size))[:, None] + (2 * (x % tile + offset) + x // tile % 2)
-    keys = plan.labels.terms(chunk.batch, chunk.y, chunk.x)
-    return [plan.place.index_select(0, key.reshape(-1)).view(key.shape).add_(inside) for key in keys]
-
-
-def _take(planes: Tensor, places: list[Tensor]) -> list[list[Tensor]]:
-    """For each channel, take the pixels out of the planes of their layers."""
-    flat = torch.view_as_real(planes).view(-1)
-    step = 2 * planes.shape[-1] ** 2
-    return [[flat[channel * step :].take(place) for place in places] for channel in range(planes.shape[1])]
-
-
-def _put(values: Tensor, places: list[Tensor], plan: Plan, chunk: Chunk) -> Tensor:
-    """Share each pixel out to the planes of its layers: (pairs, C, size, size) complex, the transpose of taking."""
-    size, channels = plan.grid.size, values.shape[1]
-    planes = values.new_zeros(len(chunk.block), channels, size, size, 2)
-    flat = planes.view(-1)
-    for channel in range(channels):
-        own = flat[channel * 2 * size**2 :]
-        light = values[chunk.pixels(channel)]
-        if plan.labels.fraction is None:
-            own.put_(places[0], light)
-        else:
-            shared = light * plan.labels.fraction[chunk.batch, chunk.y, chunk.x]
-            own.put_(places[1], shared)
-            own.put_(places[0], torch.where(places[0] == places[1], light, light - shared))
-    return torch.view_as_complex(planes)
-
-
-def _mix_into(mixed: Tensor, terms: list[list[Tensor]], plan: Plan, chunk: Chunk) -> None:
-    """Write each pixel's mean over its layers into (B, C, H, W)."""
-    for channel, own in enumerate(terms):
-        if plan.labels.fraction is None:
-            mixed[chunk.pixels(channel)] = own[0]
-        else:
-            torch.lerp(*own, plan.labels.fraction[chunk.batch, chunk.y, chunk.x], out=mixed[chunk.pixels(channel)])

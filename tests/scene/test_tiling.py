@@ -295,7 +295,7 @@ class TestPlan(BaseTester):
         bank = make_bank(6, 1, 5, device=device)
         psi = depth_map(kind, bank, 37, 51)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
-        plan = make_plan(Labels(label, None, sloped=False), 6, 5, 1)
+        plan = make_plan(Labels.of(label, None), 6, 5, 1)
         tile = plan.grid.tile
         expected = {
             (b, y // tile, x // (2 * tile), int(label[b, y, x])) for b in range(2) for y in range(37) for x in range(51)
@@ -316,9 +316,9 @@ class TestPlan(BaseTester):
         sides = []
         for layers in (1, 100):
             x = torch.arange(600, device=device) * layers // 600
-            sides.append(choose_grid(Labels(x.expand(1, 500, 600), None, sloped=False), 100, 23).size)
+            sides.append(choose_grid(Labels.of(x.expand(1, 500, 600), None), 100, 23).size)
         assert sides[0] > sides[1]
         assert all(side - 23 + 1 >= 23 - 1 for side in sides)
 
     def test_property_sizes_transform_fast(self):
-        assert all((2 * 3) ** 16 % size == 0 for size in tiles.SIZES)
+        assert all((2 * 3) ** 16 * 5 * 7 % size == 0 for size in tiles.SIZES)
