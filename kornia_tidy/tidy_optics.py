@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -11,22 +11,25 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
+from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_positive
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.coded_lens import CodedLens
 from kornia_tidy.optics.phase_masks import PhaseMasks, adam_groups
+from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.scene.bands import padded_band
 from kornia_tidy.scene.compositing import COMPOSITING, render
 from kornia_tidy.scene.convolution import BORDERS, check_border
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.noise import STRIP, SensorNoise
 
 if TYPE_CHECKING:
     from kornia_tidy.planning import RenderPlan
 
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
+_BYTES_A_PIXEL = 120  # that a capture in float32 of three channels takes at its peak, beyond image and capture
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
 
@@ -54,6 +57,8 @@ class TiDyOptics(CodedLens):
             one channel are taken at 530 nm.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
         check_inputs: look at the values of images and depths before any work, eagerly.
+        memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
+            through in bands of 64 rows or more, which changes nothing but the last digits.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -100,7 +105,9 @@ class TiDyOptics(CodedLens):
         spectrum: Spectrum | None = None,
         aperture: Tensor | None = None,
         check_inputs: bool = True,
+        memory_budget: int = 512 << 20,
     ) -> None:
+        check_positive("memory_budget", memory_budget, "bytes")
         fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
         paper = fidelity.propagation == "paper"
         color_space = color_space or ("paper" if paper else "srgb")
@@ -118,6 +125,7 @@ class TiDyOptics(CodedLens):
         self.color_space = color_space
         self.border = border
         self.check_inputs = check_inputs
+        self.memory_budget = memory_budget
         self._clamped: Tensor | None = None
         self._warned = False
 
@@ -158,27 +166,69 @@ class TiDyOptics(CodedLens):
         """Take a picture of an image and its depth. See :meth:`forward`."""
         image, depth, batched = self._checked(image, depth)
         check_border(self.border, *image.shape[-2:], self.window)
-        dtype = self._compute_dtype(image)
         with torch.autocast(image.device.type, enabled=False):
-            light = self.decode(image.to(dtype))
-            defocus = self.camera.defocus(depth.to(dtype), check_inputs=False)
-            self._count_clamped(defocus)
-            bank = self.scene_bank(image.shape[1], dtype, defocus)
-            light = render(
-                light,
-                defocus,
-                bank,
-                self.compositing,
-                layers="nearest" if self.fidelity.layers == "nearest" else "linear",
-                border=self.border,
-                correlate=self.fidelity.correlate,
-            )
-            if self.sensor is not None:
-                light = self.sensor(light, params=params, generator=generator)
-            coded = self.encode(light).to(image.dtype)
+            rows = self._rows_at_once(image, depth)
+            if rows is None:
+                coded = self._capture_at_once(image, depth, params, generator)
+            else:
+                coded = self._capture_in_bands(image, depth, rows, params, generator)
         if not torch.compiler.is_compiling() and get_worker_info() is not None:
             coded = coded.detach()  # collation in a worker cannot carry gradients
         return coded if batched else coded[0]
+
+    def _capture_at_once(
+        self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor] | None, generator: torch.Generator | None
+    ) -> Tensor:
+        defocus = self._defocus(depth, image)
+        self._survey([defocus])
+        bank = self.scene_bank(image.shape[1], defocus.dtype, defocus)
+        return self._expose(image, defocus, bank, self.border, params, generator)
+
+    def _capture_in_bands(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        rows: int,
+        params: Mapping[str, Tensor] | None,
+        generator: torch.Generator | None,
+    ) -> Tensor:
+        """Take the picture some rows at a time, each with as much of its neighbours as the PSFs reach."""
+        radius = self.window // 2
+        height, width = self._cropped(image).shape[-2:]
+        bands = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+        extremes = self._survey(self._defocus(part, image) for part in depth.split(rows, dim=-2))
+        bank = self.scene_bank(image.shape[1], extremes.dtype, extremes)
+        sides = "replicate" if self.border == "zero" else self.border  # what is black may lie anywhere
+        coded = image.new_empty(*image.shape[:2], height, width)
+        for band in bands:
+            piece = padded_band(image, band, radius, self.border)
+            there = self._defocus(padded_band(depth, band, radius, sides), image)
+            own = None if params is None else {name: field[..., band, :] for name, field in params.items()}
+            coded[..., band, :] = self._expose(piece, there, bank, "valid", own, generator)
+        return coded
+
+    def _expose(
+        self,
+        image: Tensor,
+        defocus: Tensor,
+        bank: PSFBank,
+        border: str,
+        params: Mapping[str, Tensor] | None,
+        generator: torch.Generator | None,
+    ) -> Tensor:
+        """Take a picture of encoded light at known defocus."""
+        light = render(
+            self.decode(image.to(defocus.dtype)),
+            defocus,
+            bank,
+            self.compositing,
+            layers="nearest" if self.fidelity.layers == "nearest" else "linear",
+            border=border,
+            correlate=self.fidelity.correlate,
+        )
+        if self.sensor is not None:
+            light = self.sensor(light, params=params, generator=generator)
+        return self.encode(light).to(image.dtype)
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.
@@ -221,7 +271,7 @@ class TiDyOptics(CodedLens):
         blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
         blank, depth, _ = self._checked(blank, depth)
         light = None if image is None else self.decode(blank.to(self._compute_dtype(blank)))
-        defocus = self.camera.defocus(depth.to(self._compute_dtype(depth)), check_inputs=False)
+        defocus = self._defocus(depth, depth)
         return Planner(self, blank.shape[1]).scene(defocus, light).plan(tolerance)
 
     # ------------------------------------------------------------------ colour
@@ -280,6 +330,23 @@ class TiDyOptics(CodedLens):
 
     # ------------------------------------------------------------------ inside
 
+    def _rows_at_once(self, image: Tensor, depth: Tensor) -> int | None:
+        """Rows whose capture fits the memory allowed; None where all do, or where the whole image is needed."""
+        learning = torch.is_grad_enabled() and (
+            image.requires_grad or depth.requires_grad or any(p.requires_grad for p in self.parameters())
+        )
+        if learning or torch.compiler.is_compiling() or self.fidelity.stray_light == "veil":
+            return None
+        itemsize = self._compute_dtype(image).itemsize
+        row = _BYTES_A_PIXEL * itemsize // 4 * image.shape[0] * image.shape[-1]
+        rows = max(STRIP, self.memory_budget // row // STRIP * STRIP)
+        return None if rows >= image.shape[-2] else rows
+
+    def _defocus(self, depth: Tensor, image: Tensor) -> Tensor:
+        """The defocus of a depth map in the type that an image is computed in."""
+        look = self.check_inputs and not torch.compiler.is_compiling()
+        return self.camera.defocus(depth.to(self._compute_dtype(image)), check_inputs=look)
+
     def _compute_dtype(self, image: Tensor) -> torch.dtype:
         return torch.float64 if self.fidelity.double or image.dtype == torch.float64 else torch.float32
 
@@ -302,23 +369,33 @@ class TiDyOptics(CodedLens):
             )
         if self.check_inputs and not torch.compiler.is_compiling():
             check_finite("image", image)
-            self.camera.defocus(depth.detach(), check_inputs=True)
         return image, depth, batched
 
-    def _count_clamped(self, defocus: Tensor) -> None:
-        """Count pixels beyond the range; say so once. Half a thousandth of a radian of rounding is not beyond."""
+    def _survey(self, parts: Iterable[Tensor]) -> Tensor:
+        """Return the lowest and highest defocus of a map given in parts; count pixels beyond the range, say so once.
+
+        Half a thousandth of a radian of rounding is not beyond.
+        """
         if torch.compiler.is_compiling():
-            return
+            return torch.zeros(2)
         lo, hi = self.camera.defocus_range
-        self._clamped = ((defocus < lo - 5e-4) | (defocus > hi + 5e-4)).detach().sum()
-        if self.check_inputs and not self._warned and (count := int(self._clamped)):
+        extremes, pixels, clamped = [], 0, torch.tensor(0)
+        for defocus in parts:
+            own = defocus.detach()
+            extremes.append(torch.stack(torch.aminmax(own)))
+            pixels += own.numel()
+            clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
+        lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
+        self._clamped = clamped
+        if self.check_inputs and not self._warned and (count := int(clamped)):
             self._warned = True
             warnings.warn(
-                f"{count} of {defocus.numel()} pixels have a defocus between {float(defocus.detach().min()):+.2f} and "
-                f"{float(defocus.detach().max()):+.2f} rad, beyond the camera's range {lo:+.2f} to {hi:+.2f}: they are "
-                f"rendered as its ends (see ThinLensCamera.for_scene, or its depth_range)",
-                stacklevel=4,
+                f"{count} of {pixels} pixels have a defocus between {float(lowest):+.2f} and {float(highest):+.2f} "
+                f"rad, beyond the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
+                f"ThinLensCamera.for_scene, or its depth_range)",
+                stacklevel=5,
             )
+        return torch.stack([lowest, highest])
 
     def _cropped(self, tensor: Tensor) -> Tensor:
         """Crop a map to the capture's view, which is smaller only with the border ``"valid"``."""

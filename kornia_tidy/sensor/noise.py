@@ -41,6 +41,9 @@ def quantize(image: Tensor, bits: int) -> Tensor:
     return (rounded + (value - value.detach())).to(image.dtype)  # adds 0, and a gradient of 1
 
 
+STRIP = 64  # rows whose noise is drawn at once
+
+
 class SensorNoise(nn.Module):
     r"""A sensor: turns a linear-light image into what the camera reports, still in linear light.
 
@@ -187,6 +190,9 @@ class SensorNoise(nn.Module):
         Raises:
             ValueError: if ``dtype`` is another.
 
+        Convention:
+            - Drawn in strips of 64 rows from the top, so that a large image taken in bands has the same noise.
+
         Example:
             >>> sorted(SensorNoise(0.01, full_well=1e4).draw((1, 3, 4, 4)))
             ['read', 'shot']
@@ -194,10 +200,13 @@ class SensorNoise(nn.Module):
         check_choice("dtype", dtype, (torch.float32, torch.float64))
         source = device if generator is None else generator.device
         samplers = {"read": torch.randn, "shot": torch.rand}
-        return {
-            name: samplers[name](tuple(shape), generator=generator, device=source, dtype=dtype).to(device)
-            for name in self._field_names()
-        }
+        *outer, height, width = shape
+        strips: dict[str, list[Tensor]] = {name: [] for name in self._field_names()}
+        for top in range(0, max(height, 1), STRIP):
+            part = (*outer, min(STRIP, height - top), width)
+            for name, fields in strips.items():
+                fields.append(samplers[name](part, generator=generator, device=source, dtype=dtype).to(device))
+        return {name: torch.cat(fields, dim=-2) for name, fields in strips.items()}
 
     def _field_names(self) -> list[str]:
         return ["read"] * (self.sigma > 0) + ["shot"] * (self.full_well is not None)
