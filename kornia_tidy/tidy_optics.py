@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
-_BYTES_A_PIXEL = 120  # that a capture in float32 of three channels takes at its peak, beyond image and capture
+# What a capture in float32 of three channels takes at its peak, beyond image and capture: for tiles, and for each pixel.
+_BYTES_OF_TILES, _BYTES_A_PIXEL = 24 << 20, 120
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
 
@@ -339,7 +340,7 @@ class TiDyOptics(CodedLens):
             return None
         itemsize = self._compute_dtype(image).itemsize
         row = _BYTES_A_PIXEL * itemsize // 4 * image.shape[0] * image.shape[-1]
-        rows = max(STRIP, self.memory_budget // row // STRIP * STRIP)
+        rows = max(STRIP, (self.memory_budget - _BYTES_OF_TILES) // row // STRIP * STRIP)
         return None if rows >= image.shape[-2] else rows
 
     def _defocus(self, depth: Tensor, image: Tensor) -> Tensor:
