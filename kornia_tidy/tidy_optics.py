@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
-# What a capture in float32 of three channels takes at its peak, beyond image and capture: for tiles, and for each pixel.
+# What a capture in float32 of three channels takes at its peak beyond image and capture: for tiles, and a pixel.
 _BYTES_OF_TILES, _BYTES_A_PIXEL = 24 << 20, 120
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
