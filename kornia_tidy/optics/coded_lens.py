@@ -174,9 +174,9 @@ class CodedLens(nn.Module):
     @property
     def pupil(self) -> Pupil:
         """The aperture over the masks' pixels."""
-        size = self.masks.phase.shape[-1]
         pupil = self.__dict__["_pupil"]
         if pupil is None:
+            size = self.masks.phase.shape[-1]
             amplitude = circular_aperture(size, MASK_SPAN / size) if self._aperture is None else self._aperture
             if amplitude.shape[-1] % size:
                 raise ValueError(
@@ -196,10 +196,10 @@ class CodedLens(nn.Module):
         tolerance: float,
         nodes: tuple[float, ...],
     ) -> PSFBank:
-        dispersion = [self.masks.dispersion(w) for w in spectrum.wavelengths]
+        dispersion, shift = self._colours(spectrum)
         if self.fidelity.propagation == "paper":
-            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
-        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
+            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes, shift)
+        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
 
     def _computed_bank(self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...]) -> PSFBank:
         """PSFs at these nodes, computed or remembered, before anything is done about stray light."""
@@ -209,9 +209,8 @@ class CodedLens(nn.Module):
         learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
         if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
             return build(nodes)
-        dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
         paper = self.fidelity.propagation == "paper"
-        setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
+        setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
         return self._memory.recall(setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
@@ -240,6 +239,11 @@ class CodedLens(nn.Module):
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
+
+    def _colours(self, spectrum: Spectrum) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """How the phase of the masks and the focus of the lens change from wavelength to wavelength."""
+        waves = spectrum.wavelengths
+        return tuple(map(self.masks.dispersion, waves)), tuple(map(self.camera.chromatic_defocus, waves))
 
     def _pixel_step(self) -> float | Tensor:
         """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
