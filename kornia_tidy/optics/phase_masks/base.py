@@ -73,7 +73,7 @@ class PhaseMasks(nn.Module):
         if max_height is not None:
             check_positive("max_height", max_height, "metres")
             if constraint == "none":
-                raise ValueError(f"max_height needs constraint='clamp', 'sigmoid' or 'wrapped', got 'none', {max_height}")
+                raise ValueError(f"max_height needs a constraint, 'clamp', 'sigmoid' or 'wrapped', got {max_height}")
         self.constraint = constraint
         self.max_phase = 2 * math.pi if max_height is None else max_height * metres_to_radians(self.material)
 
@@ -84,7 +84,7 @@ class PhaseMasks(nn.Module):
 
     def free_phase(self) -> Tensor:
         """Return the phase before the constraint: here the parameter or buffer registered as ``phase``."""
-        return super().__getattr__("phase")  # where it is not registered yet, the property is an attribute not there
+        return cast("Tensor", super().__getattr__("phase"))  # an AttributeError as long as none is registered
 
     def heights(self) -> Tensor:
         """Return the height maps in metres, (K, N, N); at least float32, since they are of order 1e-7."""

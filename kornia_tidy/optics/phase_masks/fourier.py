@@ -37,7 +37,7 @@ class FourierMask(PhaseMasks):
     Raises:
         ValueError: if ``max_frequency`` is not from 1 to below half the pixels, or given values do not fit.
 
-    Source: Sitzmann et al., ACM Trans. Graph. 37(4) 114 (2018), section 4 (they keep three quarters of the frequencies).
+    Source: Sitzmann et al., ACM Trans. Graph. 37(4) 114 (2018): they keep three quarters of the frequencies.
 
     Example:
         >>> masks = FourierMask(num_masks=2, max_frequency=3)

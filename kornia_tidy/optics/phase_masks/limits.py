@@ -70,6 +70,6 @@ class _Clamp(torch.autograd.Function):
         ctx.save_for_backward((value < 0).to(value) - (value > limit).to(value))  # the way back: +1, -1, or 0
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (back,) = ctx.saved_tensors
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (gradient,), (back,) = grad_outputs, ctx.saved_tensors
         return gradient * (back * gradient <= 0), None  # descent goes against the gradient

@@ -66,4 +66,4 @@ class PixelwiseMask(PhaseMasks):
             phase = torch.zeros(num_masks, len(y), len(x))
             if initial == "noise":
                 phase = torch.rand(phase.shape, generator=generator) * (self.NOISE_HEIGHT * to_radians)
-        self.phase = nn.Parameter(unlimited_phase(phase, constraint, self.max_phase))
+        self.register_parameter("phase", nn.Parameter(unlimited_phase(phase, constraint, self.max_phase)))

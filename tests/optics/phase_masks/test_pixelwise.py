@@ -39,9 +39,7 @@ class TestPixelwiseMask(BaseTester):
         assert after.dtype == torch.float32
         assert float((after - before).abs().max()) < 1e-9
 
-    @pytest.mark.parametrize(
-        "initial", ["nois", torch.zeros(3), torch.zeros(0, 4, 4), torch.full((4, 4), math.nan)]
-    )
+    @pytest.mark.parametrize("initial", ["nois", torch.zeros(3), torch.zeros(0, 4, 4), torch.full((4, 4), math.nan)])
     def test_exception_initial(self, initial):
         with pytest.raises(ValueError, match="initial"):
             PixelwiseMask(initial=initial)
