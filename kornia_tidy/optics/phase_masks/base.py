@@ -59,7 +59,8 @@ class PhaseMasks(nn.Module):
     Convention:
         - Axes are (mask, y, x), seen in the orientation of the image: a phase that rises along +x moves the PSF
           towards +x (columns to the right), one that rises along +y moves it down.
-        - The shorter side spans 2.3 pupil radii, pixels are square; rho = 1 is the edge of the aperture.
+        - The shorter side spans 2.3 pupil radii, pixels are square; rho = 1 is the edge of the aperture. Of a longer
+          side, light passes only through as much in the middle.
         - Each pixel has one phase: that of the family's formula at the pixel's centre.
         - "clamp" and "sigmoid" raise a free phase of 0 to half of ``max_height``, so that shapes have room both ways.
     """
@@ -127,15 +128,38 @@ def mask_axes(size: Size) -> tuple[Tensor, Tensor]:
     Args:
         size: pixels along both sides, or (rows, columns); the shorter side spans 2.3 pupil radii.
 
+    Raises:
+        ValueError: if a size is not positive, or one is odd and the other even (see :func:`central_square`).
+
     Example:
-        >>> y, x = mask_axes((23, 46))
+        >>> y, x = mask_axes((23, 45))
         >>> y.shape, x.shape, round(float(x[-1]), 2)
-        (torch.Size([23, 1]), torch.Size([46]), 2.25)
+        (torch.Size([23, 1]), torch.Size([45]), 2.2)
     """
     rows, columns = (size, size) if isinstance(size, int) else size
     check_positive("size", min(rows, columns))
+    if (rows - columns) % 2:
+        raise ValueError(f"rows and columns of a mask must both be odd or both even, got {rows} and {columns}")
     pitch = MASK_SPAN / min(rows, columns)
     return mask_coordinates(rows, pitch)[:, None], mask_coordinates(columns, pitch)
+
+
+def central_square(phase: Tensor) -> Tensor:
+    """Return the middle of masks that are longer along one axis: the square over the pupil, where the light passes.
+
+    Args:
+        phase: (K, rows, columns), both odd or both even, so that the square falls on whole pixels.
+
+    Returns:
+        (K, N, N) with N the shorter side; the same tensor where it is square.
+
+    Example:
+        >>> central_square(torch.arange(5.0).reshape(1, 1, 5))
+        tensor([[[2.]]])
+    """
+    rows, columns = phase.shape[-2:]
+    top, left = max(rows - columns, 0) // 2, max(columns - rows, 0) // 2
+    return phase[..., top : rows - top, left : columns - left]
 
 
 def initial_values(

@@ -56,6 +56,7 @@ class PixelwiseMask(PhaseMasks):
             heights = initial[None] if initial.ndim == 2 else initial
             if heights.ndim != 3 or heights.numel() == 0:
                 raise ValueError(f"initial heights must have shape (K, N, N) or (N, N), got {tuple(initial.shape)}")
+            mask_axes((heights.shape[1], heights.shape[2]))  # refuses what cannot be centred on the pupil
             if not bool(torch.isfinite(heights).all()):
                 raise ValueError("initial heights must be finite metres, got NaN or infinity")
             phase = (heights.detach().double() * to_radians).to(torch.get_default_dtype())

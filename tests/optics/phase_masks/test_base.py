@@ -46,14 +46,16 @@ class TestPhaseMasks(BaseTester):
 
 class TestMaskAxes(BaseTester):
     def test_feature_pixels_are_square_and_the_shorter_side_spans_the_mask(self):
-        y, x = mask_axes((46, 69))
+        y, x = mask_axes((46, 68))
         self.assert_close(y.flatten().diff(), torch.full((45,), 0.05).double())
-        self.assert_close(x.diff(), torch.full((68,), 0.05).double())
+        self.assert_close(x.diff(), torch.full((67,), 0.05).double())
         assert float(y.sum()) == pytest.approx(0, abs=1e-12)
 
     def test_exception_size(self):
         with pytest.raises(ValueError, match="size must be positive"):
             mask_axes((23, 0))
+        with pytest.raises(ValueError, match="both be odd or both even, got 23 and 24"):
+            mask_axes((23, 24))
 
 
 class TestInitialValues(BaseTester):

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from kornia_tidy.optics.coded_lens import CodedLens
 from kornia_tidy.optics.materials import FUSED_SILICA, constant_index
 from kornia_tidy.optics.phase_masks.pixelwise import PixelwiseMask
 from tests.base import BaseTester
@@ -49,3 +50,15 @@ class TestPixelwiseMask(BaseTester):
         for constraint in ("none", "clamp", "sigmoid", "wrapped"):
             back = PixelwiseMask(initial=heights, constraint=constraint).heights().detach()
             self.assert_close(back, heights, rtol=1e-5, atol=1e-12)
+
+    def test_feature_light_passes_through_the_middle_of_a_longer_mask(self):
+        heights = torch.rand(2, 23, 23) * 1e-6
+        wide = torch.rand(2, 23, 41) * 1e-6
+        wide[..., 9:32] = heights
+        banks = [CodedLens(PixelwiseMask(initial=h)).psf_bank(defocus=[-3.0]) for h in (heights, wide, wide.mT)]
+        self.assert_close(banks[1].psfs, banks[0].psfs, rtol=0, atol=1e-7)
+        self.assert_close(banks[2].psfs, banks[0].psfs.mT, rtol=0, atol=1e-5)
+
+    def test_exception_a_mask_that_cannot_be_centred(self):
+        with pytest.raises(ValueError, match="rows and columns of a mask must both be odd or both even, got 4 and 3"):
+            PixelwiseMask(initial=torch.zeros(2, 4, 3))
