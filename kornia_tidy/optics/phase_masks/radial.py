@@ -8,7 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.optics.materials import Material
-from kornia_tidy.optics.phase_masks.base import MASK_SPAN, NOISE_RMS, PhaseMasks, Size, initial_values, mask_axes
+from kornia_tidy.optics.phase_masks.base import (
+    MASK_SPAN,
+    NOISE_RMS,
+    PhaseMasks,
+    Size,
+    initial_values,
+    mask_axes,
+    spread,
+)
 
 
 class RadialMask(PhaseMasks):
@@ -71,4 +79,4 @@ class RadialMask(PhaseMasks):
 
     def free_phase(self) -> Tensor:
         """Return the profile turned around the axis, (K, N, N) radians."""
-        return torch.lerp(self.profile[:, self.inner], self.profile[:, self.inner + 1], self.share)
+        return torch.lerp(spread(self.profile, self.inner), spread(self.profile, self.inner + 1), self.share)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.optics.materials import Material
-from kornia_tidy.optics.phase_masks.base import NOISE_RMS, PhaseMasks, Size, initial_values, mask_axes
+from kornia_tidy.optics.phase_masks.base import NOISE_RMS, PhaseMasks, Size, initial_values, mask_axes, spread
 
 
 class SpiralMask(PhaseMasks):
@@ -79,4 +79,4 @@ class SpiralMask(PhaseMasks):
 
     def free_phase(self) -> Tensor:
         """Return the rings, (K, N, N) radians."""
-        return torch.addcmul(self.offsets[:, self.zone], self.charges[:, self.zone], self.azimuth)
+        return torch.addcmul(spread(self.offsets, self.zone), spread(self.charges, self.zone), self.azimuth)

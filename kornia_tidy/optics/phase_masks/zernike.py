@@ -45,6 +45,7 @@ class ZernikeMask(PhaseMasks):
     """
 
     polynomials: Tensor
+    order: Tensor
 
     def __init__(
         self,
@@ -59,16 +60,43 @@ class ZernikeMask(PhaseMasks):
     ) -> None:
         super().__init__(material, constraint, max_height)
         y, x = mask_axes(size)
-        radius = torch.hypot(y, x)
-        inward = radius.clamp(min=1)
+        self.odd_sides = len(y) % 2 == 1  # both are, or neither: the middle row and column lie on the axes
+        # Every polynomial is even or odd along each axis: a quarter of the mask is all that needs to be held.
+        y, x = y[len(y) // 2 :], x[len(x) // 2 :]
+        inward = torch.hypot(y, x).clamp(min=1)
         polynomials = zernike_polynomials(num_modes, y / inward, x / inward).to(torch.get_default_dtype())
-        self.register_buffer("polynomials", polynomials, persistent=False)
+        parities = [_parity(index) for index in range(num_modes)]
+        order = sorted(range(num_modes), key=parities.__getitem__)
+        self.group_sizes = [parities.count(kind) for kind in ((0, 0), (0, 1), (1, 0), (1, 1))]
+        self.register_buffer("polynomials", polynomials[order].flatten(1), persistent=False)
+        self.register_buffer("order", torch.tensor(order), persistent=False)
+        self.quarter = (len(y), len(x))
         rms = NOISE_RMS / math.sqrt(num_modes)
         self.coefficients = nn.Parameter(initial_values(initial, num_masks, (num_modes,), rms, generator))
 
     def free_phase(self) -> Tensor:
         """Return the sum of the polynomials, (K, N, N) radians."""
-        return (self.coefficients @ self.polynomials.flatten(1)).unflatten(1, self.polynomials.shape[1:])
+        groups = zip(
+            self.coefficients[:, self.order].split(self.group_sizes, 1),
+            self.polynomials.split(self.group_sizes),
+            strict=True,
+        )
+        sums = [(strengths @ shapes).unflatten(1, self.quarter) for strengths, shapes in groups]
+        halves = [self._mirrored(even, odd, -1) for even, odd in (sums[:2], sums[2:])]
+        return self._mirrored(halves[0], halves[1], -2)
+
+    def _mirrored(self, even: Tensor, odd: Tensor, axis: int) -> Tensor:
+        """Both sides of an axis, from what is even and odd about it on its positive side."""
+        middle = int(self.odd_sides)
+        negative = (even - odd).narrow(axis, middle, even.shape[axis] - middle).flip(axis)
+        return torch.cat([negative, even + odd], axis)
+
+
+def _parity(index: int) -> tuple[int, int]:
+    """Return whether a polynomial is odd (1) or even (0) along y and along x."""
+    n = (math.isqrt(8 * index + 1) - 1) // 2
+    m = 2 * index - n * (n + 2)
+    return int(m < 0), (m + (m < 0)) % 2
 
 
 def zernike_polynomials(num_modes: int, y: Tensor, x: Tensor) -> Tensor:

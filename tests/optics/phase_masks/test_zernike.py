@@ -9,6 +9,7 @@ from scipy.special import eval_jacobi
 from torch import Tensor
 
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.phase_masks.base import mask_axes
 from kornia_tidy.optics.phase_masks.zernike import ZernikeMask, zernike_polynomials
 from tests.base import BaseTester
 
@@ -83,6 +84,15 @@ class TestZernikeMask(BaseTester):
         corner = masks.phase[0, 0, 22].detach()
         edge = zernike_polynomials(55, torch.tensor(-(0.5**0.5)).double(), torch.tensor(0.5**0.5).double())
         self.assert_close(corner, edge @ masks.coefficients[0].detach().double(), rtol=1e-4, atol=1e-4)
+
+    @pytest.mark.parametrize("size", [23, 24, (24, 38), (41, 23)])
+    def test_feature_a_quarter_mirrored_is_the_whole(self, size):
+        """Every one of 350 polynomials, evaluated on all pixels."""
+        y, x = mask_axes(size)
+        inward = torch.hypot(y, x).clamp(min=1)
+        expected = zernike_polynomials(350, y / inward, x / inward)
+        masks = ZernikeMask(size=size, num_modes=350, initial=torch.eye(350))
+        self.assert_close(masks.phase.detach().double(), expected, rtol=0, atol=1e-5)
 
     def test_feature_noise_is_as_rough_as_the_start_of_the_paper(self):
         phase = ZernikeMask(200, 100).phase.detach()
