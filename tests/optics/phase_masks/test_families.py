@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import Fidelity, TiDyOptics
+from kornia_tidy import Fidelity, ThinLensCamera, TiDyOptics
 from kornia_tidy.optics import (
+    PMMA,
     CubicMask,
     FourierMask,
     PhaseMasks,
@@ -106,6 +107,15 @@ class TestEveryFamily(BaseTester):
         radians = 1e-10 * math.pi / 530e-9
         for old, new in zip(before, group["params"], strict=True):
             assert float((new - old).detach().abs().max()) == pytest.approx(radians, rel=0.01)
+
+    def test_feature_gradients_of_a_capture_reach_every_parameter(self, family):
+        """Through a lens with axial colour and a limit of height."""
+        camera = ThinLensCamera(lens_material=PMMA)
+        optics = TiDyOptics(family(constraint="sigmoid"), camera, fidelity=FIDELITY)
+        coded = optics(torch.rand(1, 3, 16, 20), torch.full((1, 1, 16, 20), 0.5))
+        coded.mul(torch.randn(coded.shape)).sum().backward()
+        for name, parameter in optics.masks.named_parameters():
+            assert float(parameter.grad.abs().max()) > 0, name
 
     def test_feature_half_precision_keeps_the_height(self, family):
         masks: PhaseMasks = family()
