@@ -28,14 +28,14 @@ from kornia_tidy.optics import CubicMask, FourierMask, PhaseMasks, PixelwiseMask
 # Light that leaves the window is lost, not given back: a PSF is not rewarded for throwing light far away.
 FIDELITY = Fidelity("families", pixel_tolerance=0.1, layer_spacing=5.0, window=23, stray_light="discard")
 
-# Each family with its learning rate in metres of height: less where many shapes add up in every pixel.
+# Each family with its learning rate in metres of height: the less, the more shapes add up in a pixel.
 FAMILIES: dict[str, tuple[Callable[[torch.Generator], PhaseMasks], float]] = {
     "pixelwise": (lambda noise: PixelwiseMask(1, generator=noise), 5e-8),
-    "Zernike": (lambda noise: ZernikeMask(1, generator=noise), 2e-8),
+    "Zernike": (lambda noise: ZernikeMask(1, generator=noise), 1e-8),
     "radial": (lambda noise: RadialMask(1, generator=noise), 5e-8),
-    "spiral": (lambda noise: SpiralMask(1, size=46, num_zones=3, generator=noise), 5e-8),
-    "Fourier": (lambda noise: FourierMask(1, generator=noise), 2e-8),
-    "cubic": (lambda noise: CubicMask(10 * torch.randn(1, generator=noise)), 5e-8),
+    "spiral": (lambda noise: SpiralMask(1, size=46, num_zones=3, generator=noise), 1e-7),
+    "Fourier": (lambda noise: FourierMask(1, generator=noise), 1e-8),
+    "cubic": (lambda noise: CubicMask(10 * torch.randn(1, generator=noise)), 2e-7),
 }
 
 

@@ -4,7 +4,8 @@ With the largest phase m and a free phase :math:`\varphi`:
 
 - clamp: :math:`\min(\max(\varphi + m/2, 0), m)`; beyond a limit only gradients that lead back pass.
 - sigmoid: :math:`m / (1 + e^{-4\varphi/m})`, of slope 1 in the middle of the range, so a learning rate keeps its unit.
-- wrapped: :math:`\varphi \bmod m`; the gradient is that of the free phase, as light at 530 nm sees no step of a wave.
+- wrapped: :math:`\varphi \bmod m`; the gradient is that of the free phase, which passes over the steps. Where m is a
+  whole number of waves, as it is by default, light at 530 nm does not see them.
 """
 
 from __future__ import annotations
