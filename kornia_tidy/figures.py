@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.phase_masks import central_square
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.tidy_optics import TiDyOptics
 
@@ -240,7 +241,7 @@ def _column_header(figure: Figure, x: float, defocus: float, camera: ThinLensCam
 
 
 def _mask(figure: Figure, x: float, y: float, optics: TiDyOptics, k: int) -> None:
-    phase = optics.masks.phase[k].detach().cpu().remainder(2 * math.pi)
+    phase = central_square(optics.masks.phase)[k].detach().cpu().remainder(2 * math.pi)
     amplitude = optics.pupil.amplitude.detach().cpu()
     cells = amplitude.shape[-1] // phase.shape[-1]
     light = torch.nn.functional.avg_pool2d(amplitude[None, None].double(), cells)[0, 0]

@@ -108,3 +108,21 @@ class TestNonconvexPSFs(BaseTester):
         assert (witnesses[1] - 1).abs().max() < 1e-9
         assert max(witnesses[2].max(), witnesses[3].max()) < 1
         assert picture(tmp_path / "nonconvex_psfs.png").float().std() > 20
+
+
+@pytest.mark.parametrize("example", ["mask_families"], indirect=True)
+class TestMaskFamilies(BaseTester):
+    def test_feature_every_family_learns_both_tasks(self, example, capsys):
+        histories = example.main(["--trials", "2", "--iterations", "25"])
+        assert len(histories) == 2 * len(example.FAMILIES) >= 12
+        for runs in histories.values():
+            assert len(runs) == 2
+            assert min(runs[0][-1] / runs[0][0], runs[1][-1] / runs[1][0]) < 0.99
+        assert max(errors[-1] for errors in histories["pixelwise", "target"]) < 0.4
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == 2 + len(histories)
+        assert lines[2].startswith("pixelwise  point")
+
+    def test_feature_steps_are_counted_to_the_first_below_the_goal(self, example):
+        assert example.steps_to(0.5, [0.9, 0.7, 0.4, 0.6]) == 2
+        assert example.steps_to(0.5, [0.9, 0.7]) is None

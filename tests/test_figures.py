@@ -47,6 +47,10 @@ class TestExplain(BaseTester):
         assert sum(shape[:2] == (64, 80) for shape in pictures) == 4
         assert figure.get_size_inches().tolist() == [WIDTH, HEIGHT]
 
+    def test_feature_of_a_longer_mask_the_part_over_the_pupil_is_drawn(self):
+        figure = figure_of(TiDyOptics(PixelwiseMask(2, size=(23, 41)), fidelity=QUICK))
+        assert sum(axes.images[0].get_array().shape == (23, 23) for axes in figure.axes) == 2
+
     def test_feature_headers_run_from_near_to_infinity(self):
         figure = figure_of(TiDyOptics(PixelwiseMask(2), fidelity=QUICK))
         words = [t.get_text() for t in figure.texts]

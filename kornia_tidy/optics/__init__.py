@@ -6,7 +6,16 @@ from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, constant_index
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import AliasingWarning, paper_psf_bank
-from kornia_tidy.optics.phase_masks import FresnelLens, PhaseMasks, PixelwiseMask
+from kornia_tidy.optics.phase_masks import (
+    CubicMask,
+    FourierMask,
+    FresnelLens,
+    PhaseMasks,
+    PixelwiseMask,
+    RadialMask,
+    SpiralMask,
+    ZernikeMask,
+)
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
@@ -19,16 +28,21 @@ __all__ = [
     "PMMA",
     "REFERENCE_WAVELENGTH",
     "AliasingWarning",
+    "CubicMask",
     "DefocusRange",
     "DwellTimes",
+    "FourierMask",
     "FresnelLens",
     "Material",
     "PSFBank",
     "PhaseMasks",
     "PixelwiseMask",
     "Pupil",
+    "RadialMask",
     "Spectrum",
+    "SpiralMask",
     "ThinLensCamera",
+    "ZernikeMask",
     "annular_aperture",
     "autocorrelation_witness",
     "camera_spectrum",

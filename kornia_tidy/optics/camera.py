@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_depth, check_positive
+from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 
@@ -66,6 +67,8 @@ class ThinLensCamera(nn.Module):
         pixel_pitch: distance between the sensor's pixels in metres.
         depth_range: nearest and farthest depth in metres that the PSFs are prepared for. Default: from half the focus
             distance to infinity, which is symmetric in defocus.
+        lens_material: glass of a lens of a single element, whose focus then differs from colour to colour; the focal
+            length is that at 530 nm. Default: a lens corrected for colour.
 
     Shape:
         - ``defocus(depth)``: any shape to the same shape.
@@ -96,6 +99,7 @@ class ThinLensCamera(nn.Module):
         focus_distance: float | Tensor = 0.595,
         pixel_pitch: float = 8e-6,
         depth_range: tuple[float, float] | None = None,
+        lens_material: Material | None = None,
     ) -> None:
         super().__init__()
         check_positive("focal_length", focal_length, "metres")
@@ -107,6 +111,7 @@ class ThinLensCamera(nn.Module):
         self.focal_length = focal_length
         self.aperture_diameter = aperture_diameter
         self.pixel_pitch = pixel_pitch
+        self.lens_material = lens_material
         self.focus_distance: float | Tensor = focus
         if isinstance(focus_distance, Tensor):
             del self.focus_distance  # a parameter may not shadow an attribute
@@ -136,8 +141,37 @@ class ThinLensCamera(nn.Module):
         """Distance from the lens to the sensor in metres, at which the focus distance is sharp."""
         return 1 / (1 / self.focal_length - 1 / _at_least_float32(self.focus_distance))
 
+    def chromatic_defocus(self, wavelength: float) -> float:
+        r"""Return the defocus that a wavelength has more than 530 nm has, whatever the depth.
+
+        The power of a single element goes as its index less one, so
+
+        .. math:: \Delta\psi(\lambda) = \frac{\pi R^2}{\lambda_0} \left( \frac{1}{f} - \frac{1}{f(\lambda)} \right),
+            \qquad f(\lambda) = f \, \frac{n(\lambda_0) - 1}{n(\lambda) - 1}
+
+        Args:
+            wavelength: in metres.
+
+        Returns:
+            Radians at 530 nm, like all defocus; 0 for a lens corrected for colour. Blue, focused nearer to the lens,
+            has less.
+
+        Source: Goodman, Introduction to Fourier Optics, section 5.1 (lensmaker's equation); Chang and Wetzstein, ICCV
+        2019, for chromatic aberration as a code of depth.
+
+        Example:
+            >>> from kornia_tidy.optics import PMMA
+            >>> lens = ThinLensCamera(lens_material=PMMA)
+            >>> [round(lens.chromatic_defocus(w), 2) for w in (610e-9, 530e-9, 470e-9)]
+            [1.8, 0.0, -2.08]
+        """
+        if self.lens_material is None:
+            return 0.0
+        power = (self.lens_material.index(wavelength) - 1) / (self.lens_material.index(REFERENCE_WAVELENGTH) - 1)
+        return math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH * (1 - power) / self.focal_length
+
     def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
-        """Return the defocus map of a depth map. See :func:`thin_lens_defocus`.
+        """Return the defocus map of a depth map at 530 nm. See :func:`thin_lens_defocus`.
 
         Args:
             depth: metres, any shape; ``inf`` is allowed.
@@ -165,6 +199,7 @@ class ThinLensCamera(nn.Module):
             focus.detach() if isinstance(focus, Tensor) else focus,
             self.pixel_pitch / scale,
             self.depth_range,
+            self.lens_material,
         )
 
     @classmethod
@@ -174,6 +209,7 @@ class ThinLensCamera(nn.Module):
         defocus_range: tuple[float, float] = (-20.0, 20.0),
         focal_length: float = 50e-3,
         pixel_pitch: float = 8e-6,
+        lens_material: Material | None = None,
     ) -> ThinLensCamera:
         r"""Choose focus and aperture so that a range of depths fills a range of defocus.
 
@@ -184,6 +220,7 @@ class ThinLensCamera(nn.Module):
             defocus_range: defocus at the farthest and at the nearest depth in radians, lo < hi and lo <= 0 <= hi.
             focal_length: in metres.
             pixel_pitch: in metres.
+            lens_material: glass of a single element. Default: a lens corrected for colour.
 
         Raises:
             ValueError: if a range is empty, or no lens of this focal length can do it.
@@ -204,7 +241,7 @@ class ThinLensCamera(nn.Module):
         inverse_focus = 1 / far - lo / scale
         focus = math.inf if inverse_focus == 0 else 1 / inverse_focus
         radius = math.sqrt(scale * REFERENCE_WAVELENGTH / math.pi)
-        return cls(focal_length, 2 * radius, focus, pixel_pitch, depth_range)
+        return cls(focal_length, 2 * radius, focus, pixel_pitch, depth_range, lens_material)
 
     def extra_repr(self) -> str:
         """Describe the lens in a person's words."""
@@ -213,6 +250,7 @@ class ThinLensCamera(nn.Module):
         return (
             f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {_number(self.focus_distance):.4g} m, "
             f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
+            f"{'' if self.lens_material is None else ', a single element of ' + self.lens_material.name}"
         )
 
 
@@ -261,6 +299,10 @@ class DefocusRange(nn.Module):
     def pixel_pitch(self) -> float:
         """Distance between the sensor's pixels in metres."""
         return self.lens.pixel_pitch
+
+    def chromatic_defocus(self, wavelength: float) -> float:
+        """Return the defocus that a wavelength has more than 530 nm has. See :class:`ThinLensCamera`."""
+        return self.lens.chromatic_defocus(wavelength)
 
     def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
         """Return the defocus map of a normalised disparity map.

@@ -21,7 +21,7 @@ from kornia_tidy.optics.defocus_interpolation import FINE_SPACING, TAPS, defocus
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
-from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask
+from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
 from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
@@ -39,7 +39,8 @@ class CodedLens(nn.Module):
         modulator: turns masks into the states shown and their weights. Default: equal dwell times.
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
-        aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
+        aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
+            Default: the binary disc.
 
     Example:
         >>> lens = CodedLens()
@@ -156,7 +157,7 @@ class CodedLens(nn.Module):
         """PSFs at both ends of the range and at focus, good enough to see where the light goes."""
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-        states, weights = self.modulator(self.masks.phase.to(torch.float32))
+        states, weights = self._states(torch.float32)
         return self._build(states, weights, self.spectrum, self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -171,12 +172,17 @@ class CodedLens(nn.Module):
 
     # ------------------------------------------------------------------ inside
 
+    def _states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """What the modulator shows over the pupil, and for what share of the exposure."""
+        states, weights = self.modulator(self.masks.phase.to(dtype))
+        return central_square(states), weights
+
     @property
     def pupil(self) -> Pupil:
         """The aperture over the masks' pixels."""
-        size = self.masks.phase.shape[-1]
         pupil = self.__dict__["_pupil"]
         if pupil is None:
+            size = min(self.masks.phase.shape[-2:])
             amplitude = circular_aperture(size, MASK_SPAN / size) if self._aperture is None else self._aperture
             if amplitude.shape[-1] % size:
                 raise ValueError(
@@ -196,22 +202,21 @@ class CodedLens(nn.Module):
         tolerance: float,
         nodes: tuple[float, ...],
     ) -> PSFBank:
-        dispersion = [self.masks.dispersion(w) for w in spectrum.wavelengths]
+        dispersion, shift = self._colours(spectrum)
         if self.fidelity.propagation == "paper":
-            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes)
-        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance)
+            return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes, shift)
+        return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
 
     def _computed_bank(self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...]) -> PSFBank:
         """PSFs at these nodes, computed or remembered, before anything is done about stray light."""
-        states, weights = self.modulator(self.masks.phase.to(dtype))
+        states, weights = self._states(dtype)
         step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
         build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
         learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
         if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
             return build(nodes)
-        dispersion = tuple(self.masks.dispersion(w) for w in spectrum.wavelengths)
         paper = self.fidelity.propagation == "paper"
-        setting = (spectrum, dispersion, step, self.window, tolerance, paper, self.pupil)
+        setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
         return self._memory.recall(setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
@@ -240,6 +245,11 @@ class CodedLens(nn.Module):
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
+
+    def _colours(self, spectrum: Spectrum) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """How the phase of the masks and the focus of the lens change from wavelength to wavelength."""
+        waves = spectrum.wavelengths
+        return tuple(map(self.masks.dispersion, waves)), tuple(map(self.camera.chromatic_defocus, waves))
 
     def _pixel_step(self) -> float | Tensor:
         """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""

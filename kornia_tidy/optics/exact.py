@@ -28,6 +28,7 @@ def exact_psf_bank(
     pixel_step: float | Tensor,
     window: int,
     tolerance: float = 2e-2,
+    chromatic_defocus: Sequence[float] | None = None,
 ) -> PSFBank:
     r"""Return the PSFs of a mask sequence with every mask pixel and sensor pixel integrated.
 
@@ -44,6 +45,8 @@ def exact_psf_bank(
             the pixel's side in cycles per pupil radius. May carry gradients.
         window: side P of the PSFs in pixels, odd.
         tolerance: error allowed to the integrals over sensor pixels, see :func:`sensor_kernels`.
+        chromatic_defocus: for each wavelength, what it has more of defocus than the nodes, in radians at 530 nm.
+            Default: nothing, a lens corrected for colour.
 
     Returns:
         A bank whose PSFs sum to their energy.
@@ -59,8 +62,9 @@ def exact_psf_bank(
     per_channel = spectrum.channel_weights
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
     for w, wavelength in enumerate(spectrum.wavelengths):
+        shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]
         kernels = _kernels(
-            tuple(p * (REFERENCE_WAVELENGTH / wavelength) for p in defocus),
+            tuple((p + shift) * (REFERENCE_WAVELENGTH / wavelength) for p in defocus),
             pixel_step / wavelength,
             (window, pupil.amplitude.shape[-1], pupil.cell_pitch, pupil.extent, tolerance),
             phase.device,

@@ -91,8 +91,9 @@ def paper_psf_bank(
     spectrum: Spectrum,
     dispersion: Sequence[float],
     defocus: Sequence[float],
+    chromatic_defocus: Sequence[float] | None = None,
 ) -> PSFBank:
-    """Return the bank of the published discretisation; see :func:`paper_psfs`.
+    """Return the bank of the published discretisation; see :func:`paper_psfs` and, for the arguments, the exact bank.
 
     Raises:
         ValueError: if mask or aperture are not 23x23.
@@ -106,7 +107,8 @@ def paper_psf_bank(
     psfs = phase.new_zeros(len(defocus), len(spectrum.channel_weights), PAPER_SIZE, PAPER_SIZE)
     for w, wavelength in enumerate(spectrum.wavelengths):
         share = phase.new_tensor([channel[w] for channel in spectrum.channel_weights])
-        one = paper_psfs(phase, weights, aperture, nodes, wavelength, dispersion[w])
+        shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]
+        one = paper_psfs(phase, weights, aperture, nodes + shift, wavelength, dispersion[w])
         psfs = psfs + one[:, None] * share[:, None, None]
     return PSFBank(psfs, nodes, psfs.sum((2, 3)))
 

@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
+from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera, thin_lens_defocus
+from kornia_tidy.optics.coded_lens import CodedLens
+from kornia_tidy.optics.materials import FUSED_SILICA, PMMA
+from kornia_tidy.optics.phase_masks import PixelwiseMask
+from kornia_tidy.optics.spectrum import Spectrum
 from tests.base import BaseTester
 
 
@@ -129,3 +134,53 @@ class TestDefocusRange(BaseTester):
 
     def test_feature_resized_scales_the_pixel(self):
         assert DefocusRange().resized(2.0).pixel_pitch == 4e-6
+
+
+class TestSinglet(BaseTester):
+    def test_feature_axial_colour_is_the_focal_length_over_abbe_number(self):
+        """Between the lines F and C the focus of a singlet moves by f / V, with V = 67.8 for fused silica."""
+        lens = ThinLensCamera(lens_material=FUSED_SILICA)
+        scale = math.pi * lens.aperture_radius**2 / 530e-9
+        lines = (486.13e-9, 587.56e-9, 656.27e-9)
+        blue, yellow, red = (1 / (1 / 50e-3 - lens.chromatic_defocus(line) / scale) for line in lines)
+        assert red - blue == pytest.approx(yellow / 67.8, rel=0.01)
+
+    @pytest.mark.parametrize("wavelength", [450e-9, 530e-9, 650e-9])
+    def test_feature_the_psf_is_sharpest_where_the_lensmaker_says(self, wavelength):
+        """The sharpest depth of each colour, found in PSFs, against 1/z = 1/f(lambda) - 1/s': the shift to 1 %."""
+        camera = ThinLensCamera(lens_material=PMMA)
+        fidelity = Fidelity(window=15, stray_light="discard", double=True)
+        masks = PixelwiseMask(1, initial="flat")
+        lens = CodedLens(masks, camera, fidelity=fidelity, spectrum=Spectrum.monochrome(wavelength))
+        nodes = [-8 + 0.5 * i for i in range(33)]
+        with torch.no_grad():
+            peak = lens.psf_bank(defocus=nodes).psfs[:, 0, 7, 7]
+        best = int(peak.argmax())
+        left, top, right = peak[best - 1 : best + 2].tolist()
+        found = nodes[best] + 0.5 * (left - right) / (left - 2 * top + right) / 2
+        focal_length = 50e-3 * (PMMA.index(530e-9) - 1) / (PMMA.index(wavelength) - 1)
+        inverse_depth = 1 / focal_length - 1 / camera.image_distance
+        expected = math.pi * camera.aperture_radius**2 / 530e-9 * (inverse_depth - 1 / 0.595)
+        assert found == pytest.approx(expected, rel=0.01, abs=1e-3)
+
+    def test_feature_a_corrected_lens_has_no_axial_colour(self):
+        assert ThinLensCamera().chromatic_defocus(470e-9) == 0
+        assert DefocusRange().chromatic_defocus(470e-9) == 0
+
+    def test_feature_travels_with_the_camera(self):
+        lens = ThinLensCamera.for_scene((0.5, 4.0), lens_material=PMMA)
+        assert DefocusRange(lens=lens).resized(0.5).chromatic_defocus(470e-9) == lens.chromatic_defocus(470e-9) < 0
+        assert "a single element of PMMA" in repr(lens)
+
+    @pytest.mark.parametrize("fidelity", ["draft", "paper"])
+    def test_feature_swapping_the_lens_is_seen_at_once(self, fidelity):
+        """Remembered PSFs know the colour of the lens they were made for: red gets sharp where its focus lies."""
+        camera = DefocusRange(-10, 10)
+        optics = CodedLens(PixelwiseMask(1, initial="flat"), camera, fidelity=fidelity)
+        with torch.no_grad():
+            corrected = optics.psf_bank(defocus=[-1.8]).psfs[0].amax((1, 2))
+            camera.lens.lens_material = PMMA
+            singlet = optics.psf_bank(defocus=[-1.8]).psfs[0].amax((1, 2))
+        self.assert_close(singlet[1], corrected[1])
+        assert singlet[0] > corrected[0]
+        assert singlet[2] < corrected[2]
