@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -44,7 +45,8 @@ class TiDyOptics(CodedLens):
         sensor: noise and digitisation in linear light, full scale 1; None leaves the light as it is.
         fidelity: a preset's name (``"paper"``, ``"draft"``, ``"balanced"``, ``"reference"``) or a
             :class:`~kornia_tidy.fidelity.Fidelity`.
-        compositing: ``"gather"`` (the paper's equation 1) or ``"scatter"`` (conserves flux).
+        compositing: ``"gather"`` (the paper's equation 1), ``"scatter"`` (conserves flux) or ``"occlusion"`` (near
+            things hide far ones; each state of the exposure is rendered, see ``Fidelity.occlusion_states``).
         color_space: how images are encoded: ``"srgb"`` (default) is decoded to linear light and encoded after;
             ``"linear"`` passes untouched, beyond 1 too; ``"paper"`` treats sRGB values as light, as the paper does,
             and then the sensor's units are encoded ones.
@@ -163,22 +165,33 @@ class TiDyOptics(CodedLens):
             light = self.decode(image.to(dtype))
             defocus = self.camera.defocus(depth.to(dtype), check_inputs=False)
             self._count_clamped(defocus)
-            bank = self.scene_bank(image.shape[1], dtype, defocus)
-            light = render(
-                light,
-                defocus,
-                bank,
-                self.compositing,
-                layers="nearest" if self.fidelity.layers == "nearest" else "linear",
-                border=self.border,
-                correlate=self.fidelity.correlate,
-            )
+            light = self._blurred(light, defocus)
             if self.sensor is not None:
                 light = self.sensor(light, params=params, generator=generator)
             coded = self.encode(light).to(image.dtype)
         if not torch.compiler.is_compiling() and get_worker_info() is not None:
             coded = coded.detach()  # collation in a worker cannot carry gradients
         return coded if batched else coded[0]
+
+    def _blurred(self, light: Tensor, defocus: Tensor) -> Tensor:
+        """What the sensor sees: through PSFs averaged over the exposure, or for occlusion state by state."""
+        look = partial(
+            render,
+            light,
+            defocus,
+            compositing=self.compositing,
+            layers="nearest" if self.fidelity.layers == "nearest" else "linear",
+            border=self.border,
+            correlate=self.fidelity.correlate,
+        )
+        bank = partial(self.scene_bank, light.shape[1], light.dtype, defocus)
+        if self.compositing != "occlusion" or self.fidelity.occlusion_states == "mean":
+            return look(bank=bank())
+        weights = self.state_weights(light.dtype)
+        seen = look(bank=bank(state=0)) * weights[0]
+        for state, weight in enumerate(weights[1:], start=1):
+            seen = seen + look(bank=bank(state=state)) * weight
+        return seen
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.

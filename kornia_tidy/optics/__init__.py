@@ -10,6 +10,7 @@ from kornia_tidy.optics.phase_masks import FresnelLens, PhaseMasks, PixelwiseMas
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
+from kornia_tidy.optics.state_bank import StateBank
 from kornia_tidy.optics.witness import autocorrelation_witness
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "PixelwiseMask",
     "Pupil",
     "Spectrum",
+    "StateBank",
     "ThinLensCamera",
     "annular_aperture",
     "autocorrelation_witness",

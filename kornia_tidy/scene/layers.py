@@ -82,13 +82,13 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     return lower, (clamped - nodes.take(lower)) / nodes.diff().take(lower)
 
 
-def layer_weight(lower: Tensor, fraction: Tensor | None, index: int) -> Tensor:
+def layer_weight(lower: Tensor, fraction: Tensor | None, index: int | Tensor) -> Tensor:
     """Return the weight of one layer at every pixel, from what :func:`assign_layers` returned.
 
     Args:
         lower: (B, 1, H, W) int64 index of the layer below.
         fraction: (B, 1, H, W) share of the layer above, or None for none.
-        index: the layer wanted.
+        index: the layer wanted, or a tensor of layers that broadcasts with the pixels.
 
     Returns:
         (B, 1, H, W) weight in [0, 1], of ``fraction``'s dtype, or bool if that is None.
