@@ -38,9 +38,10 @@ class StateBank:
 
     def __post_init__(self) -> None:
         if tuple(self.weights.shape) != tuple(self.psfs.shape[:1]):
-            raise ValueError(f"weights must have shape ({len(self.psfs)},) as psfs have, got {tuple(self.weights.shape)}")
-        for _ in self:  # each checks its own shapes
-            pass
+            raise ValueError(
+                f"weights must have shape ({len(self.psfs)},) as psfs have, got {tuple(self.weights.shape)}"
+            )
+        list(self)  # each state's bank checks its shapes
 
     @classmethod
     def of(cls, banks: Sequence[PSFBank], weights: Tensor) -> Self:

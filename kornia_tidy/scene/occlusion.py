@@ -41,15 +41,13 @@ def lay_over(layers: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
         >>> round(float(lay_over([near, far])), 4)  # 0.2 + (1 - 0.25) * 0.05 / 0.5
         0.275
     """
-    total: Tensor | None = None
-    for light, own, seen in layers:
-        divisor = seen.clamp(min=0) + EPSILON
-        if total is None:
-            total, through = light / divisor, 1 - own / divisor
-            continue
-        share = through / divisor
+    planes = iter(layers)
+    light, own, seen = next(planes)
+    divisor = seen.clamp(min=0) + EPSILON  # round-off makes it fall below zero
+    total, through = light / divisor, 1 - own / divisor
+    for light, own, seen in planes:
+        share = through / (seen.clamp(min=0) + EPSILON)
         total, through = total.addcmul(share, light), through.addcmul(share, own, value=-1)
-    assert total is not None
     return total
 
 

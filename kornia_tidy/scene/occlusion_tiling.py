@@ -15,7 +15,6 @@ the inputs are kept; each chunk is computed again.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -24,66 +23,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
-from kornia_tidy.scene.convolution import next_fast_size, pad_border
+from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.layers import layer_weight
 from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
-
-# Sides of transforms; and bytes that the complex planes of a chunk may take, see tiles.py.
-SIZES = (16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024)
-CHUNK_BYTES = {"cpu": 6 << 20}
-CHUNK_BYTES_ACCELERATOR = 256 << 20
-
-Corner = tuple[int, int, int]  # image, first row and first column of a window in the padded plane, and of its tile
-
-
-class Grid(NamedTuple):
-    """Square tiles over a batch of images of ``height`` x ``width`` pixels, the last ones reaching beyond."""
-
-    batch: int
-    height: int
-    width: int
-    size: int
-    tile: int
-
-    @property
-    def rows(self) -> int:
-        """Tiles from top to bottom."""
-        return math.ceil(self.height / self.tile)
-
-    @property
-    def columns(self) -> int:
-        """Tiles from left to right."""
-        return math.ceil(self.width / self.tile)
-
-    def corner(self, number: int) -> Corner:
-        """Return where a tile stands."""
-        rest, column = divmod(number, self.columns)
-        image, row = divmod(rest, self.rows)
-        return image, row * self.tile, column * self.tile
-
-
-class Chunk(NamedTuple):
-    """Tiles that are worked on together, all with n layers in their windows.
-
-    Args:
-        corners: where they stand.
-        layers: (N, n) their layers from far to near, as indices into :attr:`Plan.present`.
-        bounded: nothing of the windows lies in the dark beyond a border of zeros.
-        fillers: where in ``corners`` a tile stands only to make a pair and counts for nothing.
-    """
-
-    corners: list[Corner]
-    layers: Tensor
-    bounded: bool
-    fillers: list[int]
-
-
-class Plan(NamedTuple):
-    """What is computed for one scene: tiles in chunks, and the (D',) layers that are present at all."""
-
-    grid: Grid
-    present: Tensor
-    chunks: list[Chunk]
+from kornia_tidy.scene.occlusion_tiles import Chunk, Corner, Grid, Plan, make_plan
 
 
 class Scene(NamedTuple):
@@ -159,133 +102,6 @@ def occlude_tiled(
     )
 
 
-def make_plan(
-    lower: Tensor,
-    fraction: Tensor | None,
-    output: tuple[int, int],
-    bank: tuple[int, int, int],
-    *,
-    sloped: bool,
-    dark: bool,
-) -> Plan:
-    """Choose the tiles for a scene, find the layers of each, and group them into chunks.
-
-    Args:
-        lower: (B, H, W) layer of each pixel of the padded image, and
-        fraction: share of the next one, or None.
-        output: height and width of the image to be made.
-        bank: number of layers, channels and the side of the PSFs.
-        sloped: a share of zero matters too, for its gradient.
-        dark: what lies beyond the border has no weight.
-    """
-    count, channels, psf_size = bank
-    labels = _labels(lower, fraction, sloped=sloped)
-    grid = choose_grid(labels, output, count, psf_size)
-    here = _present(labels, grid, count, 1).cpu()
-    used = here.any(0)
-    here = here[:, used]
-    radius = psf_size // 2 if dark else 0
-    corners = [grid.corner(number) for number in range(len(here))]
-    bounded = torch.tensor(
-        [
-            radius <= y <= grid.height + radius - grid.size and radius <= x <= grid.width + radius - grid.size
-            for _, y, x in corners
-        ]
-        if dark
-        else [True] * len(here)
-    )
-    numbers = here.sum(1)
-    limit = CHUNK_BYTES.get(lower.device.type, CHUNK_BYTES_ACCELERATOR) // (16 * channels * grid.size**2)
-    chunks = []
-    for own_bound in (True, False):
-        for number in range(1, int(numbers.max()) + 1):
-            tiles = ((numbers == number) & (bounded == own_bound)).nonzero().squeeze(-1)
-            layers = here[tiles].nonzero()[:, 1].view(-1, number)
-            pairs = own_bound and number == 1
-            if pairs:
-                tiles, layers = _paired(tiles, layers)
-            step = max(2, limit // number // 2 * 2)
-            for first in range(0, len(tiles), step):
-                own = tiles[first : first + step].tolist()
-                chunks.append(
-                    Chunk(
-                        [corners[max(tile, 0)] for tile in own],
-                        layers[first : first + step].to(lower.device),
-                        own_bound,
-                        [place for place, tile in enumerate(own) if tile < 0],
-                    )
-                )
-    return Plan(grid, used.nonzero().squeeze(-1).to(lower.device), chunks)
-
-
-def choose_grid(labels: list[Tensor], output: tuple[int, int], count: int, psf_size: int) -> Grid:
-    """Return the grid with the lowest cost.
-
-    Larger tiles waste less on their overlap, smaller ones hold fewer layers. The layers of each candidate are counted
-    on every eighth row and column. Cost in nanoseconds a sample of a window and channel, measured on one core of a
-    2.5 GHz Xeon: 3 for a window of a single layer in float32; of n layers, 13 each, and 8 for each but two.
-    """
-    batch = len(labels[0])
-    smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: a window meets only next neighbours
-    sizes = [size for size in SIZES if smallest <= size < 2 * (psf_size - 1 + max(output))][:5]
-    grids = [Grid(batch, *output, size, size - psf_size + 1) for size in sizes or [next_fast_size(smallest)]]
-    step = 8
-    sample = [label[:, ::step, ::step] for label in labels]
-    costs = []
-    for grid in grids:
-        number = _present(sample, grid, count, step).sum(1)
-        cost = torch.where(number < 2, 3, 13 * number + 8 * (number - 2))
-        costs.append(cost.sum() * grid.size**2)
-    return grids[int(torch.stack(costs).argmin())]
-
-
-def _labels(lower: Tensor, fraction: Tensor | None, *, sloped: bool) -> list[Tensor]:
-    """Return the one or two layers of each pixel."""
-    if fraction is None:
-        return [lower]
-    if sloped:
-        return [lower, lower + 1]
-    return [lower + (fraction == 1), lower + (fraction > 0)]
-
-
-def _present(labels: list[Tensor], grid: Grid, count: int, step: int) -> Tensor:
-    """Return (tiles, count) bool: the layers in each tile's window. Labels are of every ``step``-th pixel.
-
-    A pixel belongs to the window of the tile it lies in, and to that of the tile before if it lies near the start.
-    """
-    batch, height, width = labels[0].shape
-    device = labels[0].device
-
-    def windows(length: int, tiles: int) -> tuple[Tensor, Tensor]:
-        """The window that each row begins in; and which rows the window before reaches as well."""
-        pixel = step * torch.arange(length, device=device)
-        own = (pixel // grid.tile).clamp(max=tiles - 1)
-        return own, ((pixel - own * grid.tile < grid.size - grid.tile) & (own > 0)).nonzero().squeeze(-1)
-
-    (row, reached_rows), (column, reached_columns) = windows(height, grid.rows), windows(width, grid.columns)
-    first = torch.arange(batch, device=device)[:, None, None] * (grid.rows * grid.columns * count)
-    table = torch.zeros(batch * grid.rows * grid.columns * count, dtype=torch.bool, device=device)
-    for label in labels:
-        own = label + first + ((row * grid.columns)[:, None] + column) * count
-        above = own[:, reached_rows] - grid.columns * count
-        for keys in (own, own[..., reached_columns] - count, above, above[..., reached_columns] - count):
-            table.index_fill_(0, keys.reshape(-1), True)
-    return table.view(-1, count)
-
-
-def _paired(tiles: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
-    """Order tiles of one layer each so that two of a layer stand together; -1 fills up where one is left over."""
-    order = layers[:, 0].argsort(stable=True)
-    own = layers[order, 0]
-    numbers = torch.bincount(own)
-    even = numbers + numbers % 2
-    shift = (even.cumsum(0) - even) - (numbers.cumsum(0) - numbers)
-    slots = torch.arange(len(own)) + shift[own]
-    filled = torch.full((int(even.sum()),), -1)
-    filled[slots] = tiles[order]
-    return filled, torch.arange(len(numbers)).repeat_interleave(even)[:, None]
-
-
 class _OccludeTiled(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -319,33 +135,37 @@ class _OccludeTiled(torch.autograd.Function):
         grid = plan.grid
         scene = _scene(light, psfs, fraction, mean, veil, lower, inside, plan)
         grad = pad(grad, (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height))
+        wanted = ctx.needs_input_grad[:5]
         sources = Inputs(light, scene.spectra, fraction, mean, scene.veil)
-        wanted = Inputs(*ctx.needs_input_grad[:5])
-        slopes = Inputs(*(torch.zeros_like(s) if want else None for s, want in zip(sources, wanted, strict=True)))
+        slopes = {
+            name: torch.zeros_like(source)
+            for name, source, want in zip(Inputs._fields, sources, wanted, strict=True)
+            if want and source is not None
+        }
         for chunk in plan.chunks:
             own = torch.stack([grad[i, :, y : y + grid.tile, x : x + grid.tile] for i, y, x in chunk.corners])
             own[chunk.fillers] = 0
+            leaves = [
+                None if x is None else x.detach().requires_grad_(want)
+                for x, want in zip(_inputs(scene, chunk, grid), wanted, strict=True)
+            ]
+            asked = {n: x for n, x in zip(Inputs._fields, leaves, strict=True) if x is not None and x.requires_grad}
+            if not asked:
+                continue
             with torch.enable_grad():
-                inputs = Inputs(
-                    *(
-                        None if x is None else x.detach().requires_grad_(want)
-                        for x, want in zip(_inputs(scene, chunk, grid), wanted, strict=True)
-                    )
-                )
-                tiles = _tiles(inputs, scene, chunk, plan)
-                asked = [place for place, x in enumerate(inputs) if x is not None and x.requires_grad]
-                found = torch.autograd.grad(tiles, [inputs[place] for place in asked], own.to(tiles.dtype))
-            _add(Inputs(*(found[asked.index(n)] if n in asked else None for n in range(5))), slopes, chunk, grid)
-        side = psfs.shape[-1]
+                tiles = _tiles(Inputs._make(leaves), scene, chunk, plan)
+            found = torch.autograd.grad(tiles, list(asked.values()), own.to(tiles.dtype))
+            for name, part in zip(asked, found, strict=True):
+                _add(name, slopes[name], part, chunk, grid)
         of_psfs = of_veil = None
-        if slopes.spectra is not None:  # correlation is the transpose of convolution
+        if "spectra" in slopes:  # correlation is the transpose of convolution
             of_psfs = torch.zeros_like(psfs)
-            own = torch.fft.ifft2(slopes.spectra, norm="forward").real[..., :side, :side]
-            of_psfs[plan.present] = own.to(psfs.dtype)
-        if slopes.veil is not None:
+            own = torch.fft.ifft2(slopes["spectra"], norm="forward").real
+            of_psfs[plan.present] = own[..., : psfs.shape[-2], : psfs.shape[-1]].to(psfs.dtype)
+        if "veil" in slopes:
             of_veil = torch.zeros_like(veil)
-            of_veil[plan.present] = slopes.veil
-        return slopes.light, of_psfs, slopes.fraction, slopes.mean, of_veil, None, None, None
+            of_veil[plan.present] = slopes["veil"]
+        return slopes.get("light"), of_psfs, slopes.get("fraction"), slopes.get("mean"), of_veil, None, None, None
 
 
 def _scene(
@@ -394,20 +214,17 @@ def _inputs(scene: Scene, chunk: Chunk, grid: Grid) -> Inputs:
     )
 
 
-def _add(found: Inputs, slopes: Inputs, chunk: Chunk, grid: Grid) -> None:
-    """Add the gradients of a chunk's inputs to those of what they were taken from."""
-    size = grid.size
-    for part, plane in ((found.light, slopes.light), (found.fraction, slopes.fraction)):
-        if part is not None and plane is not None:
-            for own, (image, y, x) in zip(part, chunk.corners, strict=True):
-                plane[image, ..., y : y + size, x : x + size] += own
-    layers = chunk.layers[::2, 0] if _alone(chunk) else chunk.layers.flatten()
-    for part, table in ((found.spectra, slopes.spectra), (found.veil, slopes.veil)):
-        if part is not None and table is not None:
-            table.index_add_(0, layers, part.reshape(-1, *table.shape[1:]))
-    if found.mean is not None and slopes.mean is not None:
-        images = torch.tensor([image for image, _, _ in chunk.corners], device=slopes.mean.device)
-        slopes.mean.index_add_(0, images, found.mean)
+def _add(name: str, slope: Tensor, part: Tensor, chunk: Chunk, grid: Grid) -> None:
+    """Add the gradient of one of a chunk's inputs to that of what it was taken from."""
+    if name in ("light", "fraction"):
+        for own, (image, y, x) in zip(part, chunk.corners, strict=True):
+            slope[image, ..., y : y + grid.size, x : x + grid.size] += own
+        return
+    if name == "mean":
+        taken = torch.tensor([image for image, _, _ in chunk.corners], device=slope.device)
+    else:
+        taken = chunk.layers[::2, 0] if _alone(chunk) else chunk.layers.flatten()
+    slope.index_add_(0, taken, part.reshape(-1, *slope.shape[1:]))
 
 
 def _tiles(inputs: Inputs, scene: Scene, chunk: Chunk, plan: Plan) -> Tensor:
@@ -443,7 +260,7 @@ def _layers_over(inputs: Inputs, scene: Scene, chunk: Chunk, plan: Plan) -> Tens
         own, behind = own * inside[:, None], behind * inside[:, None]
 
     light = inputs.light[:, None].double()
-    if inputs.veil is not None and inputs.mean is not None:
+    if inputs.veil is not None and inputs.mean is not None:  # both or none
         light = torch.lerp(light, inputs.mean[:, None, :, None, None].double(), inputs.veil[..., None, None].double())
     lit = torch.complex(light, torch.ones_like(light))  # times a weight: the layer's light, and the weight itself
     spectra = torch.fft.fft2(own[:, :, None].to(lit.dtype) * lit)

@@ -204,7 +204,9 @@ def test_occlusion_against_the_stack_of_all_layers(scene):
     error = float((ikoma_stack(image, psi, bank) - expected).abs().max())
     candidates = {f.__name__: lambda f=f: f(image, psi, bank) for f in (tiled_occlusion, ikoma_stack, tiled)}
     medians = in_turn(candidates, 3 if scene == "aloe" else ROUNDS)
-    print(f"\n{scene}, 21 nearest layers, 23-pixel PSFs, {torch.get_num_threads()} threads; float32 stack off {error:.1e}")
+    print(
+        f"\n{scene}, 21 nearest layers, 23-pixel PSFs, {torch.get_num_threads()} threads; float32 stack off {error:.1e}"
+    )
     for name, own in medians.items():
         print(f"{name:16} {own:9.1f} ms  {own / medians['tiled_occlusion']:6.2f} x tiled occlusion")
     assert all(own > 0 for own in medians.values())

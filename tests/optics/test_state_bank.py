@@ -40,7 +40,9 @@ class TestStateBank(BaseTester):
 
 
 class TestStatesOfALens(BaseTester):
-    @pytest.mark.parametrize("fidelity", [SMALL.replace(stray_light="discard"), Fidelity.preset("paper")], ids=["exact", "paper"])
+    @pytest.mark.parametrize(
+        "fidelity", [SMALL.replace(stray_light="discard"), Fidelity.preset("paper")], ids=["exact", "paper"]
+    )
     def test_feature_the_weighted_mean_of_the_states_is_the_bank(self, fidelity):
         optics = TiDyOptics(PixelwiseMask(3), DefocusRange(-10, 10), DwellTimes((1, 2, 5)), fidelity=fidelity)
         states, bank = optics.psf_bank(states=True), optics.psf_bank()

@@ -9,12 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.scene import occlusion_tiling
+from kornia_tidy.scene import occlusion_tiles
 from kornia_tidy.scene.compositing import METHODS, gather, occlusion, render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.layers import layer_weights
 from kornia_tidy.scene.occlusion import EPSILON, weight_behind
-from kornia_tidy.scene.occlusion_tiling import choose_grid, make_plan
+from kornia_tidy.scene.occlusion_tiles import choose_grid, make_plan
 from tests.base import BaseTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
 from tests.scene.test_compositing import oracle
@@ -26,9 +26,9 @@ ATOL = {torch.float32: 2e-5, torch.float64: 1e-12}
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Tiles so small, and chunks of so few, that a small scene has many of both."""
-    monkeypatch.setattr(occlusion_tiling, "SIZES", (8, 12, 16))
-    monkeypatch.setitem(occlusion_tiling.CHUNK_BYTES, "cpu", 40_000)
-    monkeypatch.setattr(occlusion_tiling, "CHUNK_BYTES_ACCELERATOR", 40_000)
+    monkeypatch.setattr(occlusion_tiles, "SIZES", (8, 12, 16))
+    monkeypatch.setitem(occlusion_tiles.CHUNK_BYTES, "cpu", 40_000)
+    monkeypatch.setattr(occlusion_tiles, "CHUNK_BYTES_ACCELERATOR", 40_000)
 
 
 def steps(bank, height, width, side=11):
@@ -381,8 +381,8 @@ class TestTiledOcclusion(BaseTester):
         defocus = torch.empty(1, 1, 128, 128, device=device).uniform_(-20, 20).requires_grad_()
         largest = LargestTensor()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(occlusion_tiling.CHUNK_BYTES, "cpu", 200_000)
-            patch.setattr(occlusion_tiling, "CHUNK_BYTES_ACCELERATOR", 200_000)
+            patch.setitem(occlusion_tiles.CHUNK_BYTES, "cpu", 200_000)
+            patch.setattr(occlusion_tiles, "CHUNK_BYTES_ACCELERATOR", 200_000)
             with largest:
                 render(image, defocus, bank, "occlusion").sum().backward()
         assert largest.bytes < 500_000  # two tiles of 20 layers at least; the planes of all layers are 5 MB and more
