@@ -16,7 +16,7 @@ from kornia_tidy.scene.convolution import next_fast_size
 
 # Sides of transforms; and bytes that the complex planes of a chunk may take, see tiles.py.
 SIZES = (16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024)
-CHUNK_BYTES = {"cpu": 6 << 20}
+CHUNK_BYTES = {"cpu": 2 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 
 Corner = tuple[int, int, int]  # image, first row and first column of a window in the padded plane, and of its tile
@@ -164,25 +164,22 @@ def _labels(lower: Tensor, fraction: Tensor | None, *, sloped: bool) -> list[Ten
 def _present(labels: list[Tensor], grid: Grid, count: int, step: int) -> Tensor:
     """Return (tiles, count) bool: the layers in each tile's window. Labels are of every ``step``-th pixel.
 
-    A pixel belongs to the window of the tile it lies in, and to that of the tile before if it lies near the start.
+    A column belongs to the window of the tile it lies in, and to that of the tile before if it lies near the start.
     """
-    batch, height, width = labels[0].shape
-    device = labels[0].device
-
-    def windows(length: int, tiles: int) -> tuple[Tensor, Tensor]:
-        """The window that each row begins in; and which rows the window before reaches as well."""
-        pixel = step * torch.arange(length, device=device)
-        own = (pixel // grid.tile).clamp(max=tiles - 1)
-        return own, ((pixel - own * grid.tile < grid.size - grid.tile) & (own > 0)).nonzero().squeeze(-1)
-
-    (row, reached_rows), (column, reached_columns) = windows(height, grid.rows), windows(width, grid.columns)
-    first = torch.arange(batch, device=device)[:, None, None] * (grid.rows * grid.columns * count)
-    table = torch.zeros(batch * grid.rows * grid.columns * count, dtype=torch.bool, device=device)
-    for label in labels:
-        own = label + first + ((row * grid.columns)[:, None] + column) * count
-        above = own[:, reached_rows] - grid.columns * count
-        for keys in (own, own[..., reached_columns] - count, above, above[..., reached_columns] - count):
-            table.index_fill_(0, keys.reshape(-1), True)
+    batch, _, width = labels[0].shape
+    device, own_row = labels[0].device, grid.columns * count
+    pixel = step * torch.arange(width, device=device)
+    column = (pixel // grid.tile).clamp(max=grid.columns - 1)
+    reached = ((pixel - column * grid.tile < grid.size - grid.tile) & (column > 0)).nonzero().squeeze(-1)
+    first = torch.arange(batch, device=device)[:, None, None] * (grid.rows * own_row) + column * count
+    table = torch.zeros(batch * grid.rows * own_row, dtype=torch.bool, device=device)
+    for row in range(grid.rows):  # row by row, in a processor's cache
+        top, bottom = row * grid.tile, row * grid.tile + grid.size
+        here = table[row * own_row :]
+        for label in labels:
+            keys = label[:, math.ceil(top / step) : math.ceil(bottom / step)] + first
+            here.index_fill_(0, keys.view(-1), True)
+            here.index_fill_(0, keys[..., reached].sub_(count).view(-1), True)
     return table.view(-1, count)
 
 
