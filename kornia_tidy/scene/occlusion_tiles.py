@@ -140,7 +140,7 @@ def choose_grid(labels: list[Tensor], output: tuple[int, int], count: int, psf_s
     """
     batch = len(labels[0])
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: a window meets only next neighbours
-    sizes = [size for size in SIZES if smallest <= size < 2 * (psf_size - 1 + max(output))][:5]
+    sizes = [size for size in SIZES if smallest <= size < 2 * (psf_size - 1 + max(output))]
     grids = [Grid(batch, *output, size, size - psf_size + 1) for size in sizes or [next_fast_size(smallest)]]
     step = 8
     sample = [label[:, ::step, ::step] for label in labels]

@@ -13,7 +13,7 @@ from kornia_tidy.scene import occlusion_tiles
 from kornia_tidy.scene.compositing import METHODS, gather, occlusion, render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.layers import layer_weights
-from kornia_tidy.scene.occlusion import EPSILON, weight_behind
+from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
 from kornia_tidy.scene.occlusion_tiles import choose_grid, make_plan
 from tests.base import BaseTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
@@ -115,6 +115,11 @@ class TestOcclusion(BaseTester):
             expected = weights[:, : index + 1].sum(1, keepdim=True)
             self.assert_close(weight_behind(lower, fraction, index), expected, rtol=0, atol=1e-14)
             assert torch.equal(weight_behind(lower, None, index), lower <= index)
+
+    def test_feature_a_negative_divisor_counts_as_none(self, device, dtype):
+        """Interpolated PSFs can be negative in places."""
+        light, seen = torch.tensor(1e-7, device=device, dtype=dtype), torch.tensor(-5.0, device=device, dtype=dtype)
+        self.assert_close(lay_over([(light, light, seen)]), light / EPSILON, rtol=1e-6, atol=0)
 
     # Physics
 
@@ -339,6 +344,26 @@ class TestTiledOcclusion(BaseTester):
             else:
                 scale = float(expected.abs().max())
                 self.assert_close(slope, expected, rtol=0, atol=scale * (2e-5 if dtype == torch.float32 else 1e-10))
+
+    @pytest.mark.parametrize("kind", ["an odd number of tiles of one layer", "depths on the nodes"])
+    @pytest.mark.usefixtures("small_tiles")
+    def test_feature_gradients_of_hard_scenes_equal_those_of_the_dense_render(self, kind, device, monkeypatch):
+        monkeypatch.setattr(occlusion_tiles, "SIZES", (12,))  # 8 x 8 pixels a tile: 3 tiles
+        bank = make_bank(4, 1, 5, device=device)
+        image, _ = make_scene(bank, 1, 8, 24)
+        odd = kind.startswith("an odd")
+        defocus = bank.defocus[1].expand(1, 1, 8, 24) if odd else steps(bank, 8, 24, 5)
+        slopes = []
+        for method in METHODS:
+            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs)]
+            scene = Bank(inputs[2], bank.defocus)
+            coded = render(*inputs[:2], scene, "occlusion", layers="nearest" if odd else "linear", method=method)
+            wanted = [inputs[0], inputs[2]] if odd else inputs
+            slopes.append(torch.autograd.grad(coded.square().sum(), wanted))
+        for slope, expected in zip(*slopes, strict=True):
+            self.assert_close(
+                slope, expected, rtol=0, atol=1e-6 * float(expected.abs().max())
+            )  # slopes reach 1 / epsilon
 
     @pytest.mark.parametrize("wanted", range(4))
     @pytest.mark.usefixtures("small_tiles")
