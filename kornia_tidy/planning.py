@@ -27,7 +27,7 @@ from kornia_tidy.capture_error import (
     region_power,
     spectrum_size,
 )
-from kornia_tidy.checks import check_positive
+from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
@@ -150,6 +150,9 @@ class Planner:
         optics: the camera.
         channels: of the images: as many as its spectrum has, or 1.
 
+    Raises:
+        ValueError: if the camera's compositing is neither gather nor scatter, whose errors follow from the PSFs'.
+
     Example:
         >>> from kornia_tidy import PixelwiseMask, TiDyOptics
         >>> planner = Planner(TiDyOptics(PixelwiseMask(1, initial="flat")), channels=3)
@@ -159,6 +162,7 @@ class Planner:
     """
 
     def __init__(self, optics: PlannableCamera, channels: int) -> None:
+        check_choice("the compositing of a camera to plan for", optics.compositing, ("gather", "scatter"))
         camera = optics.camera
         spectrum = optics.spectrum if channels == len(optics.spectrum.weights) else Spectrum.monochrome()
         step = float(camera.pixel_pitch * camera.aperture_radius / camera.image_distance)

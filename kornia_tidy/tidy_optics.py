@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -48,7 +49,8 @@ class TiDyOptics(CodedLens):
         sensor: noise and digitisation in linear light, full scale 1; None leaves the light as it is.
         fidelity: a preset's name (``"paper"``, ``"draft"``, ``"balanced"``, ``"reference"``) or a
             :class:`~kornia_tidy.fidelity.Fidelity`.
-        compositing: ``"gather"`` (the paper's equation 1) or ``"scatter"`` (conserves flux).
+        compositing: ``"gather"`` (the paper's equation 1), ``"scatter"`` (conserves flux) or ``"occlusion"`` (near
+            things hide far ones; each state of the exposure is rendered, see ``Fidelity.occlusion_states``).
         color_space: how images are encoded: ``"srgb"`` (default) is decoded to linear light and encoded after;
             ``"linear"`` passes untouched, beyond 1 too; ``"paper"`` treats sRGB values as light, as the paper does,
             and then the sensor's units are encoded ones.
@@ -182,8 +184,8 @@ class TiDyOptics(CodedLens):
     ) -> Tensor:
         defocus = self._defocus(depth, image)
         self._survey([defocus])
-        bank = self.scene_bank(image.shape[1], defocus.dtype, defocus)
-        return self._expose(image, defocus, bank, self.border, params, generator)
+        banks = self._scene_banks(image.shape[1], defocus)
+        return self._expose(image, defocus, banks, self.border, params, generator)
 
     def _capture_in_bands(
         self,
@@ -198,38 +200,54 @@ class TiDyOptics(CodedLens):
         height, width = self._cropped(image).shape[-2:]
         bands = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
         extremes = self._survey(self._defocus(part, image) for part in depth.split(rows, dim=-2))
-        bank = self.scene_bank(image.shape[1], extremes.dtype, extremes)
+        banks = self._scene_banks(image.shape[1], extremes)
         sides = "replicate" if self.border == "zero" else self.border  # what is black may lie anywhere
         coded = image.new_empty(*image.shape[:2], height, width)
         for band in bands:
             piece = padded_band(image, band, radius, self.border)
             there = self._defocus(padded_band(depth, band, radius, sides), image)
             own = None if params is None else {name: field[..., band, :] for name, field in params.items()}
-            coded[..., band, :] = self._expose(piece, there, bank, "valid", own, generator)
+            coded[..., band, :] = self._expose(piece, there, banks, "valid", own, generator)
         return coded
 
     def _expose(
         self,
         image: Tensor,
         defocus: Tensor,
-        bank: PSFBank,
+        banks: list[tuple[Tensor | float, PSFBank]],
         border: str,
         params: Mapping[str, Tensor] | None,
         generator: torch.Generator | None,
     ) -> Tensor:
         """Take a picture of encoded light at known defocus."""
-        light = render(
+        look = partial(
+            render,
             self.decode(image.to(defocus.dtype)),
             defocus,
-            bank,
-            self.compositing,
+            compositing=self.compositing,
             layers="nearest" if self.fidelity.layers == "nearest" else "linear",
             border=border,
             correlate=self.fidelity.correlate,
         )
+        (share, bank), *others = banks
+        light = look(bank=bank)
+        if others:
+            light = light * share
+            for share, bank in others:
+                light = light + look(bank=bank) * share
         if self.sensor is not None:
             light = self.sensor(light, params=params, generator=generator)
         return self.encode(light).to(image.dtype)
+
+    def _scene_banks(self, channels: int, defocus: Tensor) -> list[tuple[Tensor | float, PSFBank]]:
+        """PSFs that a scene is rendered through, and for what share of the exposure.
+
+        Their average does for the whole exposure, except where layers hide one another: there each state of its own.
+        """
+        bank = partial(self.scene_bank, channels, defocus.dtype, defocus)
+        if self.compositing != "occlusion" or self.fidelity.occlusion_states == "mean":
+            return [(1.0, bank())]
+        return [(share, bank(state=state)) for state, share in enumerate(self.state_weights(defocus.dtype))]
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.
@@ -336,7 +354,9 @@ class TiDyOptics(CodedLens):
         learning = torch.is_grad_enabled() and (
             image.requires_grad or depth.requires_grad or any(p.requires_grad for p in self.parameters())
         )
-        if learning or torch.compiler.is_compiling() or self.fidelity.stray_light == "veil":
+        veiled = self.fidelity.stray_light == "veil"
+        unseen = self.compositing == "occlusion" and self.border == "zero"  # beyond the border is neither light nor thing
+        if learning or torch.compiler.is_compiling() or veiled or unseen:
             return None
         itemsize = self._compute_dtype(image).itemsize
         row = _BYTES_A_PIXEL * itemsize // 4 * image.shape[0] * image.shape[-1]

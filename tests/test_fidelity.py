@@ -25,6 +25,7 @@ class TestFidelity(BaseTester):
             ("propagation", "fast"),
             ("layers", "quadratic"),
             ("stray_light", "keep"),
+            ("occlusion_states", "first"),
             ("pixel_tolerance", 0.0),
             ("layer_spacing", -1.0),
             ("enclosed_energy", 1.0),

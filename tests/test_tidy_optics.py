@@ -94,6 +94,64 @@ class TestLight(BaseTester):
         expected = getattr(oracle, compositing)(image.numpy(), label, psfs)
         assert abs(coded - expected).max() < 1e-12
 
+    @needs_data
+    def test_feature_occlusion_equals_the_oracle_state_by_state(self, monkeypatch):
+        monkeypatch.setattr(sys, "path", [str(SHARED / "oracle"), *sys.path])
+        import oracle
+
+        optics = TiDyOptics(
+            PixelwiseMask(2),
+            modulator=DwellTimes((3, 1)),
+            sensor=None,
+            color_space="linear",
+            compositing="occlusion",
+            fidelity=SMALL.replace(layers="nearest", double=True),
+        )
+        image = torch.rand(3, 30, 34, dtype=torch.float64)
+        depth = torch.where(torch.arange(34) < 15, 0.45, 1.4).expand(1, 30, 34).double()
+        coded = optics(image, depth).detach().numpy()
+        label = oracle.nearest(
+            oracle.defocus(depth[0].numpy(), optics.camera.aperture_radius, 0.595), optics.defocus_nodes
+        )
+        bank = optics.psf_bank(states=True)
+        near_first = list(range(len(bank.defocus)))[::-1]
+        expected = sum(
+            float(w) * oracle.occlusion(image.numpy(), label, state.psfs.detach().numpy(), near_first)
+            for w, state in zip(bank.weights, bank, strict=True)
+        )
+        assert abs(coded - expected).max() < 1e-9
+
+    @pytest.mark.parametrize("layers", ["nearest", "linear", "bandlimited"])
+    def test_feature_an_occlusion_capture_is_the_weighted_mean_of_single_masks(self, layers):
+        """And not the capture through the mean PSFs, which is what ``occlusion_states="mean"`` takes."""
+        masks, shares = PixelwiseMask(3), (3, 1, 2)
+        options = {"sensor": None, "color_space": "linear", "compositing": "occlusion"}
+        fidelity = SMALL.replace(layers=layers, layer_spacing=2.0)
+        optics = TiDyOptics(masks, modulator=DwellTimes(shares), fidelity=fidelity, **options)
+        image, depth = torch.rand(1, 3, 40, 44), torch.where(torch.arange(44) < 20, 0.4, 2.0).expand(1, 1, 40, 44)
+        single = [
+            TiDyOptics(PixelwiseMask(initial=height[None]), fidelity=fidelity, **options)(image, depth).detach()
+            for height in masks.heights().detach()
+        ]
+        expected = sum(share / 6 * own for share, own in zip(shares, single, strict=True))
+        coded = optics(image, depth)
+        self.assert_close(coded, expected, rtol=0, atol=2e-6)
+        through_mean = optics.with_fidelity(fidelity.replace(occlusion_states="mean"))(image, depth)
+        error = float((through_mean - coded).detach().abs().max())
+        assert 2e-5 < error < 2e-2
+
+    def test_feature_occlusion_sends_gradients_to_every_mask_and_to_depth(self):
+        optics = TiDyOptics(PixelwiseMask(2), sensor=None, compositing="occlusion", fidelity=SMALL)
+        image = torch.rand(1, 3, 30, 30)
+        depth = torch.where(torch.arange(30) < 15, 0.4, 2.0).expand(1, 1, 30, 30).clone().requires_grad_()
+        optics(image, depth).square().mean().backward()
+        assert optics.masks.phase.grad.abs().amax((1, 2)).min() > 0
+        assert depth.grad.abs().max() > 0
+
+    def test_exception_plans_are_for_gather_and_scatter(self):
+        with pytest.raises(ValueError, match="must be one of 'gather', 'scatter', got 'occlusion'"):
+            TiDyOptics(compositing="occlusion", fidelity=SMALL).plan(torch.ones(1, 30, 30))
+
     def test_feature_paper_takes_srgb_as_light_and_correlates(self):
         masks = PixelwiseMask(2)
         paper = TiDyOptics(masks, DefocusRange(-10, 10), sensor=None, fidelity="paper")

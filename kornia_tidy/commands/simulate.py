@@ -20,6 +20,7 @@ from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.optics.phase_masks import PixelwiseMask
+from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tidy_optics import COLOR_SPACES, TiDyOptics
 
@@ -85,10 +86,10 @@ def add_parser(subparsers: Any) -> None:
     )
     capture.add_argument(
         "--compositing",
-        choices=("gather", "scatter"),
+        choices=tuple(COMPOSITING),
         default="gather",
         help="gather: each pixel collects light through its own depth's PSF, as the paper; scatter: each spreads its "
-        "light, which conserves it (default: gather)",
+        "light, which conserves it; occlusion: near things hide far ones, slowest (default: gather)",
     )
     capture.add_argument(
         "--border",

@@ -19,6 +19,7 @@ from kornia_tidy.optics.phase_masks import (
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
+from kornia_tidy.optics.state_bank import StateBank
 from kornia_tidy.optics.witness import autocorrelation_witness
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "RadialMask",
     "Spectrum",
     "SpiralMask",
+    "StateBank",
     "ThinLensCamera",
     "ZernikeMask",
     "annular_aperture",

@@ -5,10 +5,11 @@ from __future__ import annotations
 import copy
 import warnings
 from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, Self
+from typing import Any, Literal, Self, overload
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +26,7 @@ from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask,
 from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.optics.state_bank import StateBank
 
 
 class CodedLens(nn.Module):
@@ -64,18 +66,40 @@ class CodedLens(nn.Module):
         self.modulator = DwellTimes() if modulator is None else modulator
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
-        self._memory = BankMemory()
+        self._memories: dict[int | None, BankMemory] = defaultdict(BankMemory)  # of each state, and of their average
         if self.fidelity.propagation == "paper":
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
         self.register_load_state_dict_post_hook(_refit_window)
         self.fit_window()
+
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: Literal[False] = False,
+    ) -> PSFBank: ...
+
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: Literal[True],
+    ) -> StateBank: ...
 
     def psf_bank(
         self,
         channels: int | None = None,
         dtype: torch.dtype | None = None,
         defocus: Sequence[float] | None = None,
-    ) -> PSFBank:
+        *,
+        states: bool = False,
+    ) -> PSFBank | StateBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         Without gradients, PSFs are remembered while masks and camera stay as they are.
@@ -84,11 +108,20 @@ class CodedLens(nn.Module):
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
             dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
             defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
+            states: return the PSFs of each state that the modulator shows, with their weights, not the average.
         """
         spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
         dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
-        return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
+        if not states:
+            return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
+        weights = self.state_weights(dtype)
+        banks = [self._computed_bank(spectrum, dtype, nodes, state) for state in range(len(weights))]
+        return StateBank.of([bank.with_stray_light(self.fidelity.stray_light) for bank in banks], weights)
+
+    def state_weights(self, dtype: torch.dtype) -> Tensor:
+        """Return the share of the exposure of each state that the modulator shows, (S,)."""
+        return self.modulator(self.masks.phase.to(dtype))[1]
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
@@ -168,7 +201,7 @@ class CodedLens(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: no PSFs."""
-        return {**super().__getstate__(), "_memory": BankMemory()}
+        return {**super().__getstate__(), "_memories": defaultdict(BankMemory)}
 
     # ------------------------------------------------------------------ inside
 
@@ -207,9 +240,13 @@ class CodedLens(nn.Module):
             return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes, shift)
         return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
 
-    def _computed_bank(self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...]) -> PSFBank:
+    def _computed_bank(
+        self, spectrum: Spectrum, dtype: torch.dtype, nodes: tuple[float, ...], state: int | None = None
+    ) -> PSFBank:
         """PSFs at these nodes, computed or remembered, before anything is done about stray light."""
         states, weights = self._states(dtype)
+        if state is not None:
+            states, weights = states[state : state + 1], torch.ones_like(weights[:1])
         step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
         build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
         learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
@@ -217,20 +254,21 @@ class CodedLens(nn.Module):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
-        return self._memory.recall(setting, states, weights, nodes, build)
+        return self._memories[state].recall(setting, states, weights, nodes, build)
 
-    def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
+    def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
 
         Args:
             channels: of the image, as in :meth:`psf_bank`.
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
+            state: index of the one state to look through. Default: the average over the exposure.
         """
         spectrum, kind = self._spectrum(channels), self.fidelity.layers
         nodes = self.defocus_nodes
         if kind in ("nearest", "linear"):
-            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus))
+            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus), state)
         else:
             spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
             finer = ceil(spacing / FINE_SPACING)
@@ -239,7 +277,7 @@ class CodedLens(nn.Module):
             first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
             last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
-            bank = self._computed_bank(spectrum, dtype, samples)
+            bank = self._computed_bank(spectrum, dtype, samples, state)
             bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
         return bank.with_stray_light(self.fidelity.stray_light)
 

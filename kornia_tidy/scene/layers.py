@@ -103,13 +103,13 @@ def _even_spacing(nodes: Tensor) -> Tensor | None:
     return spacing if bool(((nodes - even).abs() <= rounding).all()) else None
 
 
-def layer_weight(lower: Tensor, fraction: Tensor | None, index: int) -> Tensor:
+def layer_weight(lower: Tensor, fraction: Tensor | None, index: int | Tensor) -> Tensor:
     """Return the weight of one layer at every pixel, from what :func:`assign_layers` returned.
 
     Args:
         lower: (B, 1, H, W) int64 index of the layer below.
         fraction: (B, 1, H, W) share of the layer above, or None for none.
-        index: the layer wanted.
+        index: the layer wanted, or a tensor of layers that broadcasts with the pixels.
 
     Returns:
         (B, 1, H, W) weight in [0, 1], of ``fraction``'s dtype, or bool if that is None.

@@ -37,7 +37,7 @@ class Conditions:
         width: columns.
         channels: 1 or 3.
         masks: number K of masks in one exposure.
-        compositing: ``"gather"`` or ``"scatter"``.
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         reference: the setting that errors are measured against.
         version: of the library.
         code_hash: of the library's source.

@@ -26,7 +26,7 @@ def run(bench, size, device, compositing="gather", layers=21, mode="linear", win
 
 class TestRendering:
     @pytest.mark.parametrize("layers", [1, 5, 21])
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_by_layers(self, bench, size, device, compositing, layers):
         run(bench, size, device, compositing, layers)
 
@@ -38,7 +38,7 @@ class TestRendering:
     def test_by_window(self, bench, size, device, window):
         run(bench, size, device, window=window)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_with_gradients_to_the_psfs(self, bench, size, device, compositing):
         run(bench, size, device, compositing, gradients=True)
 

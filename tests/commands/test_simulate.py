@@ -56,11 +56,12 @@ class TestSimulate(BaseTester):
         assert float((image - coded).abs().mean()) > 0.05  # it did something
 
     @pytest.mark.filterwarnings("always")
-    def test_feature_every_option_reaches_the_camera(self, scene, capsys):
+    @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
+    def test_feature_every_option_reaches_the_camera(self, scene, capsys, compositing):
         options = (
-            "--bits 16 --masks 2 --mask-seed 7 --seed 8 --sigma 0.02 --fidelity draft --compositing scatter "
-            "--border valid --color-space linear --focal-length 0.04 --aperture-diameter 0.002 --focus-distance 0.8 "
-            "--depth-range 0.5 8 --pixel-pitch 1e-5"
+            "--bits 16 --masks 2 --mask-seed 7 --seed 8 --sigma 0.02 --fidelity draft --border valid "
+            "--color-space linear --focal-length 0.04 --aperture-diameter 0.002 --focus-distance 0.8 "
+            f"--depth-range 0.5 8 --pixel-pitch 1e-5 --compositing {compositing}"
         )
         assert main(["simulate", "image.png", "--depth", "depth.pfm", "-o", "out.png", *options.split()]) == 0
         assert "beyond the camera's range -6.67 to +4.45" in capsys.readouterr().err
@@ -71,7 +72,7 @@ class TestSimulate(BaseTester):
                 camera=ThinLensCamera(0.04, 0.002, 0.8, 1e-5, (0.5, 8.0)),
                 sensor=SensorNoise(0.02),
                 fidelity="draft",
-                compositing="scatter",
+                compositing=compositing,
                 border="valid",
                 color_space="linear",
             )(image, depth, generator=seeded(8))

@@ -89,6 +89,8 @@ def brute_render(image, psi, bank: Bank, *, compositing: str, layers: str, borde
                     o * (brute_blur(plane, h, border) + v * plane.mean())
                     for o, h, v in zip(inner, psfs[:, c], veil[:, c], strict=True)
                 ]
+            elif compositing == "occlusion":
+                terms = [brute_occlusion(plane, weights, psfs[:, c], veil[:, c], border)]
             else:
                 terms = [
                     brute_blur(o * plane, h, border) + v * (o * plane).mean()
@@ -96,3 +98,14 @@ def brute_render(image, psi, bank: Bank, *, compositing: str, layers: str, borde
                 ]
             out.append(sum(terms))
     return torch.from_numpy(np.stack(out)).reshape(*image.shape[:2], *out[0].shape).to(image.device)
+
+
+def brute_occlusion(plane, weights, psfs, veil, border: str) -> np.ndarray:
+    """Ikoma's layers over one another, the far ones first: each lets through what it does not hide."""
+    image = np.zeros_like(brute_blur(plane, psfs[0], border))
+    for d in range(len(psfs)):
+        seen = brute_blur(weights[: d + 1].sum(0), psfs[d], border) + 1e-6
+        light = (1 - veil[d]) * plane + veil[d] * plane.mean()
+        opacity = brute_blur(weights[d], psfs[d], border) / seen
+        image = brute_blur(weights[d] * light, psfs[d], border) / seen + (1 - opacity) * image
+    return image

@@ -268,7 +268,7 @@ class TestRender(BaseTester):
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"compositing": "splat"}, "compositing must be one of 'gather', 'scatter', got 'splat'"),
+            ({"compositing": "splat"}, "compositing must be one of 'gather', 'scatter', 'occlusion', got 'splat'"),
             ({"layers": "cubic"}, "layers must be one of 'nearest', 'linear', got 'cubic'"),
             ({"border": "mirror"}, "border must be one of 'reflect', .* got 'mirror'"),
         ],
