@@ -51,7 +51,8 @@ class TiDyOptics(CodedLens):
         border: ``"reflect"``, ``"replicate"``, ``"zero"``, ``"circular"``, or ``"valid"``, which crops image, depth
             and clean image alike to where the whole PSF fits.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel. Images of
-            one channel are taken at 530 nm.
+            one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
+            has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
         check_inputs: look at the values of images and depths before any work, eagerly.
 
@@ -164,6 +165,9 @@ class TiDyOptics(CodedLens):
             defocus = self.camera.defocus(depth.to(dtype), check_inputs=False)
             self._count_clamped(defocus)
             bank = self.scene_bank(image.shape[1], dtype, defocus)
+            reflectances = bank.psfs.shape[1] // image.shape[1]  # 1, or one for each channel of the scene's colours
+            if reflectances > 1:
+                light = light.repeat(1, reflectances, 1, 1)
             light = render(
                 light,
                 defocus,
@@ -173,6 +177,8 @@ class TiDyOptics(CodedLens):
                 border=self.border,
                 correlate=self.fidelity.correlate,
             )
+            if reflectances > 1:
+                light = light.unflatten(1, (-1, reflectances)).sum(2)
             if self.sensor is not None:
                 light = self.sensor(light, params=params, generator=generator)
             coded = self.encode(light).to(image.dtype)

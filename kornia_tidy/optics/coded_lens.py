@@ -77,6 +77,7 @@ class CodedLens(nn.Module):
     ) -> PSFBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
+        They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
         Without gradients, PSFs are remembered while masks and camera stay as they are.
 
         Args:
@@ -87,7 +88,7 @@ class CodedLens(nn.Module):
         spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
         dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
-        return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
+        return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
@@ -157,7 +158,7 @@ class CodedLens(nn.Module):
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states, weights = self.modulator(self.masks.phase.to(torch.float32))
-        return self._build(states, weights, self.spectrum, self._pixel_step(), size, 0.1, nodes).psfs
+        return self._build(states, weights, self.spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
@@ -217,6 +218,8 @@ class CodedLens(nn.Module):
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
 
+        Where the spectrum has a basis, (D, C B, P, P): those of a channel follow each other.
+
         Args:
             channels: of the image, as in :meth:`psf_bank`.
             dtype: float32 or float64.
@@ -236,7 +239,7 @@ class CodedLens(nn.Module):
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
             bank = self._computed_bank(spectrum, dtype, samples)
             bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
-        return bank.with_stray_light(self.fidelity.stray_light)
+        return bank.with_stray_light(self.fidelity.stray_light, len(spectrum.basis or (1,)))
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)

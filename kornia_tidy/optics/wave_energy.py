@@ -81,7 +81,7 @@ def _gradients(
     first: Tensor, weights: Tensor, left: Tensor, second: Tensor, gradient: Tensor, needed: Sequence[bool]
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients of the four inputs, of those needed; a sum over blocks, like the energies."""
-    depths, window, order, cells = left.shape
+    depths, _, order, cells = left.shape
     states = len(weights)
     rows = weights.repeat(order)[:, None]
     to_first, to_weights = torch.zeros_like(first), torch.zeros_like(weights)
