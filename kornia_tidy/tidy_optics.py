@@ -316,6 +316,10 @@ class TiDyOptics(CodedLens):
         if torch.compiler.is_compiling():
             return
         lo, hi = self.camera.defocus_range
+        lowest, highest = torch.aminmax(defocus.detach())
+        if bool((lowest >= lo - 5e-4) & (highest <= hi + 5e-4)):
+            self._clamped = None
+            return
         self._clamped = ((defocus < lo - 5e-4) | (defocus > hi + 5e-4)).detach().sum()
         if self.check_inputs and not self._warned and (count := int(self._clamped)):
             self._warned = True
