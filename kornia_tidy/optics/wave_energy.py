@@ -68,11 +68,12 @@ class _WaveEnergies(torch.autograd.Function):
         return _energies(first, weights, left, second)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], _: Tensor) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = grad_outputs
         with torch.autocast(gradient.device.type, enabled=False):
             return _gradients(*ctx.saved_tensors, gradient, ctx.needs_input_grad)
 
