@@ -37,8 +37,10 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
 
 def check_finite(name: str, value: Tensor) -> None:
     """Raise ``ValueError`` if a value is NaN or infinite. Waits for the device."""
-    # The extremes are NaN if any value is: one pass over the values, and no map of truths.
-    if value.numel() and not bool(torch.isfinite(torch.stack(torch.aminmax(value.detach()))).all()):
+    if not value.numel():
+        return
+    lowest, highest = torch.aminmax(value.detach())  # NaN if any value is: one pass, and no map of truths
+    if not bool(lowest.isfinite() & highest.isfinite()):
         bad = value[~torch.isfinite(value)][0].item()
         raise ValueError(f"{name} must be finite, got {bad}")
 

@@ -26,7 +26,8 @@ def spectral_error(lens: CodedLens, few: Spectrum, many: Spectrum, defocus: Sequ
         0.016, 11 by 0.0055, 16 by 0.0016 and 31 by 0.0003; ``Spectrum.rgb()`` by 0.11.
 
     Example:
-        >>> from kornia_tidy import PixelwiseMask, camera_spectrum
+        >>> from kornia_tidy import PixelwiseMask
+        >>> from kornia_tidy.optics import camera_spectrum
         >>> lens = CodedLens(PixelwiseMask(1, initial="flat"))
         >>> few, some, many = (camera_spectrum(samples=n) for n in (2, 6, 18))
         >>> spectral_error(lens, some, many, [-20.0, 0.0]) < spectral_error(lens, few, many, [-20.0, 0.0])
