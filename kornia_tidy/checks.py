@@ -37,13 +37,16 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
 
 def check_finite(name: str, value: Tensor) -> None:
     """Raise ``ValueError`` if a value is NaN or infinite. Waits for the device."""
-    if value.numel() and not bool(torch.isfinite(torch.stack(torch.aminmax(value.detach()))).all()):  # NaN is both
+    if not value.numel():
+        return
+    lowest, highest = torch.aminmax(value.detach())  # NaN if any value is: one pass, and no map of truths
+    if not bool(lowest.isfinite() & highest.isfinite()):
         bad = value[~torch.isfinite(value)][0].item()
         raise ValueError(f"{name} must be finite, got {bad}")
 
 
 def check_depth(depth: Tensor) -> None:
     """Raise ``ValueError`` if a depth is NaN, zero or negative; infinity is allowed. Waits for the device."""
-    if depth.numel() and not bool(depth.detach().amin() > 0):  # NaN is the least, and above nothing
+    if depth.numel() and not bool(depth.detach().amin() > 0):  # False for NaN too
         bad = depth[~(depth > 0)][0].item()
         raise ValueError(f"depth must be positive metres, got {bad} (fill holes and mark them in a mask first)")

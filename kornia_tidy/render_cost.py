@@ -105,7 +105,7 @@ def memory_bytes(
 ) -> int:
     """Return the peak memory of a capture without gradients beyond the image: of the bank or the renderer, whichever.
 
-    The bank holds its kernels, its PSFs and three times the field of as many depths as fit 2**23 samples. The renderer
+    The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and as real matrices. The renderer
     holds some sixteen planes of the padded image's size in all channels: two spectra and their product, the transforms'
     own copies, the sums and what is chosen from. Both are within a third of what was measured on a CPU.
     """
@@ -114,10 +114,8 @@ def memory_bytes(
     side = max(geometry.samples(fidelity))
     psfs = real * layers * channels * window_side(fidelity) ** 2
     kernels = 2 * real * layers * side * geometry.pupil.amplitude.shape[-1]
-    samples = geometry.states * side**2
-    field = 2 * real * samples * min(layers, max(1, 2**23 // samples))
     down, across = (next_fast_size(side) for side in padded_size(height, width, window_side(fidelity), border))
-    return int(psfs + max(kernels + 3 * field, 16 * real * batch * channels * down * across))
+    return int(psfs + max(4 * kernels, 16 * real * batch * channels * down * across))
 
 
 def _weight(fidelity: Fidelity) -> int:

@@ -57,7 +57,8 @@ class TiDyOptics(CodedLens):
         border: ``"reflect"``, ``"replicate"``, ``"zero"``, ``"circular"``, or ``"valid"``, which crops image, depth
             and clean image alike to where the whole PSF fits.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel. Images of
-            one channel are taken at 530 nm.
+            one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
+            has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
         check_inputs: look at the values of images and depths before any work, eagerly.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
@@ -220,9 +221,14 @@ class TiDyOptics(CodedLens):
         generator: torch.Generator | None,
     ) -> Tensor:
         """Take a picture of encoded light at known defocus."""
+        light = self.decode(image.to(defocus.dtype))
+        # Where colours have spectra, each channel of the sensor sees a plane for each channel of the scene.
+        reflectances = banks[0][1].psfs.shape[1] // image.shape[1]
+        if reflectances > 1:
+            light = light.repeat(1, reflectances, 1, 1)
         look = partial(
             render,
-            self.decode(image.to(defocus.dtype)),
+            light,
             defocus,
             compositing=self.compositing,
             layers="nearest" if self.fidelity.layers == "nearest" else "linear",
@@ -235,6 +241,8 @@ class TiDyOptics(CodedLens):
             light = light * share
             for share, bank in others:
                 light = light + look(bank=bank) * share
+        if reflectances > 1:
+            light = light.unflatten(1, (-1, reflectances)).sum(2)
         if self.sensor is not None:
             light = self.sensor(light, params=params, generator=generator)
         return self.encode(light).to(image.dtype)
@@ -355,7 +363,8 @@ class TiDyOptics(CodedLens):
             image.requires_grad or depth.requires_grad or any(p.requires_grad for p in self.parameters())
         )
         veiled = self.fidelity.stray_light == "veil"
-        unseen = self.compositing == "occlusion" and self.border == "zero"  # beyond the border is neither light nor thing
+        # Beyond a zero border there is nothing that hides, which black pixels would.
+        unseen = self.compositing == "occlusion" and self.border == "zero"
         if learning or torch.compiler.is_compiling() or veiled or unseen:
             return None
         itemsize = self._compute_dtype(image).itemsize
@@ -403,9 +412,11 @@ class TiDyOptics(CodedLens):
         extremes, pixels, clamped = [], 0, torch.tensor(0)
         for defocus in parts:
             own = defocus.detach()
-            extremes.append(torch.stack(torch.aminmax(own)))
+            lowest, highest = torch.aminmax(own)
+            extremes.append(torch.stack([lowest, highest]))
             pixels += own.numel()
-            clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
+            if not bool((lowest >= lo - 5e-4) & (highest <= hi + 5e-4)):
+                clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
         lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
         self._clamped = clamped
         if self.check_inputs and not self._warned and (count := int(clamped)):

@@ -310,10 +310,10 @@ class DefocusRange(nn.Module):
         Raises:
             ValueError: if a value is NaN or outside [0, 1].
         """
-        if check_inputs:
-            valid = (depth >= 0) & (depth <= 1)
-            if not bool(valid.all()):
-                bad = depth[~valid][0].item()
+        if check_inputs and depth.numel():
+            lowest, highest = torch.aminmax(depth.detach())
+            if not bool((lowest >= 0) & (highest <= 1)):  # False for NaN too
+                bad = depth[~((depth >= 0) & (depth <= 1))][0].item()
                 raise ValueError(f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}")
         lo, hi = self.defocus_range
         return (lo + (hi - lo) * _at_least_float32(depth)).to(depth.dtype)

@@ -102,6 +102,7 @@ class CodedLens(nn.Module):
     ) -> PSFBank | StateBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
+        They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
         Without gradients, PSFs are remembered while masks and camera stay as they are.
 
         Args:
@@ -114,9 +115,9 @@ class CodedLens(nn.Module):
         dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
         if not states:
-            return self._computed_bank(spectrum, dtype, nodes).with_stray_light(self.fidelity.stray_light)
+            return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
         weights = self.state_weights(dtype)
-        banks = [self._computed_bank(spectrum, dtype, nodes, state) for state in range(len(weights))]
+        banks = [self._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
         return StateBank.of([bank.with_stray_light(self.fidelity.stray_light) for bank in banks], weights)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
@@ -191,7 +192,7 @@ class CodedLens(nn.Module):
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states, weights = self._states(torch.float32)
-        return self._build(states, weights, self.spectrum, self._pixel_step(), size, 0.1, nodes).psfs
+        return self._build(states, weights, self.spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
@@ -259,6 +260,8 @@ class CodedLens(nn.Module):
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
 
+        Where the spectrum has a basis, (D, C B, P, P): those of a channel follow each other.
+
         Args:
             channels: of the image, as in :meth:`psf_bank`.
             dtype: float32 or float64.
@@ -279,7 +282,7 @@ class CodedLens(nn.Module):
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
             bank = self._computed_bank(spectrum, dtype, samples, state)
             bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
-        return bank.with_stray_light(self.fidelity.stray_light)
+        return bank.with_stray_light(self.fidelity.stray_light, len(spectrum.basis or (1,)))
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)

@@ -49,7 +49,7 @@ def exact_psf_bank(
             Default: nothing, a lens corrected for colour.
 
     Returns:
-        A bank whose PSFs sum to their energy.
+        A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
 
     Source: design of the matrix transform: Soummer et al. 2007; average over masks: Shah et al. 2023, equation 4.
 
@@ -59,7 +59,7 @@ def exact_psf_bank(
         >>> bank.psfs.shape
         torch.Size([1, 1, 23, 23])
     """
-    per_channel = spectrum.channel_weights
+    per_channel = spectrum.plane_weights
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
     for w, wavelength in enumerate(spectrum.wavelengths):
         shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]

@@ -104,9 +104,9 @@ def paper_psf_bank(
             f"{aperture.shape[-1]}"
         )
     nodes = phase.new_tensor(defocus)
-    psfs = phase.new_zeros(len(defocus), len(spectrum.channel_weights), PAPER_SIZE, PAPER_SIZE)
+    psfs = phase.new_zeros(len(defocus), len(spectrum.plane_weights), PAPER_SIZE, PAPER_SIZE)
     for w, wavelength in enumerate(spectrum.wavelengths):
-        share = phase.new_tensor([channel[w] for channel in spectrum.channel_weights])
+        share = phase.new_tensor([channel[w] for channel in spectrum.plane_weights])
         shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]
         one = paper_psfs(phase, weights, aperture, nodes + shift, wavelength, dispersion[w])
         psfs = psfs + one[:, None] * share[:, None, None]

@@ -12,15 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
+
+from kornia_tidy.optics.wave_energy import wave_energies
 
 CELL_TOLERANCE = 1e-9  # of the integrals over mask pixels: exact for every purpose, and they cost next to nothing
-_CHUNK_SAMPLES = 2**23  # samples of the field on the sensor held at once
 
 
 def gauss_legendre_order(half_range: float, tolerance: float) -> int:
@@ -173,24 +172,7 @@ def pixel_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
         >>> round(float(light.sum() / 4), 2)  # a square pupil of 2x2 radii lets through 4
         0.99
     """
-    samples = len(field) * (kernels.shape[1] * kernels.shape[2]) ** 2  # for each depth
-    step = max(1, _CHUNK_SAMPLES // samples)
-    if step >= len(kernels):
-        return _chunk_energies(field, weights, kernels)
-    # Too large to hold at once: depth by depth, and the backward pass computes each chunk again.
-    chunk_energies = _chunk_energies
-    if torch.is_grad_enabled():  # checkpoint imports the compiler (2 s), so only where it is needed
-        chunk_energies = partial(checkpoint, _chunk_energies, use_reentrant=False)
-    return torch.cat([chunk_energies(field, weights, chunk) for chunk in kernels.split(step)])
-
-
-def _chunk_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
-    depths, window, order, cells = kernels.shape
-    flat = kernels.reshape(depths, 1, window * order, cells)
-    wave = flat @ field @ flat.mT  # (D, K, U, U)
-    intensity = wave.real.square() + wave.imag.square()
-    mean = torch.einsum("k,dkuv->duv", weights.to(intensity.dtype), intensity)
-    return mean.reshape(depths, window, order, window, order).sum((2, 4))
+    return wave_energies(field, weights, kernels)
 
 
 # What torch.compiler.assume_constant_result does, without the compiler it imports (2 s): NumPy is not traced through.

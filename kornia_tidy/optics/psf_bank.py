@@ -57,19 +57,38 @@ class PSFBank:
         """Side P of the PSFs in pixels."""
         return self.psfs.shape[-1]
 
-    def with_stray_light(self, kind: str) -> PSFBank:
+    def with_stray_light(self, kind: str, basis: int = 1) -> PSFBank:
         """Return a bank in which the light outside the window is dealt with.
 
         Args:
             kind: ``"renormalize"`` scales each PSF to a sum of one; ``"veil"`` keeps the PSFs and spreads what they
                 miss over the image; ``"discard"`` loses it.
+            basis: PSFs a channel, see :class:`~kornia_tidy.optics.spectrum.Spectrum`.
         """
         check_choice("stray_light", kind, STRAY_LIGHT)
+        if basis > 1:
+            return self._with_stray_light_of_basis(kind, basis)
         if kind == "renormalize":
             tiny = torch.finfo(self.energy.dtype).tiny  # a PSF without light stays without light
             return PSFBank(self.psfs / self.energy.clamp(min=tiny)[..., None, None], self.defocus, self.energy)
         veil = (1 - self.energy).clamp(min=0) if kind == "veil" else None
         return PSFBank(self.psfs, self.defocus, self.energy, veil)
+
+    def _with_stray_light_of_basis(self, kind: str, basis: int) -> PSFBank:
+        """Deal with the light of a spectral scene: white light as ever, and colours that are even stay what they are.
+
+        A channel sees all light of its own reflectance and none of the others'. What the window holds of each differs,
+        as it does between wavelengths; "renormalize" makes it up in the shape of the channel's PSF for white light.
+        """
+        seen = torch.eye(basis).to(self.energy)  # (C, B), as many channels as reflectances
+        energy = self.energy.unflatten(1, (-1, basis))
+        if kind != "renormalize":
+            return PSFBank(self.psfs, self.defocus, self.energy, (seen - energy).flatten(1) if kind == "veil" else None)
+        white = energy.sum(2, keepdim=True).clamp(min=torch.finfo(energy.dtype).tiny)[..., None, None]
+        psfs = self.psfs.unflatten(1, (-1, basis)) / white
+        missing = seen[..., None, None] - energy[..., None, None] / white
+        psfs = psfs + missing * psfs.sum(2, keepdim=True)
+        return PSFBank(psfs.flatten(1, 2), self.defocus, self.energy)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the bank as safetensors, all or nothing.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,10 +26,13 @@ class Spectrum:
     Args:
         wavelengths: the W samples in metres.
         weights: C rows of W numbers, each the response of channel c at a wavelength, in any common unit.
+        basis: C rows of W numbers, the reflectance that stands for a scene's colour in each channel, or None for
+            scenes whose colours all reflect flatly within a channel. See :func:`smoothest_reflectances`.
 
     Raises:
         ValueError: if a wavelength is not between 100 nm and 20 µm, a weight is negative or not finite, a row has
-            another length than ``wavelengths``, or a channel sees no light.
+            another length than ``wavelengths``, a channel sees no light, or the basis does not give each channel its
+            own colour.
 
     Example:
         >>> Spectrum((500e-9, 600e-9), ((1, 3),)).channel_weights
@@ -41,6 +44,7 @@ class Spectrum:
 
     wavelengths: tuple[float, ...]
     weights: tuple[tuple[float, ...], ...]
+    basis: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         # Lists and NumPy rows become tuples of floats, so that a spectrum can always be hashed.
@@ -63,11 +67,34 @@ class Spectrum:
                     raise ValueError(f"weights must be finite and not negative, got {weight} in channel {channel}")
             if not sum(row) > 0:
                 raise ValueError(f"weights of channel {channel} must have a positive sum, got {sum(row)}")
+        if self.basis is not None:
+            object.__setattr__(self, "basis", tuple(_floats(row) for row in self.basis))
+            shape = (len(self.weights), len(self.wavelengths))
+            if (len(self.basis), *{len(row) for row in self.basis}) != shape:
+                raise ValueError(f"basis must have shape {shape} as the weights have, got {np.shape(self.basis)}")
+            seen = np.array(self.channel_weights) @ np.array(self.basis).T
+            if not np.allclose(seen, np.eye(shape[0]), rtol=0, atol=1e-6):
+                raise ValueError(f"basis must be seen as 1 by its own channel and as 0 by others, got {seen.tolist()}")
 
     @property
     def channel_weights(self) -> tuple[tuple[float, ...], ...]:
         """The weights divided by their sum in each channel, (C, W): every row adds up to one."""
         return tuple(tuple(weight / sum(row) for weight in row) for row in self.weights)
+
+    @property
+    def plane_weights(self) -> tuple[tuple[float, ...], ...]:
+        r"""Weights of the PSFs that a scene needs: :math:`h_{cb} = \sum_\lambda w_{c\lambda} R_{b\lambda} h_\lambda`.
+
+        (C B, W), ordered by channel, then by basis; without a basis those of the channels, (C, W).
+        """
+        rows = self.channel_weights
+        if self.basis is None:
+            return rows
+        return tuple(tuple(w * r for w, r in zip(row, own, strict=True)) for row in rows for own in self.basis)
+
+    def flat(self) -> Spectrum:
+        """Return the spectrum for a scene that reflects all wavelengths alike: the same without a basis."""
+        return Spectrum(self.wavelengths, self.weights)
 
     @classmethod
     def rgb(cls) -> Spectrum:
@@ -87,7 +114,9 @@ class Spectrum:
         return cls((wavelength,), ((1.0,),))
 
 
-def camera_spectrum(camera: str = "Nikon 5100 (NPL)", illuminant: str = "D65", samples: int = 7) -> Spectrum:
+def camera_spectrum(
+    camera: str = "Nikon 5100 (NPL)", illuminant: str = "D65", samples: int = 7, reflectance: bool = False
+) -> Spectrum:
     r"""Return the channels of a real camera under a light, sampled over 400-700 nm.
 
     The range is cut into equal slices S. Each sample is the middle of a slice and stands for all light in it:
@@ -101,12 +130,17 @@ def camera_spectrum(camera: str = "Nikon 5100 (NPL)", illuminant: str = "D65", s
         illuminant: name of an illuminant in colour-science, such as "D65", "A" or "FL2".
         samples: number of wavelengths W. For the Nikon, D65 and a flat mask, 7 give the on-axis PSF to 1.3 % on
             average over defocus from -20 to 20 rad, 16 to 0.24 %.
+        reflectance: let each colour of a scene have a reflectance spectrum, see :func:`smoothest_reflectances`, and so
+            PSFs of its own. On a real scene (Aloe, five random masks, captures with values in [0, 1]) it changes the
+            capture by 3.5e-4 root mean square with windows of 23 px and by 7.6e-4 with 65 px, as much as these
+            wavelengths do against ``Spectrum.rgb()``; rendering, of nine planes for three, takes 2.3 to 3.1 times.
 
     Returns:
         W wavelengths shared by the channels red, green and blue; weights in the illuminant's unit.
 
     Raises:
-        ValueError: if the camera or illuminant is unknown (the message lists those there are), or ``samples`` < 1.
+        ValueError: if the camera or illuminant is unknown (the message lists those there are), or ``samples`` < 1, or
+            < 3 with ``reflectance``.
 
     Convention:
         A sensitivity counts as zero beyond the range in which it was measured (Sigma: 400-680 nm).
@@ -135,7 +169,48 @@ def camera_spectrum(camera: str = "Nikon 5100 (NPL)", illuminant: str = "D65", s
         light = colour.SDS_ILLUMINANTS[illuminant]
     lamp = _resample(grid, light.wavelengths, light.values)
     responses = np.stack([_resample(grid, sensitivity.wavelengths, column) for column in sensitivity.values.T]) * lamp
-    return Spectrum(tuple(wavelengths), tuple(responses.reshape(len(responses), -1, steps).mean(axis=-1)))
+    weights = responses.reshape(len(responses), -1, steps).mean(axis=-1)
+    spectrum = Spectrum(tuple(wavelengths), tuple(weights))
+    if not reflectance:
+        return spectrum
+    return replace(spectrum, basis=tuple(smoothest_reflectances(np.array(spectrum.channel_weights))))
+
+
+def smoothest_reflectances(channel_weights: np.ndarray) -> np.ndarray:
+    r"""Return the smoothest reflectance spectra that a camera sees as pure red, green and blue.
+
+    .. math:: R_b = \arg\min_R \sum_i (R_{i+1} - R_i)^2 \quad \text{with} \quad \sum_i w_{ci} R_i = \delta_{cb}
+
+    The colour (r, g, b) then stands for the reflectance r R_r + g R_g + b R_b, the smoothest one of that colour; grey
+    is flat. Channels overlap, so no surface is as saturated as a pure one: R dips below zero. In the Aloe scene, with
+    its sRGB taken for the camera's colours, 3 % of the pixels' values over wavelengths do. Colours come back whatever
+    they are.
+
+    Args:
+        channel_weights: w, (C, W), rows that add up to one, on an even grid of wavelengths.
+
+    Returns:
+        (C, W), which adds up to one at each wavelength.
+
+    Raises:
+        ValueError: if there are fewer wavelengths than channels.
+
+    Source: van Trigt, Smoothest reflectance functions, J. Opt. Soc. Am. A 7, 1891 (1990).
+
+    Example:
+        >>> smoothest_reflectances(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])).round(6) + 0.0
+        array([[0., 0., 1.],
+               [0., 1., 0.],
+               [1., 0., 0.]])
+    """
+    channels, samples = channel_weights.shape
+    if samples < channels:
+        raise ValueError(f"samples must be at least {channels} for reflectances of {channels} channels, got {samples}")
+    slope = np.diff(np.eye(samples), axis=0)
+    # The least square under equality constraints, by Lagrange's multipliers.
+    system = np.block([[slope.T @ slope, channel_weights.T], [channel_weights, np.zeros((channels, channels))]])
+    target = np.concatenate([np.zeros((samples, channels)), np.eye(channels)])
+    return np.linalg.solve(system, target)[:samples].T
 
 
 def _slice_middles(count: int) -> np.ndarray:

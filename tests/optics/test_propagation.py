@@ -234,7 +234,7 @@ class TestPixelEnergies(BaseTester):
         kernels = sensor_kernels([-4.0, 0.0, 4.0], 0.39, 11, 23, 0.1, 1.05, 1e-3)
         whole = pixel_energies(fields, torch.ones(2), kernels)
         (expected,) = torch.autograd.grad(whole.square().sum(), fields)
-        monkeypatch.setattr("kornia_tidy.optics.propagation._CHUNK_SAMPLES", 1)
+        monkeypatch.setattr("kornia_tidy.optics.wave_energy._BLOCK_SAMPLES", 1)
         chunked = pixel_energies(fields, torch.ones(2), kernels)
         (got,) = torch.autograd.grad(chunked.square().sum(), fields)
         self.assert_close(chunked, whole, rtol=1e-12, atol=0)
