@@ -15,9 +15,10 @@ learnt without switching have 0.9118 where there is none):
 | linear      | 0.9430         | 0.9310      | 0.9299          |
 | random      | 0.9653         | 0.9650      | 0.9651          |
 
-So learning with switching takes back a sixth of what switching costs where the crystal relaxes, a third where it moves
-evenly, and next to nothing where the states in between are random, as these do not depend on the masks. It pays from
-6 ms on; for a modulator as slow as 16 ms five masks are too many: none of these is better than a plain lens.
+So learning with switching takes back a sixth of what switching costs where the crystal relaxes, more than a third where
+it moves evenly, and next to nothing where the states in between are random, as these do not depend on the masks. Where
+the crystal relaxes it pays from swaps of 6 ms on. For a modulator as slow as 16 ms five masks are too many: none of
+these is better than a plain lens.
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@ With the defaults (3 electrons of read noise, pauses of 8 ms, 100 ms in all, swa
 averaged exposure wins in the dark: 14.0 dB against 11.8 (sum) and 11.1 dB (all) where white is 10 electrons. From
 about 200 electrons on all shots together win, by 0.8 dB at 1000 and at 30 000, for four times the memory. At equal
 memory the averaged exposure is always ahead. With pauses of 25 ms, three quarters of the light lost, it also beats all
-shots together at every level. Without any pause the sum loses to it by its read noise only, 1.6 dB at 10 electrons.
+shots together at every level. Without pauses and with instant swaps the sum loses to it by its read noise only, 1.6 dB
+at 10 electrons.
 
 Source: the question is that of Shah et al., TiDy-PSFs (ICCV 2023), supplement, section 2.
 """

@@ -23,6 +23,14 @@ KINDS = ["random", "linear", "exponential", MEASURED]
 
 
 class TestSwitching(BaseTester):
+    @pytest.mark.parametrize("between", KINDS)
+    def test_smoke(self, between, device, dtype):
+        phase = torch.rand(3, 5, 5).to(device, dtype)
+        states, weights = Switching(4e-3, between=between)(phase)
+        assert (states.device.type, states.dtype, weights.dtype) == (device.type, dtype, dtype)
+        self.assert_close(states[:3], phase, rtol=0, atol=0)
+        assert "4 ms a swap in an exposure of 100 ms" in repr(Switching(4e-3, between=between))
+
     def test_exception(self):
         with pytest.raises(ValueError, match=r"^5 swaps of 20.5 ms must fit .* of 100 ms, got 102.5 ms$"):
             Switching(20.5e-3)(torch.zeros(6, 5, 5))
