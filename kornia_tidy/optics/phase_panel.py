@@ -118,6 +118,7 @@ class GreyLevels(nn.Module):
         self, bits: int, phase_range: float = 2 * math.pi, response: Sequence[float] | Tensor | None = None
     ) -> None:
         super().__init__()
+        self.bits, self.phase_range, self.response = bits, phase_range, None
         levels = level_phases(bits, phase_range)
         if response is not None:
             curve = torch.as_tensor(response, dtype=torch.float64)
@@ -128,7 +129,7 @@ class GreyLevels(nn.Module):
             place = torch.linspace(0, len(curve) - 1, len(levels), dtype=torch.float64)
             lower = place.long().clamp(max=len(curve) - 2)
             levels = torch.lerp(curve[lower], curve[lower + 1], place - lower)
-        self.bits = bits
+            self.response = tuple(curve.tolist())
         # Not a buffer: module.to(float16) must not round what a panel does.
         self.levels = levels
 

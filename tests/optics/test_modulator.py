@@ -97,6 +97,35 @@ class TestSpatialLightModulator(BaseTester):
         assert float((after - before).abs().max()) > 1e-3
         self.assert_close(after, fresh, rtol=0, atol=0)
 
+    def test_dynamo_a_capture_is_one_graph(self):
+        parts = (GreyLevels(6), PixelCrosstalk(0.3), Switching(5e-3, dwell=LearnableDwellTimes((1, 2))))
+        modulator = SpatialLightModulator(*parts, fill_factor=0.9)
+        optics = TiDyOptics(PixelwiseMask(2), modulator=modulator, sensor=None, fidelity=SMALL)
+        image, depth = torch.rand(1, 3, 12, 14), 0.4 + torch.rand(1, 1, 12, 14)
+        compiled = torch.compile(optics, fullgraph=True, backend="eager")
+        self.assert_close(compiled(image, depth), optics(image, depth))
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda panel, _: setattr(panel, "levels", GreyLevels(1).levels),
+            lambda _, switching: setattr(switching, "switching_time", 0.05),
+            lambda _, switching: setattr(switching, "between", "linear"),
+            lambda _, switching: switching.dwell.logits.data.add_(torch.tensor([1.0, 0.0])),
+        ],
+        ids=["levels", "switching time", "states between", "dwell times"],
+    )
+    @torch.no_grad()
+    def test_feature_what_is_changed_in_place_is_never_stale(self, change):
+        panel, switching = GreyLevels(6), Switching(0.01, dwell=LearnableDwellTimes((1, 1)))
+        optics = TiDyOptics(PixelwiseMask(2), modulator=SpatialLightModulator(panel, switching), fidelity=SMALL)
+        before = optics.psf_bank().psfs
+        change(panel, switching)
+        after = optics.psf_bank().psfs
+        fresh = TiDyOptics(optics.masks, modulator=optics.modulator, fidelity=SMALL).psf_bank().psfs
+        assert float((after - before).abs().max()) > 1e-4
+        self.assert_close(after, fresh, rtol=0, atol=1e-7)
+
     def test_smoke_repr_tells_the_panel(self):
         modulator = SpatialLightModulator(
             GreyLevels(8), Switching(4e-3, dwell=LearnableDwellTimes((1, 3))), fill_factor=0.93
