@@ -126,3 +126,30 @@ class TestMaskFamilies(BaseTester):
     def test_feature_steps_are_counted_to_the_first_below_the_goal(self, example):
         assert example.steps_to(0.5, [0.9, 0.7, 0.4, 0.6]) == 2
         assert example.steps_to(0.5, [0.9, 0.7]) is None
+
+
+@pytest.mark.parametrize("example", ["learn_with_switching"], indirect=True)
+class TestLearnWithSwitching(BaseTester):
+    @pytest.mark.parametrize("between", ["exponential", "random"])
+    def test_feature_masks_that_know_of_switching_lose_less(self, example, between, tmp_path):
+        few = ["--masks", "3", "--trials", "1", "--iterations", "60", "--output", str(tmp_path)]
+        errors = example.main([*few, "--between", between, "--switching-time", "0.03"])
+        without, known, dwell = (trials[0] for trials in errors.values())
+        assert without[0] < known[0]  # nothing is free: without switching, masks learnt without it are better
+        assert known[-1] < without[-1]
+        assert known[-1] - known[0] < without[-1] - without[0]
+        assert len(dwell) == len(known) == 6
+        assert picture(tmp_path / f"learn_with_switching_{between}.png").float().std() > 20
+
+
+@pytest.mark.parametrize("example", ["time_average_or_burst"], indirect=True)
+class TestTimeAverageOrBurst(BaseTester):
+    def test_feature_the_dark_favours_one_exposure_and_light_the_burst(self, example, tmp_path, capsys):
+        few = ["--masks", "3", "--size", "96", "--iterations", "40", "--output", str(tmp_path)]
+        result = example.main([*few, "--electrons", "10", "10000"])
+        single, added, every = result.values()
+        assert single[0] > max(added[0], every[0]) + 1
+        assert every[1] > single[1]
+        assert single[1] > added[1]
+        assert "84% of the light, readouts: 3, pictures stored: 1" in capsys.readouterr().out
+        assert picture(tmp_path / "time_average_or_burst.png").float().std() > 20

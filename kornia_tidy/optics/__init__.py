@@ -4,7 +4,7 @@ from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, pol
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera, thin_lens_defocus
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, constant_index
-from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
 from kornia_tidy.optics.paper import AliasingWarning, paper_psf_bank
 from kornia_tidy.optics.phase_masks import (
     CubicMask,
@@ -16,10 +16,12 @@ from kornia_tidy.optics.phase_masks import (
     SpiralMask,
     ZernikeMask,
 )
+from kornia_tidy.optics.phase_panel import GreyLevels, PixelCrosstalk, StrokeError
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
 from kornia_tidy.optics.state_bank import StateBank
+from kornia_tidy.optics.switching import Switching
 from kornia_tidy.optics.witness import autocorrelation_witness
 
 __all__ = [
@@ -34,15 +36,21 @@ __all__ = [
     "DwellTimes",
     "FourierMask",
     "FresnelLens",
+    "GreyLevels",
+    "LearnableDwellTimes",
     "Material",
     "PSFBank",
     "PhaseMasks",
+    "PixelCrosstalk",
     "PixelwiseMask",
     "Pupil",
     "RadialMask",
+    "SpatialLightModulator",
     "Spectrum",
     "SpiralMask",
     "StateBank",
+    "StrokeError",
+    "Switching",
     "ThinLensCamera",
     "ZernikeMask",
     "annular_aperture",

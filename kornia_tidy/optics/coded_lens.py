@@ -38,7 +38,8 @@ class CodedLens(nn.Module):
     Args:
         masks: phase masks. Default: five learnable 23x23 masks of uniform noise.
         camera: turns depth into defocus. Default: :class:`ThinLensCamera` as it comes.
-        modulator: turns masks into the states shown and their weights. Default: equal dwell times.
+        modulator: turns masks into the states shown and their weights; its ``fill_factor``, where it has one, is the
+            share of each mask pixel that modulates. Default: equal dwell times.
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
@@ -214,8 +215,9 @@ class CodedLens(nn.Module):
     @property
     def pupil(self) -> Pupil:
         """The aperture over the masks' pixels."""
+        fill_factor = getattr(self.modulator, "fill_factor", 1.0)
         pupil = self.__dict__["_pupil"]
-        if pupil is None:
+        if pupil is None or pupil.fill_factor != fill_factor:
             size = min(self.masks.phase.shape[-2:])
             amplitude = circular_aperture(size, MASK_SPAN / size) if self._aperture is None else self._aperture
             if amplitude.shape[-1] % size:
@@ -223,7 +225,7 @@ class CodedLens(nn.Module):
                     f"aperture must have a whole number of cells for each of the {size} mask pixels, got "
                     f"{tuple(amplitude.shape)}"
                 )
-            pupil = self.__dict__["_pupil"] = Pupil(amplitude, MASK_SPAN / amplitude.shape[-1])
+            pupil = self.__dict__["_pupil"] = Pupil(amplitude, MASK_SPAN / amplitude.shape[-1], fill_factor)
         return pupil
 
     def _build(
@@ -238,6 +240,11 @@ class CodedLens(nn.Module):
     ) -> PSFBank:
         dispersion, shift = self._colours(spectrum)
         if self.fidelity.propagation == "paper":
+            if self.pupil.fill_factor != 1:
+                raise ValueError(
+                    f"fidelity 'paper' has one sample a mask pixel and so no gaps between them, got a fill_factor of "
+                    f"{self.pupil.fill_factor}"
+                )
             return paper_psf_bank(states, weights, self.pupil.amplitude, spectrum, dispersion, nodes, shift)
         return exact_psf_bank(states, weights, self.pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
 

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from kornia_tidy.optics.propagation import pixel_energies, sensor_kernels
 from kornia_tidy.optics.psf_bank import PSFBank
-from kornia_tidy.optics.pupil import Pupil, pupil_field
+from kornia_tidy.optics.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
-_CACHE: OrderedDict[tuple[float, float, Geometry, torch.device, torch.dtype], Tensor] = OrderedDict()
+Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
+_CACHE: OrderedDict[tuple[float, float, Geometry, Gaps, torch.device, torch.dtype], Tensor] = OrderedDict()
 _CACHE_BYTES = 256 * 2**20
 
 
@@ -51,6 +52,11 @@ def exact_psf_bank(
     Returns:
         A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
 
+    Convention:
+        - Where ``pupil.fill_factor`` is below 1, the gaps between the squares that modulate are integrated as exactly:
+          their light keeps its phase. The matrices then have twice the columns: the bank of the default masks at 41 px
+          takes 1.4 times as long, 1.2 times with its gradients (one core).
+
     Source: design of the matrix transform: Soummer et al. 2007; average over masks: Shah et al. 2023, equation 4.
 
     Example:
@@ -60,17 +66,21 @@ def exact_psf_bank(
         torch.Size([1, 1, 23, 23])
     """
     per_channel = spectrum.plane_weights
+    cells = pupil.amplitude.shape[-1]
+    gaps = None if pupil.fill_factor == 1 else (cells // phase.shape[-1], pupil.fill_factor)
+    field = pupil_field if gaps is None else gapped_pupil_field
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
     for w, wavelength in enumerate(spectrum.wavelengths):
         shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]
         kernels = _kernels(
             tuple((p + shift) * (REFERENCE_WAVELENGTH / wavelength) for p in defocus),
             pixel_step / wavelength,
-            (window, pupil.amplitude.shape[-1], pupil.cell_pitch, pupil.extent, tolerance),
+            (window, cells, pupil.cell_pitch, pupil.extent, tolerance),
+            gaps,
             phase.device,
             torch.complex128 if phase.dtype == torch.float64 else torch.complex64,
         )
-        light = pixel_energies(pupil_field(phase, pupil.amplitude, dispersion[w]), weights, kernels)
+        light = pixel_energies(field(phase, pupil.amplitude, dispersion[w]), weights, kernels)
         energies = light / pupil.light
         share = phase.new_tensor([channel[w] for channel in per_channel])
         psfs = psfs + energies[:, None] * share[:, None, None]
@@ -78,18 +88,24 @@ def exact_psf_bank(
 
 
 def _kernels(
-    defocus: tuple[float, ...], step: float | Tensor, geometry: Geometry, device: torch.device, dtype: torch.dtype
+    defocus: tuple[float, ...],
+    step: float | Tensor,
+    geometry: Geometry,
+    gaps: Gaps,
+    device: torch.device,
+    dtype: torch.dtype,
 ) -> Tensor:
     """Return the sensor kernels, remembered where the geometry is fixed: they depend on nothing else."""
+    spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
-        return sensor_kernels(defocus, step.double(), *geometry, device).to(dtype)
+        return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
     if torch.compiler.is_compiling():
-        return sensor_kernels(defocus, step, *geometry, device).to(dtype)
-    keys = [(psi, step, geometry, device, dtype) for psi in defocus]
+        return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
+    keys = [(psi, step, geometry, gaps, device, dtype) for psi in defocus]
     missing = [key for key in keys if key not in _CACHE]
     if missing:
         with torch.inference_mode(False), torch.no_grad():
-            made = sensor_kernels([key[0] for key in missing], step, *geometry, device).to(dtype)
+            made = sensor_kernels([key[0] for key in missing], step, *geometry, device, spans).to(dtype)
         _CACHE.update(zip(missing, made.unbind(), strict=True))
     for key in keys:
         _CACHE.move_to_end(key)

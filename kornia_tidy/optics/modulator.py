@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor, nn
 
 
@@ -41,10 +42,102 @@ class DwellTimes(nn.Module):
         masks = phase.shape[0]
         if self.shares is None:
             return phase, phase.new_full((masks,), 1 / masks)
-        if len(self.shares) != masks:
-            raise ValueError(f"there are {len(self.shares)} dwell shares for {masks} masks")
+        _check_count(len(self.shares), masks)
         return phase, phase.new_tensor(self.shares)
 
     def extra_repr(self) -> str:
         """Describe the exposure in a person's words."""
         return "equal dwell times" if self.shares is None else f"dwell shares {tuple(round(s, 4) for s in self.shares)}"
+
+
+class LearnableDwellTimes(nn.Module):
+    r"""Dwell times that are learnt with the masks, :math:`w_k = e^{a_k} / \sum_j e^{a_j}`: positive, summing to one.
+
+    Args:
+        shares: relative dwell times to start from, one for each mask, all positive.
+
+    Shape:
+        - ``logits``: learnable parameter (K,).
+        - input: phase (K, N, N) radians; output: states (K, N, N) and weights (K,).
+
+    Raises:
+        ValueError: if a share is not positive and finite, or their number is not that of the masks.
+
+    Example:
+        >>> import torch
+        >>> states, weights = LearnableDwellTimes((3, 1))(torch.zeros(2, 23, 23))
+        >>> weights
+        tensor([0.7500, 0.2500], grad_fn=<SoftmaxBackward0>)
+    """
+
+    def __init__(self, shares: Sequence[float]) -> None:
+        super().__init__()
+        if not shares or not all(0 < s < math.inf for s in shares):
+            raise ValueError(f"dwell shares to learn must be positive and finite, got {tuple(shares)}")
+        self.logits = nn.Parameter(torch.tensor([math.log(s) for s in shares]))
+
+    def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states shown and their weights."""
+        _check_count(len(self.logits), phase.shape[0])
+        return phase, self.logits.to(phase).softmax(0)
+
+    def extra_repr(self) -> str:
+        """Describe the exposure in a person's words."""
+        return f"learnable dwell shares {tuple(round(s, 4) for s in self.logits.detach().softmax(0).tolist())}"
+
+
+class SpatialLightModulator(nn.Module):
+    """A modulator made of parts: what its panel does to each mask, and how it passes from one to the next.
+
+    Args:
+        parts: modules, each taking what the one before gives: first those that turn masks (K, N, N) into masks as the
+            panel shows them, such as :class:`~kornia_tidy.optics.phase_panel.GreyLevels` and
+            :class:`~kornia_tidy.optics.phase_panel.PixelCrosstalk`; last one that gives states and weights, such as
+            :class:`DwellTimes` or :class:`~kornia_tidy.optics.switching.Switching`.
+        fill_factor: share of the area of each pixel that modulates: a square in its middle. Light through the gaps
+            between the squares passes with phase zero; see :func:`~kornia_tidy.optics.exact.exact_psf_bank`.
+
+    Shape:
+        - input: phase (K, N, N) radians; output: states (S, N, N) radians and weights (S,).
+
+    Raises:
+        ValueError: if the fill factor is not in (0, 1].
+        TypeError: if the last part does not give states and weights.
+
+    Convention:
+        - Any module that maps phase to states and weights is a modulator; without a ``fill_factor``, it has no gaps.
+
+    Example:
+        >>> from kornia_tidy.optics.phase_panel import GreyLevels
+        >>> from kornia_tidy.optics.switching import Switching
+        >>> modulator = SpatialLightModulator(GreyLevels(8), Switching(4e-3), fill_factor=0.93)
+        >>> states, weights = modulator(torch.rand(5, 23, 23))
+        >>> states.shape, round(float(weights.sum()), 6)
+        (torch.Size([9, 23, 23]), 1.0)
+    """
+
+    def __init__(self, *parts: nn.Module, fill_factor: float = 1.0) -> None:
+        super().__init__()
+        if not 0 < fill_factor <= 1:
+            raise ValueError(f"fill_factor must be above 0 and at most 1, got {fill_factor}")
+        self.parts = nn.Sequential(*parts)
+        self.fill_factor = fill_factor
+
+    def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states shown and their weights."""
+        shown = self.parts(phase)
+        if not isinstance(shown, tuple):
+            raise TypeError(
+                "the last part of a modulator must give states and weights, as DwellTimes and Switching do, got "
+                f"{[type(part).__name__ for part in self.parts]}"
+            )
+        return shown
+
+    def extra_repr(self) -> str:
+        """Describe the panel in a person's words."""
+        return f"fill factor {self.fill_factor:g}"
+
+
+def _check_count(shares: int, masks: int) -> None:
+    if shares != masks:
+        raise ValueError(f"there are {shares} dwell shares for {masks} masks")

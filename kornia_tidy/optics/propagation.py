@@ -59,7 +59,14 @@ def _gauss_legendre(order: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple((nodes / 2).tolist()), tuple((weights / 2).tolist())
 
 
-def cell_integrals(defocus: Sequence[float], frequency: Tensor, highest: float, num_cells: int, pitch: float) -> Tensor:
+def cell_integrals(
+    defocus: Sequence[float],
+    frequency: Tensor,
+    highest: float,
+    num_cells: int,
+    pitch: float,
+    cells: Tensor | None = None,
+) -> Tensor:
     r"""Return the integrals of a defocused plane wave over each cell of the pupil along one axis.
 
     .. math:: K_{dun} = \int_{x_n - p/2}^{x_n + p/2} \exp(i \psi_d x^2 - 2\pi i u x) \, dx
@@ -70,6 +77,7 @@ def cell_integrals(defocus: Sequence[float], frequency: Tensor, highest: float, 
         highest: bound of the frequencies' modulus.
         num_cells: cells N along the axis, centred on the optical axis.
         pitch: side p of a cell in pupil radii.
+        cells: where to integrate instead, begin and end of each interval in cells from the optical axis, (2, N').
 
     Returns:
         Integrals in pupil radii, (D, U, N) complex128: in float64 because phases reach thousands of radians.
@@ -81,11 +89,16 @@ def cell_integrals(defocus: Sequence[float], frequency: Tensor, highest: float, 
     edge = num_cells * pitch / 2
     slope = 2 * max(abs(psi) for psi in defocus) * edge + 2 * math.pi * highest  # of the phase, radians a pupil radius
     points, weights = gauss_legendre(gauss_legendre_order(slope * pitch / 2, CELL_TOLERANCE), frequency.device)
-    centres = torch.arange(num_cells, dtype=torch.float64, device=frequency.device) - (num_cells - 1) / 2
-    x = (centres[:, None] + points) * pitch
+    if cells is None:
+        centres = torch.arange(num_cells, dtype=torch.float64, device=frequency.device) - (num_cells - 1) / 2
+        widths = torch.ones_like(centres)
+    else:
+        begin, end = cells.to(frequency.device)
+        centres, widths = (begin + end) / 2, end - begin
+    x = (centres[:, None] + widths[:, None] * points) * pitch
     psi = torch.tensor(defocus, dtype=torch.float64, device=x.device)
     wave = torch.exp(-2j * math.pi * frequency[:, None, None] * x)
-    lens = torch.exp(1j * psi[:, None, None] * x**2) * (weights * pitch)
+    lens = torch.exp(1j * psi[:, None, None] * x**2) * (widths[:, None] * weights * pitch)
     return torch.einsum("ung,dng->dun", wave, lens)
 
 
@@ -116,6 +129,7 @@ def sensor_kernels(
     extent: float,
     tolerance: float,
     device: torch.device | None = None,
+    cells: Tensor | None = None,
 ) -> Tensor:
     r"""Return the matrices that take a pupil field to the sensor's pixels, one for each depth.
 
@@ -128,6 +142,7 @@ def sensor_kernels(
         extent: half width of the open pupil in pupil radii; it bounds the PSF's bandwidth to twice itself.
         tolerance: error allowed to the integral over a pixel of the finest pattern the pupil can make.
         device: where to put them.
+        cells: where to integrate instead of the N cells, see :func:`cell_integrals`.
 
     Returns:
         (D, P, q, N) complex128, weighted so that the sum of \|kernel @ field @ kernel.T\|^2 over the q points of a
@@ -140,7 +155,7 @@ def sensor_kernels(
     pixel = float(step.detach()) if isinstance(step, Tensor) else step
     order = gauss_legendre_order(2 * math.pi * extent * pixel, tolerance)
     frequency = pixel_frequencies(step, window, order, device)
-    integrals = cell_integrals(defocus, frequency, pixel * window / 2, num_cells, pitch)
+    integrals = cell_integrals(defocus, frequency, pixel * window / 2, num_cells, pitch, cells)
     _, weights = gauss_legendre(order, device)
     scale = (weights.sqrt() * step**0.5).repeat(window)  # squared by the intensity, once for each axis
     return (integrals * scale[:, None]).unflatten(1, (window, order))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,6 +17,7 @@ class Pupil:
     Args:
         amplitude: (n, n) in [0, 1].
         cell_pitch: side of a cell in pupil radii.
+        fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
 
     Example:
         >>> from kornia_tidy.optics.aperture import circular_aperture
@@ -25,6 +28,7 @@ class Pupil:
 
     amplitude: Tensor
     cell_pitch: float
+    fill_factor: float = 1.0
     light: float = field(init=False)
     """Light it lets through, in units of squared amplitude times pupil radii squared."""
     extent: float = field(init=False)
@@ -62,3 +66,55 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
     if cells > 1:
         cosine, sine = (x.repeat_interleave(cells, -1).repeat_interleave(cells, -2) for x in (cosine, sine))
     return torch.complex(amplitude * cosine, amplitude * sine)
+
+
+def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
+    r"""Return the field behind a mask with gaps between its pixels, to be used with :func:`gapped_cells`.
+
+    Light through the gaps keeps its phase, so the field is that of the open aperture, A on whole cells, plus what the
+    mask changes, :math:`A (e^{i\phi} - 1)`, on the modulating part of each cell.
+
+    Args:
+        phase: radians at 530 nm, (K, N, N), float32 or float64.
+        aperture: amplitude, (n, n), as for :func:`pupil_field`.
+        dispersion: factor that takes the phase at 530 nm to the wavelength.
+
+    Returns:
+        (K, 2n, 2n) complex: the change and the open aperture as blocks on the diagonal.
+
+    Example:
+        >>> gapped_pupil_field(torch.zeros(1, 2, 2), torch.ones(2, 2), 1.0)[0].real
+        tensor([[0., 0., 0., 0.],
+                [0., 0., 0., 0.],
+                [0., 0., 1., 1.],
+                [0., 0., 1., 1.]])
+    """
+    cells = aperture.shape[-1]
+    field = pupil_field(phase, aperture, dispersion)
+    still = aperture.to(field)
+    change = pad(field - still, (0, cells, 0, cells))
+    return change + pad(still, (cells, 0, cells, 0))
+
+
+def gapped_cells(num_cells: int, per_pixel: int, fill_factor: float) -> Tensor:
+    """Return where along one axis the modulating parts of all cells begin and end, and then the cells themselves.
+
+    Args:
+        num_cells: cells n along a side.
+        per_pixel: cells along a side of a mask pixel; a modulating square may end within a cell.
+        fill_factor: share of the area of each mask pixel that modulates.
+
+    Returns:
+        (2, 2n) float64 in cells, from the optical axis.
+
+    Example:
+        >>> gapped_cells(2, 1, 0.25)
+        tensor([[-0.7500,  0.2500, -1.0000,  0.0000],
+                [-0.2500,  0.7500,  0.0000,  1.0000]], dtype=torch.float64)
+    """
+    begin = torch.arange(num_cells, dtype=torch.float64) - num_cells / 2
+    whole = torch.stack([begin, begin + 1])
+    middle = begin[::per_pixel].repeat_interleave(per_pixel) + per_pixel / 2
+    half = per_pixel * math.sqrt(fill_factor) / 2
+    active = whole.clamp(middle - half, middle + half)  # empty where a cell lies in the gap
+    return torch.cat([active, whole], 1)
