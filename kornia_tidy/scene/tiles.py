@@ -25,7 +25,7 @@ from kornia_tidy.scene.convolution import next_fast_size
 SIZES = (8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 256, 288, 384, 512, 576, 768, 1024, 1536, 2048)
 # Bytes that the planes of a chunk may take: near a processor's cache (and below what makes an allocator give memory
 # back and fetch it again), or enough to keep an accelerator busy.
-CHUNK_BYTES = {"cpu": 12 << 20}
+CHUNK_BYTES = {"cpu": 6 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 # What a complex sample costs, in nanoseconds on a core of a 2.5 GHz Xeon in float32: its transform, for each octave of
 # the samples; to cut it out of the image; to fetch its spectrum, multiply it, and take its pixels.

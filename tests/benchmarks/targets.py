@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.spectrum import camera_spectrum
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import next_fast_size
@@ -204,7 +203,7 @@ def fresh(image: Tensor, disparity: Tensor, *cameras: TiDyOptics) -> dict[str, C
     """Captures that compute their PSFs anew."""
 
     def capture(optics: TiDyOptics) -> Tensor:
-        optics._memory = BankMemory()
+        optics._memories.clear()
         return optics(image, disparity)
 
     return {str(number): lambda o=optics: capture(o) for number, optics in enumerate(cameras)}
