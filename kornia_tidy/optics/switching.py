@@ -110,7 +110,7 @@ class Switching(nn.Module):
         if swaps * swap == 0:
             return masks, shares
         if self.between == "random":
-            between, times = random_phases(self.seed, swaps, phase.shape[-1]).to(phase), phase.new_ones(1)
+            between, times = random_phases(self.seed, swaps, *phase.shape[-2:]).to(phase), phase.new_ones(1)
         else:
             response, times = (values.to(phase) for values in sampled_response(self.between, self.samples))
             before, after = masks[:swaps], masks.roll(-1, 0)[:swaps]
@@ -172,14 +172,14 @@ def sampled_response(between: str | Sequence[float], samples: int) -> tuple[Tens
     return torch.lerp(curve[lower], curve[lower + 1], place - lower), weights
 
 
-def random_phases(seed: int, count: int, size: int) -> Tensor:
-    """Return random patterns, uniform in [0, 2π): the same for the same arguments, (count, size, size) float64.
+def random_phases(seed: int, count: int, rows: int, columns: int) -> Tensor:
+    """Return random patterns, uniform in [0, 2π): the same for the same arguments, (count, rows, columns) float64.
 
     Example:
-        >>> torch.equal(random_phases(3, 2, 23), random_phases(3, 2, 23))
+        >>> torch.equal(random_phases(3, 2, 23, 23), random_phases(3, 2, 23, 23))
         True
     """
-    return torch.from_numpy(np.random.default_rng(seed).uniform(0, 2 * math.pi, (count, size, size)))
+    return torch.from_numpy(np.random.default_rng(seed).uniform(0, 2 * math.pi, (count, rows, columns)))
 
 
 # Constants to the compiler, which cannot trace NumPy's generator; see propagation.py.

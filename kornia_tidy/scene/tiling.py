@@ -4,6 +4,9 @@ Overlap-save for gather, overlap-add for scatter. Each is the other's transpose,
 of the same four steps: cut windows out of a plane, add windows to a plane, put pixels into the planes of their layers,
 take pixels out of the planes of their layers. The planes of one chunk of tiles exist at a time. For the backward pass
 only the inputs are kept; spectra are computed again.
+
+There is no direct convolution: it would pay for PSFs of a single pixel only (at 3 x 3 a loop over their pixels takes
+1.2 times as long as this, at 5 x 5 4.4 times; 1.4 megapixels, 21 layers, one core).
 """
 
 from __future__ import annotations

@@ -58,6 +58,11 @@ class TestSwitching(BaseTester):
         assert weights.shape == (masks + each * swaps,)
         self.assert_close(weights[masks:].sum(), torch.tensor(0.02 * swaps))
 
+    @pytest.mark.parametrize("between", KINDS)
+    def test_cardinality_masks_longer_along_one_axis(self, between):
+        states, _ = Switching(2e-3, between=between)(torch.rand(3, 6, 10))
+        assert states.shape[1:] == (6, 10)
+
     @settings(max_examples=60, deadline=None)
     @given(
         masks=st.integers(1, 16),
@@ -160,7 +165,7 @@ class TestRandomStates(BaseTester):
 
     def test_feature_their_mean_field_is_zero(self):
         """Worst of all states: nothing of the light stays together."""
-        patterns = random_phases(0, 50, 64)
+        patterns = random_phases(0, 50, 64, 64)
         assert float(torch.polar(torch.ones_like(patterns), patterns).mean().abs()) < 5 / math.sqrt(patterns.numel())
         assert 0 <= float(patterns.min()) < float(patterns.max()) < 2 * math.pi
 
