@@ -89,9 +89,11 @@ PRESETS = {
     "reference": Fidelity(
         "reference",
         pixel_tolerance=1e-6,
+        layers="bandlimited",
         layer_spacing=1.0,
-        enclosed_energy=0.9,
-        max_window=129,
+        enclosed_energy=0.97,
+        max_window=257,
+        stray_light="veil",
         double=True,
     ),
 }
