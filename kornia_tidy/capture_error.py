@@ -116,9 +116,20 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
         drawn_out = pad_border(varying, int(size / GRID_RATIO) // 2, "replicate")
         return torch.maximum(*(_power_of_blocks(plane, "reflect", size) for plane in (varying, drawn_out)))
     power = _power_of_blocks(light if border == "zero" else varying, border, size)
-    if border == "zero":  # the mean is light at the edge, but the veil gives it back elsewhere
-        power[:, 0, 0] = _power_of_blocks(varying, "reflect", size)[:, 0, 0]
+    if border == "zero":  # with the veil the mean is kept, but for what is missed in the dark around
+        mean_square = light.mean((-2, -1)).square().mean(0).cpu()
+        missed = mean_square * _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
+        power[:, 0, 0] = _power_of_blocks(varying, "reflect", size)[:, 0, 0] + missed
     return power
+
+
+def _dark_square(shape: Sequence[int], radius: int) -> float:
+    """Return the mean square of the share of a pixel's surroundings that lies beyond the image."""
+    inside = []
+    for side in shape:
+        at = torch.arange(side, dtype=torch.float64)
+        inside.append(((at + radius).clamp(max=side - 1) - (at - radius).clamp(min=0) + 1) / (2 * radius + 1))
+    return float((1 - inside[0][:, None] * inside[1]).square().mean())
 
 
 def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
