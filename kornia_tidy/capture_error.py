@@ -229,7 +229,7 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
         ([[0.75, 0.25, 0.0]], (0.0, 2.0, 4.0))
     """
     mode = "nearest" if layers == "nearest" else "linear"
-    taken_from = fine_nodes(nodes) if layers in TAPS else nodes
+    taken_from = fine_nodes(nodes) if layers in TAPS else tuple(nodes)
     at = torch.tensor(taken_from, dtype=torch.float64)
     weights = layer_weights(psi.double().view(1, 1, 1, -1), at, mode)[0, :, 0].T
     if layers not in TAPS:
@@ -256,7 +256,9 @@ class LayerErrors:
         self._nodes, self._psi, self._share = nodes, psi, share
         size = min(power.shape[-2], spectrum_size(psfs.shape[-1]))
         power = coarser(power, size) if size < power.shape[-2] else power
-        self._products = torch.stack([_products(own, weight) for own, weight in zip(psfs.unbind(1), power, strict=True)])
+        self._products = torch.stack(
+            [_products(own, weight) for own, weight in zip(psfs.unbind(1), power, strict=True)]
+        )
 
     def rows(self, nodes: Sequence[float], layers: str, band: float) -> Tensor:
         """Return the coefficients of what the scene's pixels are blurred with, (b, n)."""

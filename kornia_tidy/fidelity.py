@@ -13,6 +13,22 @@ LAYERS = ("nearest", "linear", "cubic", "bandlimited")
 class Fidelity:
     """The knobs of the speed/accuracy trade. Presets: ``paper``, ``draft``, ``balanced``, ``reference``.
 
+    What ``reference`` leaves out, as the root mean square error of a capture, full scale 1:
+
+    - light beyond its window, which is the smallest that holds 97 % but at most 257 px; the rest is spread evenly over
+      the image. On dead leaves, against windows of 513 and 641 px: 9e-4 for five random masks (95 % held) and a flat
+      one (43 px), 7e-4 for one random mask, a smooth one and Fresnel lenses. With 385 px the five random ones would be
+      at 4e-4, for 2.2 times the PSFs' time and memory.
+    - depths between its layers: 1.5e-6, against linear layers 1/64 rad apart. (Linear layers 1 rad apart: 4e-5.)
+    - integration over sensor pixels: 5e-12, and rounding.
+
+    So errors against it are errors against the truth down to 1e-3; below that they tell what the window holds apart.
+
+    How layers are chosen by tolerance: :meth:`kornia_tidy.TiDyOptics.plan` takes, of all kinds and spacings, the
+    cheapest whose error on the scene is within what was asked. On 35 photographs with a random mask that was
+    ``"nearest"`` 4 or 8 rad apart for 1e-1 and mostly for 1e-2, ``"linear"`` 2 or 4 rad apart for 1e-3, 1 rad for 1e-4,
+    0.5 rad or ``"cubic"`` 1 rad apart for 1e-5, and ``"bandlimited"`` for 1e-6.
+
     Args:
         name: how the setting calls itself.
         propagation: ``"exact"`` integrates every pixel of the mask and of the sensor; ``"paper"`` is the published

@@ -48,7 +48,7 @@ from kornia_tidy.render_cost import (
     window_side,
 )
 from kornia_tidy.render_plan import RenderPlan
-from kornia_tidy.scene.convolution import pad_border
+from kornia_tidy.scene.convolution import largest_window, pad_border
 from kornia_tidy.scene.tiles import Labels
 
 REFERENCE = Fidelity.preset("reference")
@@ -327,7 +327,9 @@ class PlannedScene:
         full = window_side(self.reference)
         if key not in self._known:
             nodes, psfs = self._planner.window_survey(full)
-            around = slice(max(0, bisect_right(nodes, float(self._psi[0])) - 1), bisect_left(nodes, float(self._psi[-1])) + 1)
+            around = slice(
+                max(0, bisect_right(nodes, float(self._psi[0])) - 1), bisect_left(nodes, float(self._psi[-1])) + 1
+            )
             nodes, psfs = nodes[around], psfs[around]
             kept = _cropped(psfs, window)
             if stray_light == "renormalize":
@@ -379,18 +381,6 @@ class PlannedScene:
             height, width = self._defocus.shape[-2:]
             return self._defocus[..., margin : height - margin, margin : width - margin]
         return pad_border(self._defocus, margin, "replicate" if border == "zero" else border)
-
-
-def largest_window(border: str, height: int, width: int) -> int:
-    """Return the largest window that a border allows an image of this size; ``valid`` keeps half the view.
-
-    Example:
-        >>> largest_window("reflect", 48, 64), largest_window("valid", 48, 64)
-        (95, 23)
-    """
-    side = min(height, width)
-    limits = {"reflect": 2 * side - 1, "circular": 2 * side + 1, "valid": max(1, side // 2 - 1 + side // 2 % 2)}
-    return limits.get(border, 2**31 - 1)
 
 
 def window_ladder(largest: int) -> tuple[int, ...]:

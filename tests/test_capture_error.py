@@ -29,7 +29,6 @@ from kornia_tidy.planning import Planner
 from kornia_tidy.scene.compositing import render
 from tests.base import BaseTester
 
-
 ZERO, ONE = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
 
 

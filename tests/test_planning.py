@@ -12,19 +12,19 @@ from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.psf_bank import PSFBank
-from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.planning import (
     LAYER_SPACINGS,
     PIXEL_TOLERANCES,
     REFERENCE,
     PlannedScene,
     Planner,
-    largest_window,
     window_ladder,
 )
 from kornia_tidy.scene.compositing import render
+from kornia_tidy.scene.convolution import largest_window
 from tests.base import BaseTester, needs_data
 from tests.scenes import ENTRIES, load_scene
 
@@ -50,9 +50,7 @@ class Rig:
         light, defocus = light.to(dtype), defocus.to(dtype)
         bank = self._cameras[key].scene_bank(light.shape[1], dtype, defocus)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        return render(
-            light, defocus, bank, self.optics.compositing, layers=layers, border=self.optics.border
-        ).double()
+        return render(light, defocus, bank, self.optics.compositing, layers=layers, border=self.optics.border).double()
 
     def error(self, light: Tensor, defocus: Tensor, fidelity: Fidelity, reference: Fidelity) -> float:
         difference = self.capture(light, defocus, fidelity) - self.capture(light, defocus, reference)
@@ -328,7 +326,9 @@ class TestPlan(BaseTester):
             flat.plan(torch.zeros(1, 40, 40))
 
     def test_exception_errors_are_of_exact_fidelities_with_a_window(self, scene):
-        with pytest.raises(ValueError, match=r"propagation 'exact' and stray_light 'veil' or 'renormalize', got 'paper'"):
+        with pytest.raises(
+            ValueError, match=r"propagation 'exact' and stray_light 'veil' or 'renormalize', got 'paper'"
+        ):
             scene.error(Fidelity.preset("paper"))
         with pytest.raises(ValueError, match=r"a fixed window up to the reference's .* got None"):
             scene.error(Fidelity.preset("balanced"))

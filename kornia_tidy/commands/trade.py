@@ -21,12 +21,12 @@ from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.figures import require_matplotlib
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.phase_masks import PixelwiseMask
+from kornia_tidy.scene.convolution import largest_window
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.costs import DEVICES
 from kornia_tidy.tradeoff.figure import draw_trade
 from kornia_tidy.tradeoff.files import TradeRun, markdown, read_json, write_csv, write_json
-from kornia_tidy.planning import largest_window
 from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, Setting, ladder, planned
 from kornia_tidy.tradeoff.measure import TradeRow, linear_light, missing, sweep
 

@@ -151,7 +151,9 @@ def _plans(axes: Axes, plans: list[TradeRow], floor: float) -> list[Label]:
     places = [_place(row, floor) for row in plans]
     x, y = zip(*places, strict=True)
     axes.plot(x, y, color=INK, marker="o", markersize=6, linewidth=2, label="plan, by tolerance", zorder=3.5)
-    return [(f"{row.value:.0e}".replace("e-0", "e-"), place, INK, SMALL) for row, place in zip(plans, places, strict=True)]
+    return [
+        (f"{row.value:.0e}".replace("e-0", "e-"), place, INK, SMALL) for row, place in zip(plans, places, strict=True)
+    ]
 
 
 def _order(row: TradeRow) -> float:

@@ -200,7 +200,7 @@ def _typed(cells: dict[str, str]) -> dict[str, Any]:
     """Return a row of a CSV with its cells in the types that its names have."""
     knobs = get_type_hints(Fidelity)
     hints = {**get_type_hints(TradeRow), **{_KNOB + name: hint for name, hint in knobs.items()}}
-    hints["value"] = knobs.get(cells["knob"], str)
+    hints["value"] = {**knobs, PLAN: float}.get(cells["knob"], str)
     entry: dict[str, Any] = {name: _parsed(text, hints[name]) for name, text in cells.items()}
     entry["fidelity"] = {name: entry.pop(_KNOB + name) for name in knobs}
     return entry

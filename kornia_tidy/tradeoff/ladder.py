@@ -66,7 +66,9 @@ def ladder(base: str | Fidelity = "balanced", knobs: Sequence[str] = tuple(LADDE
     return settings
 
 
-def planned(optics: TiDyOptics, light: Tensor, depth: Tensor, tolerances: Sequence[float] = TOLERANCES) -> list[Setting]:
+def planned(
+    optics: TiDyOptics, light: Tensor, depth: Tensor, tolerances: Sequence[float] = TOLERANCES
+) -> list[Setting]:
     """Return what is planned for a scene at some tolerances; a plan that is the reference itself is one of them.
 
     Args:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.planning import largest_window
+from kornia_tidy.scene.convolution import largest_window
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.tradeoff.costs import peak_bytes, seconds
 from kornia_tidy.tradeoff.ladder import PRESET, Setting, Value
@@ -230,7 +230,7 @@ def linear_light(optics: TiDyOptics, image: Tensor) -> Tensor:
 
 
 def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDyOptics:
-    """The same camera at another setting: noise-free, light in, light out, and no window wider than the border allows."""
+    """The same camera at another setting, its window in the border's limits: noise-free, light in and light out."""
     if optics.border == "valid":
         raise ValueError("captures at different settings differ in size with the border 'valid': choose another")
     fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
