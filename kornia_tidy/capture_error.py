@@ -25,7 +25,7 @@ from kornia_tidy.scene.convolution import next_fast_size, pad_border
 from kornia_tidy.scene.layers import layer_weights
 
 CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
-GRID_RATIO = 1.5  # side of the grid of frequencies over the window
+GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
 _BLOCK = 1024  # px; larger images are looked at block by block
 _BINS = 256  # of the histogram of defocus
 _REGIONS = 8  # of defocus, whose outlines scatter makes visible
@@ -88,7 +88,7 @@ def nodes_needed(half_range: float, bandwidth: float) -> int:
 
 
 def spectrum_size(window: int) -> int:
-    """Return the side of the grid that PSFs of a window are compared on: half as much again keeps tails apart."""
+    """Return the side of the grid that PSFs of a window are compared on."""
     return next_fast_size(math.ceil(GRID_RATIO * window))
 
 

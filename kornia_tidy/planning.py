@@ -59,7 +59,7 @@ LAYER_SPACINGS = {
     "bandlimited": (2.0, 1.0),
 }
 PIXEL_TOLERANCES = (1e-1, 2e-2, 1e-3, 1e-6)
-WINDOW_STRAY_LIGHT = ("veil", "renormalize")  # the veil is nearer unless the window is a few pixels wide
+WINDOW_STRAY_LIGHT = ("veil", "renormalize")  # the veil is nearer unless the window is narrow, or one side bright
 WINDOW_RATIO = 1.2  # between a window that is tried and the next
 
 SAFETY = 1.4  # on 35 photographs measured errors were up to 1.2 times what the formula says

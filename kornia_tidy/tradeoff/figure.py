@@ -181,7 +181,7 @@ def _titles(figure: Figure, run: TradeRun) -> None:
     figure.text(0.03, 0.945, "What exactness costs", fontsize=TITLE, color=INK, weight="bold")
     about = (
         f"{here.scene}, {here.width} × {here.height} px, K = {here.masks} masks, {here.compositing}; "
-        f"each line turns one knob and leaves the others"
+        f"each thin line turns one knob and leaves the others"
     )
     figure.text(0.03, 0.9, about, fontsize=LABEL, color=FAINT)
     code = f"kornia-tidy {here.version}" + (f" ({here.commit})" if here.commit else "")
