@@ -5,27 +5,27 @@ image with the power spectrum S that makes a mean square of
 
 .. math:: \mathrm{MSE} = \sum_\psi p(\psi) \sum_f S(f) \, |\Delta H_\psi(f)|^2
 
-Every PSF in it is a linear combination of a few: PSFs are band-limited in :math:`\psi`, so those at some forty
-Chebyshev nodes carry all others, and layers, spacing and window only change the coefficients. What is left of the
-images is the matrix of the products of these forty with each other, one for each window and channel.
+Of layers, every PSF in it is a linear combination of a few: PSFs are band-limited in :math:`\psi`, so those at some
+sixty Chebyshev nodes carry all others, and layers and spacing only change the coefficients. What is left of the images
+is the matrix of the products of these with each other, one for each channel. What window and points a pixel change is
+looked at where it is: in PSFs a few radians apart, as its size hardly depends on :math:`\psi`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.optics.defocus_interpolation import TAPS, fine_nodes, guarded, interpolation_matrix
 from kornia_tidy.scene.convolution import next_fast_size, pad_border
 from kornia_tidy.scene.layers import layer_weights
 
 CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
-GRID_RATIO = 1.5  # side of the grid of frequencies over the window
+GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
 _BLOCK = 1024  # px; larger images are looked at block by block
 _BINS = 256  # of the histogram of defocus
 _REGIONS = 8  # of defocus, whose outlines scatter makes visible
@@ -88,7 +88,7 @@ def nodes_needed(half_range: float, bandwidth: float) -> int:
 
 
 def spectrum_size(window: int) -> int:
-    """Return the side of the grid that PSFs of a window are compared on: half as much again keeps tails apart."""
+    """Return the side of the grid that PSFs of a window are compared on."""
     return next_fast_size(math.ceil(GRID_RATIO * window))
 
 
@@ -101,7 +101,8 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
         size: side N of the frequency grid.
 
     Returns:
-        (C, N, N // 2 + 1) float64 for the half spectrum, without the mean: PSFs that sum to one leave it alone.
+        (C, N, N // 2 + 1) float64 for the half spectrum. The mean of each image is left out, as white stays white; at
+        frequency zero stands what varies more slowly than the grid can tell.
 
     Example:
         >>> image = torch.rand(1, 1, 40, 40, dtype=torch.float64)
@@ -109,21 +110,60 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
         >>> bool(torch.isclose(power.sum(), image.var(correction=0)))
         True
     """
+    light = light.double()
+    varying = light - light.mean((-2, -1), keepdim=True)
     if border == "replicate":  # edges drawn out into streaks are coarser than the image, mirrored or not: take either
-        drawn_out = pad_border(light, int(size / GRID_RATIO) // 2, "replicate")
-        return torch.maximum(*(power_spectrum(plane, "reflect", size) for plane in (light, drawn_out)))
+        drawn_out = pad_border(varying, int(size / GRID_RATIO) // 2, "replicate")
+        return torch.maximum(*(_power_of_blocks(plane, "reflect", size) for plane in (varying, drawn_out)))
+    power = _power_of_blocks(light if border == "zero" else varying, border, size)
+    if border == "zero":  # with the veil the mean is kept, but for what is missed in the dark around
+        mean_square = light.mean((-2, -1)).square().mean(0).cpu()
+        missed = mean_square * _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
+        power[:, 0, 0] = _power_of_blocks(varying, "reflect", size)[:, 0, 0] + missed
+    return power
+
+
+def _dark_square(shape: Sequence[int], radius: int) -> float:
+    """Return the mean square of the share of a pixel's surroundings that lies beyond the image."""
+    inside = []
+    for side in shape:
+        at = torch.arange(side, dtype=torch.float64)
+        inside.append(((at + radius).clamp(max=side - 1) - (at - radius).clamp(min=0) + 1) / (2 * radius + 1))
+    return float((1 - inside[0][:, None] * inside[1]).square().mean())
+
+
+def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
     total, pixels = torch.zeros((), dtype=torch.float64), 0
     for top in range(0, light.shape[-2], _BLOCK):
         for left in range(0, light.shape[-1], _BLOCK):
             block = light[..., top : top + _BLOCK, left : left + _BLOCK]
             total = total + _covariance(_endless(block, border, size), size) * block[0, 0].numel()
             pixels += block[0, 0].numel()
-    power = torch.fft.rfft2(total / pixels).real / size**2
-    return _half_plane(power, size)
+    return _half_plane(torch.fft.rfft2(total / pixels).real / size**2, size)
+
+
+def coarser(power: Tensor, size: int) -> Tensor:
+    """Return a power spectrum on a smaller grid: its covariance at the shifts that the grid has.
+
+    Example:
+        >>> power = power_spectrum(torch.rand(1, 1, 40, 40, dtype=torch.float64), "circular", 20)
+        >>> coarser(power, 10).shape
+        torch.Size([1, 10, 6])
+    """
+    full = power.shape[-2]
+    halves = torch.full((full // 2 + 1,), 0.5, dtype=torch.float64)
+    halves[0] = 1
+    if full % 2 == 0:
+        halves[-1] = 1
+    covariance = torch.fft.irfft2(power * halves, s=(full, full))
+    lags = torch.fft.fftfreq(size, 1 / size).round().long()
+    return _half_plane(torch.fft.rfft2(covariance[:, lags[:, None], lags]).real * (full / size) ** 2, size)
 
 
 def natural_power(channels: int, size: int) -> Tensor:
     """Return the power spectrum of a typical photograph: 1 / f**2, with the standard deviation ``CONTRAST``.
+
+    At frequency zero stands that of half the lowest frequency of the grid.
 
     Source: Field, Relations between the statistics of natural images and the response properties of cortical cells,
     J. Opt. Soc. Am. A 4(12), 2379 (1987).
@@ -134,7 +174,7 @@ def natural_power(channels: int, size: int) -> Tensor:
     """
     down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
     squared = down[:, None] ** 2 + across**2
-    squared[0, 0] = math.inf
+    squared[0, 0] = (0.5 / size) ** 2
     power = _half_plane(1 / squared[None], size)
     return (power * (CONTRAST**2 / power.sum())).expand(channels, -1, -1)
 
@@ -171,140 +211,107 @@ def defocus_histogram(defocus: Tensor, lo: float, hi: float) -> tuple[Tensor, Te
     return mean[count > 0], count[count > 0] / len(psi)
 
 
-class PSFSurvey:
-    """The PSFs of masks as they are now, at the nodes that carry all others, and their spectra for any window.
+def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: float) -> tuple[Tensor, Sequence[float]]:
+    """Return which PSFs a pixel at some defocus is blurred with, by the layers between which it lies.
 
     Args:
-        bank: gives the PSFs at some nodes, with the light outside their window left out.
-        span: lowest and highest defocus in radians.
-        bandwidth: see :func:`nodes_needed`.
+        psi: (b,) defocus in radians.
+        nodes: of the layers, evenly spaced.
+        layers: their kind.
+        band: highest frequency of a PSF along defocus, for ``"bandlimited"``.
+
+    Returns:
+        (b, n) weights and the defocus of the n PSFs, which for cubic and band-limited layers go beyond the nodes.
+
+    Example:
+        >>> weights, at = layer_coefficients(torch.tensor([0.5]), (0.0, 2.0, 4.0), "linear", 1.2)
+        >>> weights.tolist(), at
+        ([[0.75, 0.25, 0.0]], (0.0, 2.0, 4.0))
     """
-
-    def __init__(
-        self, bank: Callable[[tuple[float, ...]], PSFBank], span: tuple[float, float], bandwidth: float
-    ) -> None:
-        lo, hi = span
-        self.nodes = chebyshev_nodes(lo, hi, nodes_needed((hi - lo) / 2, bandwidth))
-        self.psfs = bank(tuple(self.nodes.tolist())).psfs.detach().cpu()
-
-    def cropped(self, window: int) -> Tensor:
-        """Return the PSFs in a smaller window, (n, C, window, window)."""
-        margin = (self.psfs.shape[-1] - window) // 2
-        return self.psfs[..., margin : margin + window, margin : margin + window]
-
-    def spectra(self, window: int, size: int) -> Tensor:
-        """Return the spectra on a grid of a given side, (C, n, frequencies) complex64."""
-        margin = (self.psfs.shape[-1] - window) // 2
-        kept = torch.nn.functional.pad(self.cropped(window).float(), (margin,) * 4)  # the centre stays where it was
-        return torch.fft.rfft2(kept, s=(size, size)).flatten(2).transpose(0, 1)
-
-    def energy(self, psi: Tensor | tuple[float, ...], window: int) -> Tensor:
-        """Return the share of the light in a window at some defocus, (len(psi), C) float64."""
-        weights = chebyshev_weights(torch.as_tensor(psi, dtype=torch.float64), self.nodes)
-        return weights @ self.cropped(window).double().sum((-2, -1))
-
-    def own_rows(self, psi: Tensor | tuple[float, ...], window: int) -> Tensor:
-        """Return the coefficients of the PSFs at some defocus, renormalised in their window, (C, len(psi), n)."""
-        weights = chebyshev_weights(torch.as_tensor(psi, dtype=torch.float64), self.nodes)
-        energy = self.energy(psi, window).clamp(min=torch.finfo(torch.float32).tiny)
-        return weights / energy.T[..., None]
-
-    def rows(self, psi: Tensor, nodes: tuple[float, ...], layers: str, window: int) -> Tensor:
-        """Return the coefficients of what pixels take from layers at these nodes, (C, len(psi), n)."""
-        at = torch.tensor(nodes, dtype=torch.float64)
-        taken = layer_weights(psi.view(1, 1, 1, -1), at, layers)[0, :, 0].T
-        return taken @ self.own_rows(nodes, window)
+    mode = "nearest" if layers == "nearest" else "linear"
+    taken_from = fine_nodes(nodes) if layers in TAPS else tuple(nodes)
+    at = torch.tensor(taken_from, dtype=torch.float64)
+    weights = layer_weights(psi.double().view(1, 1, 1, -1), at, mode)[0, :, 0].T
+    if layers not in TAPS:
+        return weights, nodes
+    samples = guarded(nodes, TAPS[layers] // 2)
+    matrix = interpolation_matrix(
+        samples[0], samples[1] - samples[0], len(samples), taken_from, band if layers == "bandlimited" else None
+    )
+    return weights @ torch.tensor(matrix, dtype=torch.float64), samples
 
 
-class SceneErrors:
-    """Root mean square differences, on one scene, between captures that differ in layers, spacing and window.
+class LayerErrors:
+    """Root mean square differences, on one scene, between captures that differ in their layers.
 
     Args:
-        survey: the PSFs.
-        reference: what captures are compared with; its window is given.
-        nodes: gives the nodes of a fidelity.
+        nodes: Chebyshev nodes that carry the PSFs of the masks, see :func:`nodes_needed`.
+        psfs: (n, C, P, P) PSFs there, not normalised.
         psi: (b,) defocus in the scene, and
         share: the share of the pixels at each.
-        power: see :func:`power_spectrum`; on the grid of ``spectrum_size(reference.window)``.
+        power: see :func:`power_spectrum`; of any grid not smaller than ``spectrum_size(P)``.
     """
 
-    def __init__(
-        self,
-        survey: PSFSurvey,
-        reference: Fidelity,
-        nodes: Callable[[Fidelity], tuple[float, ...]],
-        psi: Tensor,
-        share: Tensor,
-        power: Tensor,
-    ) -> None:
-        self._survey, self._nodes = survey, nodes
-        self._psi, self._share = psi, share
-        self._power = power
-        self._window = int(reference.window or 0)
-        self._size = spectrum_size(self._window)
-        self._spectra = self._weighted(self._window)
-        self._rows = survey.rows(psi, nodes(reference), reference.layers, self._window)
-        self._products: dict[int, Tensor] = {}
-        self._known: dict[tuple[str, float, int], float] = {}
+    def __init__(self, nodes: Tensor, psfs: Tensor, psi: Tensor, share: Tensor, power: Tensor) -> None:
+        self._nodes, self._psi, self._share = nodes, psi, share
+        size = min(power.shape[-2], spectrum_size(psfs.shape[-1]))
+        power = coarser(power, size) if size < power.shape[-2] else power
+        self._products = torch.stack(
+            [_products(own, weight) for own, weight in zip(psfs.unbind(1), power, strict=True)]
+        )
 
-    def __call__(self, fidelity: Fidelity) -> float:
-        """Return the difference that a fidelity's layers, spacing and window make, full scale 1."""
-        window = int(fidelity.window or 0)
-        key = (fidelity.layers, fidelity.layer_spacing, window)
-        if key not in self._known:
-            self._known[key] = self._difference(
-                self._survey.rows(self._psi, self._nodes(fidelity), fidelity.layers, window), window
-            )
-        return self._known[key]
+    def rows(self, nodes: Sequence[float], layers: str, band: float) -> Tensor:
+        """Return the coefficients of what the scene's pixels are blurred with, (b, n)."""
+        weights, at = layer_coefficients(self._psi, nodes, layers, band)
+        return weights @ chebyshev_weights(torch.tensor(at, dtype=torch.float64), self._nodes)
 
-    def of_reference(self) -> float:
-        """Return the difference between the reference and PSFs of its window computed for each depth alone."""
-        return self._difference(self._survey.own_rows(self._psi, self._window), self._window)
+    def own_rows(self) -> Tensor:
+        """Return the coefficients of a PSF of its own for each depth, (b, n)."""
+        return chebyshev_weights(self._psi, self._nodes)
 
-    def left_by(self, nodes: tuple[float, ...], psfs: Tensor) -> float:
-        """Return the difference that changes of PSFs make, known at some defocus: in between, the larger neighbour.
-
-        Args:
-            nodes: ascending defocus in radians.
-            psfs: the changes there, (len(nodes), C, P, P).
-        """
-        spectra = torch.fft.rfft2(psfs.double(), s=(self._size, self._size))
-        squares = (_power(spectra) * self._power).sum((-2, -1)).mean(1).clamp(min=0)
-        above = torch.bucketize(self._psi, torch.tensor(nodes, dtype=torch.float64)).clamp(max=len(nodes) - 1)
-        worse = torch.maximum(squares[above], squares[(above - 1).clamp(min=0)])
-        return math.sqrt(float(worse @ self._share))
-
-    def _difference(self, rows: Tensor, window: int) -> float:
-        difference = rows - self._rows if window == self._window else torch.cat([-self._rows, rows], dim=-1)
-        squares = torch.einsum("cbi,cbi,b->c", difference @ self._product(window), difference, self._share)
+    def __call__(self, ours: Tensor, theirs: Tensor) -> float:
+        """Return the difference between captures of these coefficients, full scale 1."""
+        difference = ours - theirs
+        squares = torch.einsum("cbi,bi,b->c", difference @ self._products, difference, self._share)
         return math.sqrt(max(0.0, float(squares.mean())))
 
-    def _weighted(self, window: int) -> Tensor:
-        return torch.view_as_real(self._survey.spectra(window, self._size)).double()
 
-    def _product(self, window: int) -> Tensor:
-        """Products with each other of the PSFs in the reference's window, if it is another, and in this one."""
-        if window not in self._products:
-            own = self._spectra if window == self._window else self._weighted(window)
-            folded = own * self._power.flatten(1)[:, None, :, None].to(own)
-            inner = folded.flatten(2) @ own.flatten(2).mT
-            if window == self._window:
-                self._products[window] = inner
-            else:
-                outer, cross = self._product(self._window), folded.flatten(2) @ self._spectra.flatten(2).mT
-                self._products[window] = torch.cat([torch.cat([outer, cross.mT], 2), torch.cat([cross, inner], 2)], 1)
-        return self._products[window]
+def _products(psfs: Tensor, power: Tensor) -> Tensor:
+    size = power.shape[-2]
+    spectra = torch.view_as_real(torch.fft.rfft2(psfs.float(), s=(size, size)).flatten(1)).double()
+    return (spectra * power.flatten()[:, None]).flatten(1) @ spectra.flatten(1).mT
+
+
+def change_error(nodes: Sequence[float], changes: Tensor, psi: Tensor, share: Tensor, power: Tensor) -> float:
+    """Return the root mean square difference that changes of PSFs make on a scene.
+
+    Args:
+        nodes: ascending defocus in radians where the changes are known; in between they are as large as there.
+        changes: (len(nodes), C, P, P).
+        psi: (b,) defocus in the scene, and
+        share: the share of the pixels at each.
+        power: see :func:`power_spectrum`; of any grid not smaller than ``spectrum_size(P)``.
+
+    Example:
+        >>> double = torch.zeros(1, 1, 1, 1) + 1.0  # what a PSF of twice the light adds
+        >>> image = torch.rand(1, 1, 9, 9, dtype=torch.float64)
+        >>> error = change_error((0.0,), double, torch.zeros(1), torch.ones(1), power_spectrum(image, "circular", 9))
+        >>> abs(error - float(image.std(correction=0))) < 1e-6
+        True
+    """
+    size = min(power.shape[-2], spectrum_size(changes.shape[-1]))
+    power = coarser(power, size) if size < power.shape[-2] else power
+    squares = (_power(torch.fft.rfft2(changes, s=(size, size))) * power).sum((-2, -1)).mean(1).clamp(min=0).numpy()
+    return math.sqrt(float(np.interp(psi.numpy(), nodes, squares) @ share.numpy()))
 
 
 def _endless(block: Tensor, border: str, size: int) -> Tensor:
     """Make a block periodic the way its border continues it: mirrored, repeated, or alone in the dark."""
     height, width = block.shape[-2:]
-    block = block.double()
-    if border == "zero":  # the mean is light at the edge
+    if border == "zero":
         return torch.nn.functional.pad(block, (0, size, 0, size)) * math.sqrt(
             (height + size) * (width + size) / (height * width)
         )
-    block = block - block.mean((0, 2, 3), keepdim=True)
     if border == "circular":
         return block
     return torch.nn.functional.pad(block, (0, max(0, width - 2), 0, max(0, height - 2)), mode="reflect")
@@ -314,9 +321,9 @@ def _covariance(plane: Tensor, size: int) -> Tensor:
     """Return the covariance of a periodic plane with itself at shifts up to half of ``size``, (C, size, size)."""
     height, width = plane.shape[-2:]
     power = _power(torch.fft.rfft2(plane)).mean(0) / (height * width)
-    covariance = torch.fft.irfft2(power, s=(height, width)).cpu()
     lags = torch.fft.fftfreq(size, 1 / size).round().long()
-    return covariance[:, (lags % height)[:, None], lags % width]
+    rows = torch.fft.ifft(power, dim=-2)[:, lags % height]
+    return torch.fft.irfft(rows, n=width)[..., lags % width].cpu()
 
 
 def _power(spectrum: Tensor) -> Tensor:
@@ -324,11 +331,9 @@ def _power(spectrum: Tensor) -> Tensor:
 
 
 def _half_plane(power: Tensor, size: int) -> Tensor:
-    """Let columns that stand for two frequencies count twice, and drop the mean."""
+    """Let columns that stand for two frequencies count twice."""
     twice = torch.full((size // 2 + 1,), 2.0, dtype=torch.float64)
     twice[0] = 1
     if size % 2 == 0:
         twice[-1] = 1
-    power = power * twice
-    power[..., 0, 0] = 0
-    return power
+    return power * twice

@@ -13,6 +13,25 @@ LAYERS = ("nearest", "linear", "cubic", "bandlimited")
 class Fidelity:
     """The knobs of the speed/accuracy trade. Presets: ``paper``, ``draft``, ``balanced``, ``reference``.
 
+    What ``reference`` leaves out, as the root mean square error of a capture, full scale 1:
+
+    - light beyond its window, which is the smallest that holds 97 % but at most 257 px; the rest is spread evenly over
+      the image. Against windows of 513 and 641 px, on dead leaves: 9e-4 for five random masks (95 % held) and a flat
+      one (43 px), 7e-4 for a smooth one and Fresnel lenses. On photographs, which are brighter on one side than on the
+      other, more: with a random mask 1.2e-3 on Middlebury's Motorcycle, 2.5e-3 on Aloe. For the five random masks
+      385 px would be at 4e-4, for 2.2 times the PSFs' time and memory.
+    - depths between its layers: 1.5e-6 for random masks, against linear layers 1/64 rad apart (linear layers 1 rad
+      apart: 4e-5); up to 1e-4 for a flat mask in focus on black and white shapes.
+    - integration over sensor pixels: 5e-12, and rounding.
+
+    So an error against it is one against the truth down to some 2e-3. Below, it tells how well layers, points and
+    precision are kept for the light within that window.
+
+    How layers are chosen by tolerance: :meth:`kornia_tidy.TiDyOptics.plan` takes, of all kinds and spacings, the
+    cheapest whose error on the scene is within what was asked. On 35 photographs with a random mask that was
+    ``"nearest"`` 4 or 8 rad apart for 1e-1 and mostly for 1e-2, ``"linear"`` 2 or 4 rad apart for 1e-3, 1 rad for 1e-4,
+    0.5 rad or ``"cubic"`` 1 rad apart for 1e-5, and ``"bandlimited"`` for 1e-6.
+
     Args:
         name: how the setting calls itself.
         propagation: ``"exact"`` integrates every pixel of the mask and of the sensor; ``"paper"`` is the published
@@ -97,9 +116,11 @@ PRESETS = {
     "reference": Fidelity(
         "reference",
         pixel_tolerance=1e-6,
+        layers="bandlimited",
         layer_spacing=1.0,
-        enclosed_energy=0.9,
-        max_window=129,
+        enclosed_energy=0.97,
+        max_window=257,
+        stray_light="veil",
         double=True,
     ),
 }

@@ -1,22 +1,30 @@
-"""What a capture costs: floating-point operations and memory of the PSF bank and of the rendering, by formula.
+"""What a capture costs: time and memory of the PSF bank and of the tiled rendering, by formula.
 
-Operations are real additions and multiplications, in float64 counted twice. Matrix products and Fourier transforms of
-this size run at like speed (17 and 13 billion a second in float32 on a core of a Xeon), so they are added up.
+Seconds are those of one core of a 2.5 GHz Xeon that does nothing else, after constants that were measured there. Other
+machines are faster or slower, but what is cheaper here is mostly cheaper there.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import torch
+from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.propagation import gauss_legendre_order
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-from kornia_tidy.scene.convolution import next_fast_size, padded_size
+from kornia_tidy.scene.layers import assign_layers
+from kornia_tidy.scene.tiles import CHUNK_BYTES, Labels, choose_grid, tile_cost
+
+BANK_RATE = {False: 60e9, True: 35e9}  # operations a second of a PSF bank in float32, and in float64, counted twice
+TILE_FACTOR = 1.1  # of what the renderer takes over the cost by which it chooses its tiles
+PIXEL_NANOSECONDS = 8.5  # of a channel of a pixel and each layer that it takes light from
+_STEP = 8  # px between those of which the layers are counted
 
 _points = cache(gauss_legendre_order)
 
@@ -70,52 +78,101 @@ def bank_operations(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> 
     return _weight(fidelity) * layers * geometry.states * each
 
 
-def rendering_operations(shape: tuple[int, int, int, int], border: str, fidelity: Fidelity, layers: int) -> float:
-    r"""Return the operations of the dense renderer.
+def bank_seconds(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> float:
+    """Return the time of an exact PSF bank, see :func:`bank_operations`, on one core of a 2.5 GHz Xeon."""
+    return bank_operations(geometry, fidelity, layers) / BANK_RATE[fidelity.double]
 
-    .. math:: (B C (1 + D) + C D) \cdot 2.5\, n \log_2 n + 7\, B C D\, n
 
-    for D layers present and planes of n pixels, padded for the border and to a fast size: one transform for each image,
-    one for each PSF, one back for each layer and image; a product of spectra and two choices a pixel.
+@dataclass(frozen=True)
+class Tiles:
+    """What the tiled renderer does for a scene, see :mod:`kornia_tidy.scene.tiles`.
 
     Args:
-        shape: (B, C, H, W) of the image.
-        border: see :mod:`kornia_tidy.scene.convolution`.
-        fidelity: its window and precision count.
-        layers: how many the scene holds.
+        size: side of the tiles' windows in pixels.
+        blocks: pieces that the scene is cut into.
+        pairs: blocks times the layers present in each.
+        layers: layers present in the scene.
+        pixels: of the output in one channel, over the batch.
+        terms: layers that a pixel takes light from: 1 or 2.
+    """
+
+    size: int
+    blocks: int
+    pairs: int
+    layers: int
+    pixels: int
+    terms: int
+
+
+def label_pixels(defocus: Tensor, batch: int, nodes: Sequence[float], mode: str) -> Labels:
+    """Return the layers of each pixel, as the renderer finds them.
+
+    Args:
+        defocus: (B or 1, 1, H, W) radians.
+        batch: images B.
+        nodes: defocus of the layers that are rendered.
+        mode: ``"nearest"`` or ``"linear"``.
+    """
+    lower, fraction = assign_layers(defocus, torch.tensor(nodes, dtype=defocus.dtype, device=defocus.device), mode)
+    lower, fraction = (x[:, 0].expand(batch, -1, -1) for x in (lower, fraction))
+    return Labels.of(lower, None if mode == "nearest" else fraction)
+
+
+def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
+    """Cut up a scene as the renderer will, and count. Only every eighth row and column is looked at.
+
+    Args:
+        labels: from :func:`label_pixels`.
+        layers: how many there are.
+        window: side of the PSFs.
 
     Example:
-        >>> f"{rendering_operations((1, 3, 1024, 1024), 'reflect', Fidelity(window=65), 21):.1e}"
-        '8.8e+09'
+        >>> flat = label_pixels(torch.zeros(1, 1, 64, 64), 1, (-1.0, 0.0, 1.0), "linear")
+        >>> count_tiles(flat, 3, 9).layers
+        1
     """
-    batch, channels, height, width = shape
-    down, across = (next_fast_size(side) for side in padded_size(height, width, window_side(fidelity), border))
-    pixels = down * across
-    transform = 2.5 * pixels * math.log2(max(2, pixels))
-    transforms = batch * channels * (1 + layers) + channels * layers
-    return _weight(fidelity) * (transforms * transform + 7 * batch * channels * layers * pixels)
+    grid, sample = choose_grid(labels, layers, window), labels.change(lambda layer: layer[:, ::_STEP, ::_STEP])
+    pairs = int(grid.number(sample, layers, _STEP).present(grid.blocks * layers).sum())
+    present = int(sample.present(layers + 1).sum())
+    return Tiles(grid.size, grid.blocks, pairs, present, labels.first.numel(), 1 if labels.fraction is None else 2)
 
 
-def memory_bytes(
-    geometry: BankGeometry,
-    shape: tuple[int, int, int, int],
-    border: str,
-    fidelity: Fidelity,
-    layers: int,
-) -> int:
+def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:
+    """Return the time of the tiled renderer on one core of a 2.5 GHz Xeon.
+
+    It is :func:`kornia_tidy.scene.tiles.tile_cost`, by which the renderer chooses its tiles, with the spectra of the
+    PSFs, and what is taken pixel by pixel from each layer.
+
+    Example:
+        >>> f"{rendering_seconds(Tiles(128, 100, 400, 21, 2**20, 2), 3, Fidelity()):.1g}"
+        '0.1'
+    """
+    windows = tile_cost(tiles.size, tiles.blocks, tiles.pairs) + tile_cost(tiles.size, 0, tiles.layers)
+    nanoseconds = TILE_FACTOR * windows + PIXEL_NANOSECONDS * tiles.pixels * tiles.terms
+    return _weight(fidelity) * channels * nanoseconds * 1e-9
+
+
+def memory_bytes(geometry: BankGeometry, tiles: Tiles, channels: int, fidelity: Fidelity, layers: int) -> int:
     """Return the peak memory of a capture without gradients beyond the image: of the bank or the renderer, whichever.
 
     The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and as real matrices. The renderer
-    holds some sixteen planes of the padded image's size in all channels: two spectra and their product, the transforms'
-    own copies, the sums and what is chosen from. Both are within a third of what was measured on a CPU.
+    holds the PSFs and their spectra, the planes of a chunk of tiles and what belongs to pixels.
+
+    Args:
+        geometry: of the bank.
+        tiles: of the scene.
+        channels: of the image.
+        fidelity: its window, points and precision count.
+        layers: PSFs computed.
     """
-    batch, channels, height, width = shape
     real = 4 * _weight(fidelity)
     side = max(geometry.samples(fidelity))
-    psfs = real * layers * channels * window_side(fidelity) ** 2
+    psfs = real * max(layers, tiles.layers) * channels * window_side(fidelity) ** 2
     kernels = 2 * real * layers * side * geometry.pupil.amplitude.shape[-1]
-    down, across = (next_fast_size(side) for side in padded_size(height, width, window_side(fidelity), border))
-    return int(psfs + max(4 * kernels, 16 * real * batch * channels * down * across))
+    plane = 2 * real * channels * tiles.size**2
+    chunk = 3 * max(CHUNK_BYTES["cpu"], plane * math.ceil(tiles.pairs / tiles.blocks))
+    pixels = tiles.pixels * (4 * channels * real + 5 * 8)
+    return int(psfs + max(4 * kernels, 2 * tiles.layers * plane + chunk + pixels))
 
 
 def _weight(fidelity: Fidelity) -> int:

@@ -26,7 +26,7 @@ from kornia_tidy.scene.convolution import BORDERS, check_border
 from kornia_tidy.sensor.noise import STRIP, SensorNoise
 
 if TYPE_CHECKING:
-    from kornia_tidy.planning import RenderPlan
+    from kornia_tidy.render_plan import RenderPlan
 
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
@@ -344,10 +344,10 @@ class TiDyOptics(CodedLens):
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""
-        settings = self.fidelity
+        settings, held = self.fidelity, self.light_held
         return (
             f"fidelity {settings.name!r}: {len(self.defocus_nodes)} {settings.layers} layers of defocus, PSF window "
-            f"{self.window}x{self.window} px holding {self._held[0]:.0%} to {self._held[1]:.0%} of the light "
+            f"{self.window}x{self.window} px holding {held[0]:.0%} to {held[1]:.0%} of the light "
             f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
         )
 

@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.capture_error import (
     CONTRAST,
-    PSFSurvey,
+    LayerErrors,
+    change_error,
     chebyshev_nodes,
     chebyshev_weights,
+    coarser,
     defocus_histogram,
+    layer_coefficients,
     natural_power,
     nodes_needed,
     power_spectrum,
@@ -23,7 +26,10 @@ from kornia_tidy.capture_error import (
 )
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.planning import Planner
+from kornia_tidy.scene.compositing import render
 from tests.base import BaseTester
+
+ZERO, ONE = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
 
 
 class TestInterpolation(BaseTester):
@@ -44,16 +50,12 @@ class TestInterpolation(BaseTester):
 
     def test_feature_surveyed_psfs_carry_those_of_every_defocus(self):
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
-        survey = PSFSurvey(
-            lambda nodes: optics.psf_bank(3, None, nodes), (-20, 20), Planner(optics, 3).geometry.bandwidth
-        )
+        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, Planner(optics, 3).geometry.bandwidth))
         psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
-        direct = optics.psf_bank(3, None, psi).with_stray_light("renormalize").psfs.detach()
-        weights = chebyshev_weights(torch.tensor(psi, dtype=torch.float64), survey.nodes)
-        surveyed = torch.einsum("an,ncpq->acpq", weights, survey.psfs.double())
-        energy = survey.energy(psi, 31)
-        self.assert_close(energy, optics.psf_bank(3, None, psi).energy.detach(), atol=1e-5, rtol=0)
-        assert float((surveyed / energy[..., None, None] - direct).abs().sum((-2, -1)).max()) < 1e-4
+        with torch.no_grad():
+            direct, known = (optics.psf_bank(3, None, at).psfs for at in (psi, tuple(nodes.tolist())))
+        surveyed = torch.einsum("an,ncpq->acpq", chebyshev_weights(torch.tensor(psi).double(), nodes), known.double())
+        assert float((surveyed - direct).abs().sum((-2, -1)).max()) < 1e-4
 
     def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
         """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
@@ -99,7 +101,20 @@ class TestPower(BaseTester):
         power = natural_power(2, 64)
         assert float(power[0].sum()) == pytest.approx(CONTRAST**2)
         assert float(power[1, 0, 4] / power[1, 0, 8]) == pytest.approx(4)
-        assert float(power[0, 0, 0]) == 0
+
+    @pytest.mark.parametrize("border", ["reflect", "circular"])
+    def test_feature_a_veil_leaves_the_mean_and_takes_what_varies(self, border):
+        """What a veil of a tenth changes in an image: a tenth of its deviation from its mean, however slow."""
+        light = torch.linspace(0, 1, 60, dtype=torch.float64).expand(1, 1, 60, 60)
+        error = change_error((0.0,), -0.1 * torch.ones(1, 1, 1, 1), ZERO, ONE, power_spectrum(light, border, 8))
+        assert error == pytest.approx(0.1 * float(light.std(correction=0)), rel=0.05)
+
+    @pytest.mark.parametrize("sizes", [(20, 10), (21, 10), (21, 9), (15, 12)])
+    def test_feature_a_coarser_grid_is_that_of_the_image(self, sizes):
+        """On white noise without any correlation, whose covariance at all other shifts is small on both grids."""
+        light = torch.rand(1, 2, 48, 48, dtype=torch.float64)
+        fine, coarse = (power_spectrum(light, "reflect", size) for size in sizes)
+        self.assert_close(coarser(fine, sizes[1]), coarse, atol=1e-12, rtol=1e-9)
 
     def test_feature_one_depth_has_no_outlines(self):
         light = torch.rand(1, 3, 20, 20)
@@ -107,6 +122,36 @@ class TestPower(BaseTester):
         self.assert_close(flat, power_spectrum(light, "reflect", 15), atol=1e-12, rtol=0)
         white = torch.ones(1, 1, 20, 20)
         assert float(region_power(white, torch.rand(1, 1, 20, 20), "circular", 15).sum()) > 0.1
+
+
+class TestLayers(BaseTester):
+    @pytest.mark.parametrize("layers", ["nearest", "linear", "cubic", "bandlimited"])
+    def test_feature_a_pixel_takes_what_the_camera_gives_it(self, layers):
+        """Against the capture of a point: the PSF that the camera makes of its layers."""
+        fidelity = Fidelity(window=15, layers=layers, layer_spacing=1.0, stray_light="discard", double=True)
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, color_space="linear", border="zero")
+        planner, psi = Planner(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
+        weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, planner.band)
+        point = torch.zeros(1, 3, 15, 15, dtype=torch.float64)
+        point[..., 7, 7] = 1
+        with torch.no_grad():
+            psf = torch.einsum("an,ncpq->acpq", weights, optics.psf_bank(3, torch.float64, tuple(at)).psfs)
+            bank = optics.scene_bank(3, torch.float64, psi)
+            mode = "nearest" if layers == "nearest" else "linear"
+            coded = render(point, psi.expand(1, 1, 15, 15), bank, layers=mode, border="zero")
+        self.assert_close(coded, psf, atol=1e-12, rtol=0)
+
+    def test_feature_differences_are_those_of_convolved_images(self):
+        """Two constant PSFs, of which the scene takes different shares."""
+        generator = torch.Generator().manual_seed(0)
+        light = torch.rand(1, 1, 24, 24, dtype=torch.float64, generator=generator)
+        psfs = torch.randn(2, 1, 3, 3, generator=generator)
+        errors = LayerErrors(torch.tensor([-1.0, 1.0]), psfs, ZERO, ONE, power_spectrum(light, "circular", 6))
+        ours, theirs = torch.tensor([[0.3, 0.7]]).double(), torch.tensor([[0.6, 0.4]]).double()
+        kernel = torch.einsum("an,ncpq->pq", ours - theirs, psfs.double())
+        varying = light[0, 0] - light.mean()
+        expected = (scipy.ndimage.convolve(varying.numpy(), kernel.numpy(), mode="wrap") ** 2).mean() ** 0.5
+        assert errors(ours, theirs) == pytest.approx(expected, rel=1e-6)
 
 
 class TestHistogram(BaseTester):

@@ -6,46 +6,51 @@ from itertools import pairwise
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.fidelity import LAYERS
+from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.psf_bank import PSFBank
-from kornia_tidy.planning import LAYER_SPACINGS, REFERENCE, PlannedScene, Planner, largest_window, window_ladder
+from kornia_tidy.planning import (
+    LAYER_SPACINGS,
+    PIXEL_TOLERANCES,
+    REFERENCE,
+    PlannedScene,
+    Planner,
+    window_ladder,
+)
 from kornia_tidy.scene.compositing import render
-from kornia_tidy.scene.layers import LAYER_MODES
+from kornia_tidy.scene.convolution import largest_window
 from tests.base import BaseTester, needs_data
 from tests.scenes import ENTRIES, load_scene
 
 NAMES = tuple(ENTRIES)
-TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
 
 class Rig:
-    """A camera, its planner, and captures of both plan and reference with banks made once."""
+    """A camera, its planner, and captures of both plan and reference with PSFs made once."""
 
     def __init__(self, optics: TiDyOptics, channels: int = 3) -> None:
         self.optics = optics
         self.planner = Planner(optics, channels)
-        self.channels = channels
-        self._banks: dict[Fidelity, PSFBank] = {}
+        self._cameras: dict[Fidelity, TiDyOptics] = {}
 
     @torch.no_grad()
     def capture(self, light: Tensor, defocus: Tensor, fidelity: Fidelity) -> Tensor:
         key = fidelity.replace(name="")
-        if key not in self._banks:
-            self._banks[key] = self.optics.with_fidelity(fidelity).psf_bank(self.channels)
+        if key not in self._cameras:
+            self._cameras[key] = self.optics.with_fidelity(fidelity)
+            self._cameras[key]._memory = BankMemory()  # of its own: the camera's is for one setting at a time
         dtype = torch.float64 if fidelity.double else torch.float32
-        return render(
-            light.to(dtype),
-            defocus.to(dtype),
-            self._banks[key],
-            self.optics.compositing,
-            layers=fidelity.layers,
-            border=self.optics.border,
-        ).double()
+        light, defocus = light.to(dtype), defocus.to(dtype)
+        bank = self._cameras[key].scene_bank(light.shape[1], dtype, defocus)
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        return render(light, defocus, bank, self.optics.compositing, layers=layers, border=self.optics.border).double()
 
     def error(self, light: Tensor, defocus: Tensor, fidelity: Fidelity, reference: Fidelity) -> float:
         difference = self.capture(light, defocus, fidelity) - self.capture(light, defocus, reference)
@@ -89,8 +94,8 @@ MASKS = {
 
 @pytest.fixture(scope="module")
 def rig():
-    """A smooth mask, whose PSFs need 45 pixels: a random one needs 119, and takes ten times as long."""
-    return Rig(TiDyOptics(MASKS["learned"](torch.Generator().manual_seed(0)), sensor=None))
+    """A flat mask, whose reference has 45 pixels: that of a random one has 257, and takes thirty times as long."""
+    return Rig(TiDyOptics(MASKS["flat"](torch.Generator().manual_seed(0)), sensor=None))
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +113,12 @@ def scene(flat) -> PlannedScene:
 class TestTolerance(BaseTester):
     @needs_data
     def test_property_real_scenes_stay_within_the_tolerance_asked(self, rig):
-        self.judge(rig, [(name, 96) for name in NAMES[2::7]])
+        self.judge(rig, [(name, 64) for name in NAMES[2::14]])
 
     @needs_data
     @pytest.mark.slow
     def test_property_all_real_scenes_stay_within_the_tolerance_asked(self):
-        self.judge(Rig(TiDyOptics(PixelwiseMask(2), sensor=None)), [(name, 160) for name in NAMES])
+        self.judge(Rig(TiDyOptics(PixelwiseMask(1), sensor=None)), [(name, 160) for name in NAMES])
 
     def judge(self, rig, scenes):
         ratios = []
@@ -124,11 +129,18 @@ class TestTolerance(BaseTester):
                 plan = scene.plan(tolerance)
                 measured = rig.error(light, defocus, plan.fidelity, plan.reference)
                 assert measured <= plan.predicted_error <= tolerance, f"{name}: {measured:.2e}\n{plan}"
-                ratios.append(plan.predicted_error / measured)
+                if measured:  # or it is the reference
+                    ratios.append(plan.predicted_error / measured)
         assert float(torch.tensor(ratios).median()) < 2
 
+    @pytest.fixture
+    def narrow(self, monkeypatch):
+        """A reference of 65 pixels at most: a tenth of the time, and all that is predicted is there."""
+        monkeypatch.setattr("kornia_tidy.planning.REFERENCE", REFERENCE.replace(name="reference", max_window=65))
+
+    @pytest.mark.usefixtures("narrow")
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
-    @settings(max_examples=2, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=2, phases=[Phase.generate], deadline=None, suppress_health_check=list(HealthCheck))
     @given(
         st.sampled_from(sorted(IMAGES)),
         st.sampled_from(sorted(DEPTHS)),
@@ -165,24 +177,40 @@ class TestTolerance(BaseTester):
 
     @needs_data
     def test_property_a_photograph_not_given_is_expected_to_be_a_contrasty_one(self, rig):
-        for name in NAMES[::7]:
+        for name in NAMES[::14]:
             light, defocus = real_scene(name, rig.optics, 96)
             plan = rig.planner.scene(defocus).plan(1e-2)
             assert rig.error(light, defocus, plan.fidelity, plan.reference) <= 1e-2
 
     @needs_data
-    @pytest.mark.parametrize("layers", LAYER_MODES)
-    @pytest.mark.parametrize(("spacing", "narrower"), [(8.0, 0), (2.0, 10), (0.5, 0)])
-    def test_feature_every_kind_of_layers_is_predicted(self, layers, spacing, narrower, rig):
+    @pytest.mark.parametrize(
+        ("layers", "spacing"), [(kind, spacing) for kind in LAYERS for spacing in LAYER_SPACINGS[kind][::2]]
+    )
+    def test_feature_every_kind_of_layers_is_predicted(self, layers, spacing, rig):
         light, defocus = real_scene(NAMES[0], rig.optics, 96)
         scene = rig.planner.scene(defocus, light)
-        window = scene.reference.window
-        assert window is not None
-        fidelity = scene.reference.replace(
-            layers=layers, layer_spacing=spacing, window=window - narrower, pixel_tolerance=2e-2, double=False
-        )
+        fidelity = scene.reference.replace(layers=layers, layer_spacing=spacing)
         measured = rig.error(light, defocus, fidelity, scene.reference)
-        assert 1 < scene.error(fidelity) / measured < 2.5
+        assert 1 < scene.error(fidelity) / measured < 2
+
+    @needs_data
+    @pytest.mark.parametrize("stray_light", ["veil", "renormalize"])
+    @pytest.mark.parametrize("window", [5, 17, 33])
+    def test_feature_every_window_is_predicted(self, stray_light, window, rig):
+        light, defocus = real_scene(NAMES[0], rig.optics, 96)
+        scene = rig.planner.scene(defocus, light)
+        fidelity = scene.reference.replace(window=window, stray_light=stray_light)
+        measured = rig.error(light, defocus, fidelity, scene.reference)
+        assert 1 < scene.error(fidelity) / measured < 2
+
+    @needs_data
+    @pytest.mark.parametrize("name", ["draft", "balanced"])
+    def test_feature_presets_are_predicted(self, name, rig):
+        light, defocus = real_scene(NAMES[0], rig.optics, 96)
+        scene = rig.planner.scene(defocus, light)
+        fidelity = Fidelity.preset(name).replace(window=rig.optics.with_fidelity(name).window)
+        measured = rig.error(light, defocus, fidelity, scene.reference)
+        assert 1 < scene.error(fidelity) / measured < 2.5  # of two equal parts the sum is expected
 
 
 class TestPlan(BaseTester):
@@ -200,10 +228,10 @@ class TestPlan(BaseTester):
         assert flat.plan(depth, tolerance=1e-2) == Planner(flat, 3).scene(flat.camera.defocus(depth[None])).plan(1e-2)
 
     def test_property_a_looser_tolerance_costs_no_more(self, scene):
-        plans = [scene.plan(tolerance) for tolerance in (1e-5, *reversed(TOLERANCES), 1.0)]
-        costs = [plan.operations for plan in plans]
+        plans = [scene.plan(tolerance) for tolerance in (*reversed(TOLERANCES), 1.0)]
+        costs = [plan.seconds for plan in plans]
         assert costs == sorted(costs, reverse=True)
-        assert costs[0] <= plans[0].reference_operations
+        assert costs[0] <= plans[0].reference_seconds
         assert costs[-1] < 0.05 * costs[0]
 
     def test_feature_an_impossible_tolerance_gives_the_reference_and_says_so(self, scene):
@@ -226,7 +254,7 @@ class TestPlan(BaseTester):
             f"{plan.fidelity.window}x{plan.fidelity.window} px",
             f"{plan.layers_total - plan.layers_present} of the layers, at depths that the scene does not have",
             "float64 (error ",
-            f"{plan.operations:.1e} operations",
+            f"some {plan.seconds:.2g} s on one core",
         ):
             assert words in text
 
@@ -238,15 +266,14 @@ class TestPlan(BaseTester):
     def test_feature_the_references_window_is_that_of_the_preset(self, flat, scene):
         assert scene.reference.window == flat.with_fidelity("reference").window
 
-    def test_feature_the_references_own_error_is_that_of_linear_layers(self, rig):
-        """Against the reference with eight times as many layers, where what is left is a sixty-fourth."""
+    def test_feature_the_references_own_error_is_that_of_its_layers(self, rig):
+        """Against linear layers an eighth of a fine spacing apart, where a sixty-fourth of the error is left."""
         generator = torch.Generator().manual_seed(2)
-        light, defocus = IMAGES["smooth"]((1, 3, 48, 48), generator), torch.linspace(-6, 6, 48).expand(1, 1, 48, 48)
+        light, defocus = IMAGES["smooth"]((1, 3, 48, 48), generator), torch.linspace(1, 2, 48).expand(1, 1, 48, 48)
         plan = rig.planner.scene(defocus, light).plan(1e-12)
-        fine = plan.reference.replace(layer_spacing=1 / 8)
-        nodes = tuple(node for node in rig.optics.with_fidelity(fine).defocus_nodes if abs(node) < 6.2)
+        nodes = tuple(1 + i / 32 for i in range(33))
         with torch.no_grad():
-            bank = rig.optics.with_fidelity(fine).psf_bank(3, None, nodes)
+            bank = rig.optics.with_fidelity(plan.reference).psf_bank(3, None, nodes)
         truth = render(light.double(), defocus.double(), bank, layers="linear")
         measured = float((rig.capture(light, defocus, plan.reference) - truth).square().mean().sqrt())
         assert plan.reference_error == pytest.approx(measured, rel=0.2)
@@ -269,13 +296,13 @@ class TestPlan(BaseTester):
         depth = torch.rand(1, 1, 40, 40, dtype=torch.float64)
         plan = optics.plan(depth, torch.rand(1, 1, 40, 40, dtype=torch.float64))
         assert plan.wavelengths == 1
-        assert plan.layers_total <= 5
+        assert plan.layers_total <= 19
 
     def test_feature_layers_counted_are_those_rendered(self, flat):
-        """All depths between two nodes, at the end of the range: two of them hold the scene."""
-        defocus = torch.linspace(-19.9, -19.6, 48).expand(1, 1, 48, 48)
+        """All depths between two nodes: ten taps hold the scene, of the nodes and five guards at either end."""
+        defocus = torch.linspace(-9.9, -9.6, 48).expand(1, 1, 48, 48)
         plan = Planner(flat, 3).scene(defocus, torch.rand(1, 3, 48, 48)).plan(1e-12)
-        assert (plan.layers_present, plan.layers_total) == (2, 41)
+        assert (plan.layers_present, plan.layers_total) == (10, 51)
 
     def test_feature_masks_may_learn_and_be_planned_for(self, flat):
         plan = flat.plan(torch.full((1, 40, 40), 0.5), tolerance=1e-2)
@@ -299,7 +326,9 @@ class TestPlan(BaseTester):
             flat.plan(torch.zeros(1, 40, 40))
 
     def test_exception_errors_are_of_exact_fidelities_with_a_window(self, scene):
-        with pytest.raises(ValueError, match=r"propagation 'exact' and stray_light 'renormalize', got 'paper'"):
+        with pytest.raises(
+            ValueError, match=r"propagation 'exact' and stray_light 'veil' or 'renormalize', got 'paper'"
+        ):
             scene.error(Fidelity.preset("paper"))
         with pytest.raises(ValueError, match=r"a fixed window up to the reference's .* got None"):
             scene.error(Fidelity.preset("balanced"))
@@ -340,5 +369,6 @@ class TestWindows(BaseTester):
         assert coded.shape[-1] >= (side + 3) // 2
 
     def test_feature_candidates_hold_the_references_knobs(self):
-        assert REFERENCE.layer_spacing in LAYER_SPACINGS
-        assert REFERENCE.layers in LAYER_MODES
+        assert REFERENCE.layer_spacing in LAYER_SPACINGS[REFERENCE.layers]
+        assert REFERENCE.pixel_tolerance in PIXEL_TOLERANCES
+        assert set(LAYER_SPACINGS) == set(LAYERS)

@@ -2,21 +2,28 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pytest
+import scipy.stats
+import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.planning import Planner
-from kornia_tidy.render_cost import bank_operations, rendering_operations, window_side
-from tests.base import BaseTester
+from kornia_tidy.render_cost import Tiles, bank_operations, count_tiles, label_pixels, rendering_seconds, window_side
+from kornia_tidy.scene.tiles import make_plan
+from tests.base import BaseTester, needs_data
+from tests.scenes import load_scene
 
 MEMORY = """
 import sys, warnings, torch
 from kornia_tidy import Fidelity, TiDyOptics
 from kornia_tidy.planning import Planner
-from kornia_tidy.render_cost import memory_bytes
 import torch._dynamo  # counted as no part of the capture
 warnings.simplefilter("ignore")
 def peak():
@@ -31,7 +38,8 @@ with torch.no_grad():
     before = peak()
     optics(image, depth)
     used = peak() - before
-print(memory_bytes(Planner(optics, 3).geometry, image.shape, "reflect", fidelity, 21) / used)
+scene = Planner(optics, 3).scene(optics.camera.defocus(depth), image)
+print(scene._described(fidelity, 1.0).memory_bytes / used)
 """
 
 
@@ -45,13 +53,45 @@ class TestCost(BaseTester):
         expected = bank_operations(Planner(optics, 3).geometry, fidelity, 3) / (2 if fidelity.double else 1)
         assert expected == pytest.approx(counted, rel=0.05)
 
-    def test_feature_rendering_grows_with_batch_layers_and_precision(self):
-        fidelity = Fidelity(window=23)
-        one = rendering_operations((1, 3, 100, 100), "reflect", fidelity, 4)
-        assert rendering_operations((1, 3, 100, 100), "reflect", fidelity.replace(double=True), 4) == 2 * one
-        eight = rendering_operations((8, 3, 100, 100), "reflect", fidelity, 4)
-        assert 5 < eight / one < 8  # PSFs are transformed once
-        assert rendering_operations((1, 3, 100, 100), "valid", fidelity, 4) < one
+    def test_feature_tiles_are_those_of_the_renderer(self):
+        """Against the plan that the renderer makes, where every pixel is looked at: some pairs are few pixels."""
+        rows = torch.linspace(-10, 10, 300).view(1, 1, -1, 1).expand(1, 1, 300, 400)
+        nodes = tuple(float(psi) for psi in range(-20, 21, 2))
+        labels = label_pixels(rows, 2, nodes, "linear")
+        counted, plan = count_tiles(labels, len(nodes), 31), make_plan(labels, len(nodes), 31, 3)
+        assert (counted.size, counted.blocks) == (plan.grid.size, plan.grid.blocks)
+        assert 0.7 < counted.pairs / sum(len(chunk.block) for chunk in plan.chunks) <= 1
+        assert counted.layers == len(plan.present) == 11
+        assert (counted.pixels, counted.terms) == (2 * 300 * 400, 2)
+
+    def test_feature_rendering_grows_with_channels_pairs_and_precision(self):
+        fidelity, tiles = Fidelity(window=23), Tiles(64, 40, 120, 9, 10**5, 2)
+        one = rendering_seconds(tiles, 1, fidelity)
+        assert rendering_seconds(tiles, 3, fidelity) == pytest.approx(3 * one)
+        assert rendering_seconds(tiles, 1, fidelity.replace(double=True)) == pytest.approx(2 * one)
+        assert one < rendering_seconds(replace(tiles, pairs=240), 1, fidelity) < 2 * one
+
+    @needs_data
+    @pytest.mark.slow
+    def test_feature_what_is_predicted_cheaper_is_faster(self):
+        """Rank correlation of predicted and measured time over candidates from the cheapest to the dearest."""
+        optics = TiDyOptics(PixelwiseMask(2), sensor=None, fidelity=Fidelity(window=9), color_space="linear")
+        scene = load_scene("aloe")
+        image, depth = scene.image[None, :, :512, :512], scene.depth[None, :, :512, :512]
+        planned = Planner(optics, 3).scene(optics.camera.defocus(depth), image)
+        predicted, measured = [], []
+        for layers, spacing, window in product(("nearest", "linear"), (8.0, 2.0), (9, 33, 85, 129)):
+            fidelity = Fidelity(layers=layers, layer_spacing=spacing, window=window)
+            predicted.append(planned.seconds(fidelity))
+            camera, times = optics.with_fidelity(fidelity), []
+            for _ in range(3):
+                camera._memory = BankMemory()
+                start = time.perf_counter()
+                with torch.no_grad():
+                    camera(image, depth)
+                times.append(time.perf_counter() - start)
+            measured.append(min(times))
+        assert scipy.stats.spearmanr(predicted, measured).statistic > 0.9
 
     def test_exception_a_window_must_be_fixed(self):
         with pytest.raises(ValueError, match="needs a fixed window, got window=None of 'balanced'"):

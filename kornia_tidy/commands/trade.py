@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from kornia_tidy.checks import check_choice
@@ -20,17 +21,19 @@ from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.figures import require_matplotlib
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.phase_masks import PixelwiseMask
+from kornia_tidy.scene.convolution import largest_window
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.costs import DEVICES
 from kornia_tidy.tradeoff.figure import draw_trade
 from kornia_tidy.tradeoff.files import TradeRun, markdown, read_json, write_csv, write_json
-from kornia_tidy.tradeoff.ladder import LADDERS, ladder
-from kornia_tidy.tradeoff.measure import TradeRow, missing, sweep
+from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, Setting, ladder, planned
+from kornia_tidy.tradeoff.measure import TradeRow, linear_light, missing, sweep
 
 DESCRIPTION = """\
 Measure the trade between speed and accuracy on one scene and this machine: each knob
-of the fidelity is turned alone, from a preset, and so are the presets. For each setting
+of the fidelity is turned alone, from a preset; the presets, and what is planned for
+this scene within errors of 1e-1 to 1e-6, are measured too. For each setting
   error    of the noise-free capture in linear light, full scale 1, against the preset
            'reference', which is rendered once
   time     of a capture after the masks have changed (PSFs and rendering), and with
@@ -58,6 +61,7 @@ examples:
 
 NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
 DOTS_PER_INCH = 150
+KNOBS = (*LADDERS, PLAN)
 
 
 def add_parser(subparsers: Any) -> None:
@@ -83,10 +87,10 @@ def add_parser(subparsers: Any) -> None:
     measuring.add_argument(
         "--knobs",
         nargs="+",
-        choices=tuple(LADDERS),
-        default=list(LADDERS),
+        choices=KNOBS,
+        default=list(KNOBS),
         metavar="KNOB",
-        help=f"some of {', '.join(LADDERS)} (default: all)",
+        help=f"some of {', '.join(KNOBS)} (default: all)",
     )
     measuring.add_argument(
         "--base", choices=tuple(PRESETS), default="balanced", help="where the other knobs stay (default: balanced)"
@@ -115,7 +119,7 @@ def run(args: argparse.Namespace) -> None:
     image, depth = scene.image.to(device), scene.depth.to(device)
     name = f"dead leaves, seed {args.seed}" if args.image is None else Path(args.image).name
     conditions = Conditions.here_and_now(name, optics, image, depth, args.reference)
-    settings = ladder(args.base, args.knobs)
+    settings = _settings(args, optics, image, depth)
     known, why = _known(folder / "trade.json", conditions)
 
     tell("scene", f"{name}, {scene_in_words(scene)}")
@@ -185,6 +189,16 @@ def _scene(args: argparse.Namespace) -> Scene:
         return read_scene(args)
     image, depth = dead_leaves(args.size, args.size, depth_range=(NEAR, FAR), seed=args.seed)
     return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+def _settings(args: argparse.Namespace, optics: TiDyOptics, image: Tensor, depth: Tensor) -> list[Setting]:
+    """Steps of the knobs and plans, without windows that are wider than the border allows."""
+    widest = largest_window(optics.border, *image.shape[-2:])
+    steps = ladder(args.base, [knob for knob in args.knobs if knob != PLAN])
+    settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
+    if PLAN in args.knobs:
+        settings += planned(optics, linear_light(optics, image)[None], depth[None])
+    return settings
 
 
 def _known(path: Path, conditions: Conditions) -> tuple[tuple[TradeRow, ...], str]:

@@ -18,7 +18,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.defocus_interpolation import FINE_SPACING, TAPS, defocus_band, interpolated_bank
+from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
@@ -149,7 +149,29 @@ class CodedLens(nn.Module):
     @property
     def window(self) -> int:
         """Side of the PSFs in pixels: given by the fidelity, or measured by :meth:`fit_window`."""
+        if self._window is None and self._fixed_window:
+            self._check_layers()
+            return self._fixed_window
         return self.fit_window() if self._window is None else self._window
+
+    @property
+    def light_held(self) -> tuple[float, float]:
+        """Least and largest share of the light in the window, as it was when the window was chosen."""
+        if self._window is None:
+            self.fit_window()
+        return self._held
+
+    @property
+    def _fixed_window(self) -> int | None:
+        return PAPER_SIZE if self.fidelity.propagation == "paper" else self.fidelity.window
+
+    def _check_layers(self) -> None:
+        settings = self.fidelity
+        if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
+            raise ValueError(
+                f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
+                f"{min(self.spectrum.wavelengths) * 1e9:.0f} nm, got {settings.layer_spacing}"
+            )
 
     def fit_window(self) -> int:
         """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
@@ -160,13 +182,8 @@ class CodedLens(nn.Module):
         Returns:
             The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
-        settings = self.fidelity
-        if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
-            raise ValueError(
-                f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
-                f"{min(self.spectrum.wavelengths) * 1e9:.0f} nm, got {settings.layer_spacing}"
-            )
-        fixed = PAPER_SIZE if settings.propagation == "paper" else settings.window
+        self._check_layers()
+        settings, fixed = self.fidelity, self._fixed_window
         size = fixed or min(33, settings.max_window)
         while True:
             psfs = self._sampled_psfs(size)
@@ -281,9 +298,7 @@ class CodedLens(nn.Module):
             bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus), state)
         else:
             spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
-            finer = ceil(spacing / FINE_SPACING)
-            fine = tuple(nodes[0] + spacing / finer * i for i in range(finer * (len(nodes) - 1) + 1))
-            targets = _around(fine, defocus)
+            targets = _around(fine_nodes(nodes), defocus)
             first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
             last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))

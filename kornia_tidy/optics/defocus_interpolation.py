@@ -8,6 +8,7 @@ Samples closer than :math:`\pi / \Omega` carry every depth between them.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,6 +26,29 @@ def defocus_band(max_rho2: float, shortest_wavelength: float, reference_waveleng
         2.79
     """
     return max_rho2 * reference_wavelength / shortest_wavelength
+
+
+def fine_nodes(nodes: Sequence[float]) -> tuple[float, ...]:
+    """Return nodes over the same range, at most ``FINE_SPACING`` apart, of which the given ones are some.
+
+    Example:
+        >>> fine_nodes((0.0, 0.5, 1.0))
+        (0.0, 0.25, 0.5, 0.75, 1.0)
+    """
+    spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
+    finer = math.ceil(spacing / FINE_SPACING)
+    return tuple(nodes[0] + spacing / finer * i for i in range(finer * (len(nodes) - 1) + 1))
+
+
+def guarded(nodes: Sequence[float], guards: int) -> tuple[float, ...]:
+    """Return evenly spaced nodes with as many more at either end.
+
+    Example:
+        >>> guarded((0.0, 1.0), 2)
+        (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
+    """
+    spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
+    return tuple(nodes[0] + spacing * i for i in range(-guards, len(nodes) + guards))
 
 
 def interpolation_matrix(

@@ -30,6 +30,18 @@ def check_border(border: str, height: int, width: int, psf_size: int) -> None:
         )
 
 
+def largest_window(border: str, height: int, width: int) -> int:
+    """Return the largest window that a border allows an image of this size; ``valid`` keeps half the view.
+
+    Example:
+        >>> largest_window("reflect", 48, 64), largest_window("valid", 48, 64)
+        (95, 23)
+    """
+    side = min(height, width)
+    limits = {"reflect": 2 * side - 1, "circular": 2 * side + 1, "valid": max(1, side // 2 - 1 + side // 2 % 2)}
+    return limits.get(border, 2**31 - 1)
+
+
 def pad_border(image: Tensor, radius: int | tuple[int, int], border: str, spare: tuple[int, int] = (0, 0)) -> Tensor:
     """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` leaves them as they are.
 

@@ -3,11 +3,14 @@
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.figure import draw_trade
 from kornia_tidy.tradeoff.files import TradeRun, markdown, read_csv, read_json, write_csv, write_json
-from kornia_tidy.tradeoff.ladder import LADDERS, Setting, ladder
+from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, PRESET, TOLERANCES, Setting, ladder, planned
 from kornia_tidy.tradeoff.measure import TradeRow, capture, measure, missing, pareto, sweep
 
 __all__ = [
     "LADDERS",
+    "PLAN",
+    "PRESET",
+    "TOLERANCES",
     "Conditions",
     "Setting",
     "TradeRow",
@@ -19,6 +22,7 @@ __all__ = [
     "measure",
     "missing",
     "pareto",
+    "planned",
     "read_csv",
     "read_json",
     "sweep",

@@ -19,6 +19,7 @@ from torch.profiler import ProfilerActivity, profile
 from kornia_tidy.checks import check_choice
 
 DEVICES = ("cpu", "cuda")
+LONG = 5.0  # seconds after which nothing is repeated any more
 
 
 class Timing(NamedTuple):
@@ -33,7 +34,8 @@ def seconds(action: Callable[[], Any], repeats: int, device: torch.device) -> Ti
 
     Args:
         action: called without arguments; what it returns is thrown away.
-        repeats: runs that are counted, 1 or more. The spread of a single one is 0.
+        repeats: runs that are counted, 1 or more; fewer once they have taken ``LONG``. What takes as long as that at
+            the first time is not repeated at all. The spread of a single run is 0.
         device: the one the action works on.
 
     Raises:
@@ -46,14 +48,14 @@ def seconds(action: Callable[[], Any], repeats: int, device: torch.device) -> Ti
     """
     if repeats < 1:
         raise ValueError(f"repeats must be 1 or more, got {repeats}")
-    times = []
-    for _ in range(1 + repeats):
+    times: list[float] = []
+    while len(times) <= repeats and sum(times) < LONG:
         synchronize(device)
         start = time.perf_counter()
         action()
         synchronize(device)
         times.append(time.perf_counter() - start)
-    low, median, high = np.quantile(times[1:], (0.25, 0.5, 0.75)).tolist()
+    low, median, high = np.quantile(times[1:] or times, (0.25, 0.5, 0.75)).tolist()
     return Timing(median, high - low)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kornia_tidy.figures import FAINT, INK, require_matplotlib
 from kornia_tidy.tradeoff.files import TradeRun, value_in_words
-from kornia_tidy.tradeoff.ladder import LADDERS, PRESET
+from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, PRESET
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
 
 if TYPE_CHECKING:
@@ -60,6 +60,8 @@ def draw_trade(run: TradeRun) -> Figure:
         steps = [row for row in run.rows if row.knob == knob]
         if len({(row.capture_seconds, row.rmse) for row in steps}) > 1:
             labels += _knob(axes, steps, floor, number)
+    plans = [row for row in run.rows if row.knob == PLAN]
+    labels = (_plans(axes, plans, floor) if plans else []) + labels  # first come, first served
     presets = [row for row in run.rows if row.knob == PRESET]
     _presets(axes, presets, floor)
     _titles(figure, run)
@@ -143,6 +145,17 @@ def _knob(axes: Axes, steps: list[TradeRow], floor: float, number: int) -> list[
     ]
 
 
+def _plans(axes: Axes, plans: list[TradeRow], floor: float) -> list[Label]:
+    """A heavy line through what was planned, each with the tolerance that was asked for."""
+    plans = sorted(plans, key=_order)
+    places = [_place(row, floor) for row in plans]
+    x, y = zip(*places, strict=True)
+    axes.plot(x, y, color=INK, marker="o", markersize=6, linewidth=2, label="plan, by tolerance", zorder=3.5)
+    return [
+        (f"{row.value:.0e}".replace("e-0", "e-"), place, INK, SMALL) for row, place in zip(plans, places, strict=True)
+    ]
+
+
 def _order(row: TradeRow) -> float:
     """Along a knob: by its number, a measured window by what was measured; what has no number stays as it came."""
     value = row.window if row.value is None else row.value
@@ -168,7 +181,7 @@ def _titles(figure: Figure, run: TradeRun) -> None:
     figure.text(0.03, 0.945, "What exactness costs", fontsize=TITLE, color=INK, weight="bold")
     about = (
         f"{here.scene}, {here.width} × {here.height} px, K = {here.masks} masks, {here.compositing}; "
-        f"each line turns one knob and leaves the others"
+        f"each thin line turns one knob and leaves the others"
     )
     figure.text(0.03, 0.9, about, fontsize=LABEL, color=FAINT)
     code = f"kornia-tidy {here.version}" + (f" ({here.commit})" if here.commit else "")

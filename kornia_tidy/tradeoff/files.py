@@ -13,7 +13,7 @@ from typing import Any, get_args, get_type_hints
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.tradeoff.conditions import Conditions
-from kornia_tidy.tradeoff.ladder import PRESET
+from kornia_tidy.tradeoff.ladder import PLAN, PRESET
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
 
 FORMAT = "kornia_tidy.trade/1"
@@ -163,7 +163,7 @@ def _row(entry: Any) -> TradeRow:
     knobs = _checked("a row's fidelity", Fidelity, values["fidelity"])
     whole: dict[str, Any] = {**values, "fidelity": Fidelity(**knobs)}
     row = TradeRow(**whole)
-    if row.knob != PRESET and row.value != knobs.get(row.knob):
+    if row.knob not in (PRESET, PLAN) and row.value != knobs.get(row.knob):
         raise ValueError(f"a row says {row.knob} = {row.value!r}, its fidelity has {knobs.get(row.knob)!r}")
     return row
 
@@ -200,7 +200,7 @@ def _typed(cells: dict[str, str]) -> dict[str, Any]:
     """Return a row of a CSV with its cells in the types that its names have."""
     knobs = get_type_hints(Fidelity)
     hints = {**get_type_hints(TradeRow), **{_KNOB + name: hint for name, hint in knobs.items()}}
-    hints["value"] = knobs.get(cells["knob"], str)
+    hints["value"] = {**knobs, PLAN: float}.get(cells["knob"], str)
     entry: dict[str, Any] = {name: _parsed(text, hints[name]) for name, text in cells.items()}
     entry["fidelity"] = {name: entry.pop(_KNOB + name) for name in knobs}
     return entry

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.scene.convolution import largest_window
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.tradeoff.costs import peak_bytes, seconds
 from kornia_tidy.tradeoff.ladder import PRESET, Setting, Value
@@ -38,7 +39,8 @@ class TradeRow:
         capture_bytes: most memory of tensors at one time in a capture, see
             :func:`~kornia_tidy.tradeoff.costs.peak_bytes`.
         training_bytes: the same for the capture with gradients.
-        repeats: runs that were timed.
+        repeats: runs asked for; what takes seconds is run less often, see
+            :func:`~kornia_tidy.tradeoff.costs.seconds`.
     """
 
     knob: str
@@ -149,10 +151,10 @@ def measure(
     """
     if truth.shape != image.shape:
         raise ValueError(f"truth must have the image's shape {tuple(image.shape)}, got {tuple(truth.shape)}")
-    light, device = _light(optics, image), image.device
+    light, device = linear_light(optics, image), image.device
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of windows too small, aliasing, clamping: the error tells their price
-        camera = _camera(optics, fidelity)
+        camera = _camera(optics, fidelity, image)
         moving = [p for p in camera.masks.parameters() if p.requires_grad]
         if training and not moving:
             raise ValueError(f"training needs masks that can be learned, got {camera.masks.extra_repr()}")
@@ -167,12 +169,12 @@ def measure(
         with torch.no_grad():
             difference = (camera(light, depth) - truth).double()
             whole = seconds(capture_once, repeats, device)
-            camera = _camera(optics, fidelity)  # a new one has nothing of an earlier capture to free
+            camera = _camera(optics, fidelity, image)  # a new one has nothing of an earlier capture to free
             memory = peak_bytes(capture_once, device)
             rendering = seconds(lambda: camera(light, depth), repeats, device)
         gradients, gradients_memory = None, None
         if training:
-            camera = _camera(optics, fidelity)
+            camera = _camera(optics, fidelity, image)
             gradients_memory = peak_bytes(train_once, device)
             gradients = seconds(train_once, repeats, device)
     return TradeRow(
@@ -205,7 +207,7 @@ def capture(optics: TiDyOptics, image: Tensor, depth: Tensor, fidelity: str | Fi
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return _camera(optics, fidelity)(_light(optics, image), depth)
+        return _camera(optics, fidelity, image)(linear_light(optics, image), depth)
 
 
 def pareto(rows: Iterable[TradeRow]) -> list[TradeRow]:
@@ -222,16 +224,18 @@ def pareto(rows: Iterable[TradeRow]) -> list[TradeRow]:
     return front
 
 
-def _light(optics: TiDyOptics, image: Tensor) -> Tensor:
+def linear_light(optics: TiDyOptics, image: Tensor) -> Tensor:
     """Linear light of an image, batched or not."""
     return optics.decode(image if image.ndim == 4 else image[None]).reshape(image.shape)
 
 
-def _camera(optics: TiDyOptics, fidelity: str | Fidelity) -> TiDyOptics:
-    """The same camera at another setting: noise-free, and light in, light out."""
+def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDyOptics:
+    """The same camera at another setting, its window in the border's limits: noise-free, light in and light out."""
     if optics.border == "valid":
         raise ValueError("captures at different settings differ in size with the border 'valid': choose another")
     fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+    widest = largest_window(optics.border, *image.shape[-2:])
+    fidelity = replace(fidelity, max_window=min(fidelity.max_window, widest))
     return TiDyOptics(
         optics.masks,
         camera=optics.camera,

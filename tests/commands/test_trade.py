@@ -11,7 +11,7 @@ from kornia_tidy.commands import trade
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.fidelity import LAYERS
-from kornia_tidy.tradeoff import read_csv, read_json
+from kornia_tidy.tradeoff import TOLERANCES, read_csv, read_json
 from kornia_tidy.tradeoff import sweep as real_sweep
 from tests.base import BaseTester
 from tests.tradeoff.samples import ROW
@@ -78,6 +78,14 @@ class TestTrade(BaseTester):
         assert "linear" not in capsys.readouterr().out.rpartition("settings")[2]
         knobs = {row.knob for row in read_json(tmp_path / "trade.json").rows}
         assert knobs == {"layers", "layer_spacing"}
+
+    @pytest.mark.usefixtures("measured")
+    def test_feature_plans_are_measured_too_and_windows_fit_the_image(self, tmp_path):
+        assert main(["trade", *QUICK, "--knobs", "plan", "window", "-o", str(tmp_path)]) == 0
+        rows = read_json(tmp_path / "trade.json").rows
+        assert [row.value for row in rows if row.knob == "plan"] == list(TOLERANCES)
+        assert max(row.fidelity.window for row in rows if row.knob == "plan") == 95
+        assert [row.value for row in rows if row.knob == "window"] == [9, 17, 33, 65, None]
 
     @pytest.mark.usefixtures("measured")
     def test_feature_a_scene_of_ones_own(self, tmp_path, capsys):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from kornia_tidy import Fidelity
-from kornia_tidy.tradeoff import Conditions, TradeRow, TradeRun, ladder
+from kornia_tidy.tradeoff import TOLERANCES, Conditions, TradeRow, TradeRun, ladder
 
 ROW = TradeRow(
     knob="preset",
@@ -56,5 +56,9 @@ def whole_sweep() -> TradeRun:
             window=setting.value if setting.knob == "window" and setting.value else 61,
         )
         for i, setting in enumerate(ladder())
+    ]
+    rows += [
+        replace(ROW, knob="plan", value=tolerance, rmse=0.6 * tolerance, capture_seconds=0.02 * 4**i)
+        for i, tolerance in enumerate(TOLERANCES)
     ]
     return TradeRun(CONDITIONS, tuple(rows))

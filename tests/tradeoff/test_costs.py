@@ -17,7 +17,15 @@ class TestSeconds(BaseTester):
     def test_feature_median_and_interquartile_range_leave_out_the_first_run(self, monkeypatch):
         clock = iter([0.0, 100.0, 0.0, 1.0, 0.0, 2.0, 0.0, 4.0, 0.0, 7.0, 0.0, 50.0])
         monkeypatch.setattr(costs.time, "perf_counter", lambda: next(clock))
+        monkeypatch.setattr(costs, "LONG", 1e3)
         assert seconds(lambda: None, 5, CPU) == (4.0, 7.0 - 2.0)
+
+    def test_feature_what_takes_long_is_not_repeated(self, monkeypatch):
+        clock = iter([0.0, 0.7, 0.0, 0.6, 0.0, 0.2, 0.0, 9.0])
+        monkeypatch.setattr(costs.time, "perf_counter", lambda: next(clock))
+        monkeypatch.setattr(costs, "LONG", 1.4)
+        assert seconds(lambda: None, 5, CPU) == pytest.approx((0.4, 0.2))
+        assert seconds(lambda: None, 5, CPU) == (9.0, 0.0)
 
     def test_feature_one_repeat_has_no_spread(self):
         timing = seconds(lambda: time.sleep(0.01), 1, CPU)

@@ -29,6 +29,14 @@ class TestDrawTrade(BaseTester):
         stars = axes.collections[0].get_offsets()
         assert len(stars) == sum(row.knob == "preset" for row in run.rows)
 
+    def test_feature_plans_have_a_line_with_the_tolerances_asked(self):
+        run = whole_sweep()
+        figure = draw_trade(run)
+        (line,) = [line for line in figure.axes[0].lines if line.get_label() == "plan, by tolerance"]
+        plans = [row for row in run.rows if row.knob == "plan"]
+        assert sorted(line.get_ydata()) == sorted(row.rmse for row in plans)
+        assert {"1e-1", "1e-3", "1e-6"} <= {text for text, _ in boxes(figure)}
+
     def test_feature_the_front_runs_through_its_rows(self):
         run = whole_sweep()
         (front,) = [line for line in draw_trade(run).axes[0].lines if line.get_label() == "Pareto front"]

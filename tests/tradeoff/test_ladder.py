@@ -36,7 +36,7 @@ class TestLadder(BaseTester):
 
     def test_feature_a_setting_of_ones_own_is_a_base_too(self):
         base = Fidelity("mine", window=21)
-        assert [s.value for s in ladder(base, ["window"])] == [9, 17, 33, 65, 129, 21]
+        assert [s.value for s in ladder(base, ["window"])] == [9, 17, 33, 65, 129, 257, 21]
 
     def test_exception_names_the_knobs(self):
         with pytest.raises(ValueError, match=r"knob must be one of 'preset', 'layers', .* got 'speed'"):
