@@ -22,7 +22,15 @@ from kornia_tidy.optics.spectrum import camera_spectrum
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import next_fast_size
 from kornia_tidy.tradeoff.costs import peak_bytes
-from tests.benchmarks.rendering_against_peers import RENDERERS, in_turn, labels_of, load_scene, make_bank
+from tests.benchmarks.rendering_against_peers import (
+    RENDERERS,
+    ikoma_stack,
+    in_turn,
+    labels_of,
+    load_scene,
+    make_bank,
+    tiled_occlusion,
+)
 from tests.scene.scenes import Bank
 
 MASKS, LAYERS, WINDOW = 5, 21, 23
@@ -181,6 +189,14 @@ def colour_rows(image: Tensor, psi: Tensor) -> Iterator[Row]:
     yield ratio("8", "31 wavelengths, rendering alone", "3 wavelengths", cached, "≤ 1.0")
 
 
+def occlusion_rows(image: Tensor, psi: Tensor) -> Iterator[Row]:
+    bank = make_bank(LAYERS, WINDOW)
+    expected = ikoma_stack(image.double(), psi, bank).float()
+    torch.testing.assert_close(tiled_occlusion(image, psi, bank), expected, rtol=0, atol=2e-5)
+    calls = {"tiled": lambda: tiled_occlusion(image, psi, bank), "stack": lambda: ikoma_stack(image, psi, bank)}
+    yield ratio("9, 12", "occlusion-aware", "Ikoma's equations as a dense FFT stack", calls, "≥ 10")
+
+
 @torch.no_grad()
 def size_rows(image: Tensor, psi: Tensor) -> Iterator[Row]:
     optics = TiDyOptics(camera=DefocusRange(-20, 20), fidelity=Fidelity(window=WINDOW, layers="nearest"))
@@ -217,6 +233,7 @@ ROWS = {
     "6": state_rows,
     "7": depth_rows,
     "8": colour_rows,
+    "9": occlusion_rows,
     "10": size_rows,
 }
 

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.optics import autocorrelation_witness, camera_spectrum, circular_aperture, polygon_aperture
+from kornia_tidy.optics import (
+    CubicMask,
+    FourierMask,
+    GreyLevels,
+    PixelCrosstalk,
+    RadialMask,
+    SpatialLightModulator,
+    SpiralMask,
+    Switching,
+    ZernikeMask,
+    autocorrelation_witness,
+    camera_spectrum,
+    circular_aperture,
+    polygon_aperture,
+)
 
 
 class TestOptics:
@@ -23,6 +38,18 @@ class TestOptics:
 
     def test_fresnel_lens(self, bench):
         bench(FresnelLens, size=0, masks=1, pupil=23)
+
+    @pytest.mark.parametrize("family", [ZernikeMask, RadialMask, SpiralMask, FourierMask, CubicMask])
+    def test_phase_and_gradients(self, bench, device, family):
+        masks = family(size=64).to(device)
+        count = len(masks.phase)
+        bench(lambda: masks.phase.square().sum().backward(), size=0, masks=count, pupil=64)
+
+    @pytest.mark.parametrize("between", ["random", "exponential"])
+    def test_modulator(self, bench, device, between):
+        modulator = SpatialLightModulator(GreyLevels(8), PixelCrosstalk(0.2), Switching(4e-3, between=between))
+        phase = PixelwiseMask(5).phase.detach().to(device)
+        bench(lambda: modulator(phase), size=0, masks=5, pupil=23)
 
     def test_witness(self, bench):
         phase, aperture = PixelwiseMask(5).phase.detach(), circular_aperture(23)
