@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench clean
+.PHONY: help demo test lint bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make lint     style, spelling and types"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
+	@echo "make targets  the figures that rendering is judged by, on a real scene: minutes, on an idle machine"
 	@echo "make clean    removes .venv, outputs and caches"
 	@echo
 	@echo "PYTHON=python3.12 chooses the interpreter (3.11 or newer) for the environment in $(VENV)."
@@ -39,6 +40,10 @@ bench: $(READY)
 		--benchmark-quiet --benchmark-json=outputs/benchmarks.json $(ARGS)
 	@$(BIN)/python -m tests.benchmarks.table outputs/benchmarks.json | tee outputs/benchmarks.md
 	@$(BIN)/python -m pytest -q -s --override-ini addopts= tests/benchmarks/rendering_against_peers.py
+
+# Memory that the C library gives back to the system is dear to fetch again, for every method alike: let it keep it.
+targets: $(READY)
+	@MALLOC_TRIM_THRESHOLD_=2000000000 MALLOC_MMAP_THRESHOLD_=2000000000 $(BIN)/python -m tests.benchmarks.targets
 
 clean:
 	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
