@@ -13,6 +13,7 @@ STARTS = ("noise", "fisher, noise", "fisher, noisy fishers", "3 fishers, 2 noisy
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
 
 # What design_fisher_mask(seed=3) found: radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
+# fmt: off
 FISHER_COEFFICIENTS = (
     -0.0056, 0.2993, -0.2471, 0.7524, 0.0021, -0.0805, 0.0000, 0.0000, 0.0001, 0.0000, 0.0000,
     -0.5963, -0.0003, 0.0623, -0.0001, -0.0001, 0.0000, 0.0000, -0.0001, -0.0001, 0.0000, 0.0142,
@@ -20,6 +21,7 @@ FISHER_COEFFICIENTS = (
     0.0000, -0.0001, 0.0000, 0.0000, -0.0038, 0.0001, -0.0294, 0.0002, 0.0060, -0.0002, 0.0033,
     0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000,
 )
+# fmt: on
 
 
 def fisher_mask(size: int = 23) -> Tensor:
@@ -77,6 +79,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     0.0329, 0.0271 and 0.0207 in this order).
 
     Example:
+        >>> from kornia_tidy.optics import PixelwiseMask
         >>> masks = PixelwiseMask(initial=initial_heights("3 fishers, 2 noisy"))
         >>> masks.phase.shape
         torch.Size([5, 23, 23])
