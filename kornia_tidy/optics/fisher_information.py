@@ -208,7 +208,7 @@ def crlb(
         - The bound is reached where photons are many, and is a lower one for all. Maximum likelihood from 2000 images
           each, at psi = -8, 0 and 8 rad, of :func:`~kornia_tidy.optics.initial_masks.fisher_mask` before a background
           of 5 scattered by 1.01, 0.99 and 1.02 times the bound at 3000 photons, by 0.99, 1.03 and 1.00 times at 1000,
-          and by 1.25, 1.07 and 1.25 times at 200: so few photons tell depth a fifth worse than the bound says.
+          and by 1.25, 1.07 and 1.25 times at 200: so few photons tell depth up to a quarter worse than it says.
 
     Raises:
         ValueError: if there are no photons, or the background is negative or not finite.
