@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.optics import mask_design
 
 # Light that leaves the window is lost, not given back: a PSF is not rewarded for throwing light far away.
 FIDELITY = Fidelity("point", pixel_tolerance=0.1, layer_spacing=5.0, window=23, stray_light="discard")
@@ -55,23 +56,14 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, list[float]]:
 
 def point_error(optics: TiDyOptics) -> Tensor:
     """Return the squared distance between PSF and unit impulse, averaged over depth, at 530 nm."""
-    psfs = optics.psf_bank(channels=1).psfs
-    centre = psfs.shape[-1] // 2
-    return (psfs.square().sum((-2, -1)) - 2 * psfs[..., centre, centre] + 1).mean()
+    return mask_design.point_error(optics.psf_bank(channels=1))
 
 
 def learn(count: int, seed: int, iterations: int, lr_metres: float) -> tuple[TiDyOptics, list[float]]:
-    """Learn one sequence of masks; return the camera and the error after every step."""
+    """Learn one sequence of masks; return the camera and the error before every step."""
     noise = torch.Generator().manual_seed(seed)
     optics = TiDyOptics(PixelwiseMask(count, generator=noise), fidelity=FIDELITY)
-    optimizer = torch.optim.Adam(optics.parameter_groups(lr_metres))
-    history = []
-    for _ in range(iterations):
-        optimizer.zero_grad()
-        error = point_error(optics)
-        error.backward()
-        optimizer.step()
-        history.append(float(error.detach()))
+    history = mask_design.design(optics.masks, lambda: point_error(optics), iterations, lr_metres)
     return optics, history
 
 
@@ -125,7 +117,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--masks", type=int, nargs="+", default=[1, 2, 3, 4, 5], help="numbers K of masks to try")
     parser.add_argument("--trials", type=int, default=3, help="random starts for each K (default: 3)")
     parser.add_argument("--iterations", type=int, default=150, help="gradient steps (default: 150)")
-    parser.add_argument("--lr", type=float, default=2e-8, help="learning rate in metres of height (default: 2e-8)")
+    parser.add_argument("--lr", type=float, default=6e-8, help="learning rate to begin with, in metres (default: 6e-8)")
     parser.add_argument("--output", type=Path, default=Path("outputs/learn_point_psf"), help="folder to write to")
     return parser.parse_args(arguments)
 

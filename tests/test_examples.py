@@ -153,3 +153,13 @@ class TestTimeAverageOrBurst(BaseTester):
         assert single[1] > added[1]
         assert "84% of the light, readouts: 3, pictures stored: 1" in capsys.readouterr().out
         assert picture(tmp_path / "time_average_or_burst.png").float().std() > 20
+
+
+@pytest.mark.parametrize("example", ["design_masks"], indirect=True)
+class TestDesignMasks(BaseTester):
+    def test_feature_each_design_is_the_best_at_its_task(self, example, tmp_path, monkeypatch):
+        monkeypatch.setattr(example, "FIDELITY", example.FIDELITY.replace(window=23, layer_spacing=2.0))
+        scores = example.main(["--limit", "6", "--iterations", "40", "--output", str(tmp_path)])
+        assert min(scores, key=lambda name: scores[name][0]) == "depth design"
+        assert min(scores, key=lambda name: scores[name][1]) == "EDoF design"
+        assert picture(tmp_path / "design_masks.png").float().std() > 20

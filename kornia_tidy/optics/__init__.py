@@ -3,6 +3,7 @@
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera, thin_lens_defocus
 from kornia_tidy.optics.exact import exact_psf_bank
+from kornia_tidy.optics.initial_masks import fisher_mask, initial_heights
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, constant_index
 from kornia_tidy.optics.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
 from kornia_tidy.optics.paper import AliasingWarning, paper_psf_bank
@@ -59,6 +60,8 @@ __all__ = [
     "circular_aperture",
     "constant_index",
     "exact_psf_bank",
+    "fisher_mask",
+    "initial_heights",
     "paper_psf_bank",
     "polygon_aperture",
     "thin_lens_defocus",

@@ -66,10 +66,11 @@ def cell_integrals(
     num_cells: int,
     pitch: float,
     cells: Tensor | None = None,
+    moment: int = 0,
 ) -> Tensor:
     r"""Return the integrals of a defocused plane wave over each cell of the pupil along one axis.
 
-    .. math:: K_{dun} = \int_{x_n - p/2}^{x_n + p/2} \exp(i \psi_d x^2 - 2\pi i u x) \, dx
+    .. math:: K_{dun} = \int_{x_n - p/2}^{x_n + p/2} x^m \exp(i \psi_d x^2 - 2\pi i u x) \, dx
 
     Args:
         defocus: :math:`\psi_d` in radians at the pupil edge, at the wavelength in use.
@@ -78,6 +79,7 @@ def cell_integrals(
         num_cells: cells N along the axis, centred on the optical axis.
         pitch: side p of a cell in pupil radii.
         cells: where to integrate instead, begin and end of each interval in cells from the optical axis, (2, N').
+        moment: m; the first and the second make the slopes of the integrals over frequency and over defocus.
 
     Returns:
         Integrals in pupil radii, (D, U, N) complex128: in float64 because phases reach thousands of radians.
@@ -98,7 +100,7 @@ def cell_integrals(
     x = (centres[:, None] + widths[:, None] * points) * pitch
     psi = torch.tensor(defocus, dtype=torch.float64, device=x.device)
     wave = torch.exp(-2j * math.pi * frequency[:, None, None] * x)
-    lens = torch.exp(1j * psi[:, None, None] * x**2) * (widths[:, None] * weights * pitch)
+    lens = torch.exp(1j * psi[:, None, None] * x**2) * (widths[:, None] * weights * pitch * x**moment)
     return torch.einsum("ung,dng->dun", wave, lens)
 
 
@@ -130,6 +132,7 @@ def sensor_kernels(
     tolerance: float,
     device: torch.device | None = None,
     cells: Tensor | None = None,
+    moment: int = 0,
 ) -> Tensor:
     r"""Return the matrices that take a pupil field to the sensor's pixels, one for each depth.
 
@@ -143,6 +146,7 @@ def sensor_kernels(
         tolerance: error allowed to the integral over a pixel of the finest pattern the pupil can make.
         device: where to put them.
         cells: where to integrate instead of the N cells, see :func:`cell_integrals`.
+        moment: power of the place in the pupil to integrate with, see there.
 
     Returns:
         (D, P, q, N) complex128, weighted so that the sum of \|kernel @ field @ kernel.T\|^2 over the q points of a
@@ -155,7 +159,7 @@ def sensor_kernels(
     pixel = float(step.detach()) if isinstance(step, Tensor) else step
     order = gauss_legendre_order(2 * math.pi * extent * pixel, tolerance)
     frequency = pixel_frequencies(step, window, order, device)
-    integrals = cell_integrals(defocus, frequency, pixel * window / 2, num_cells, pitch, cells)
+    integrals = cell_integrals(defocus, frequency, pixel * window / 2, num_cells, pitch, cells, moment)
     _, weights = gauss_legendre(order, device)
     scale = (weights.sqrt() * step**0.5).repeat(window)  # squared by the intensity, once for each axis
     return (integrals * scale[:, None]).unflatten(1, (window, order))

@@ -18,7 +18,8 @@ class PixelwiseMask(PhaseMasks):
         num_masks: number K of masks shown one after the other during the exposure.
         size: pixels N along a side, or (rows, columns).
         initial: ``"noise"`` (heights uniform on [0, 1.2e-6] m, the paper's start), ``"flat"``, or heights in metres
-            as a (K, N, N) or (N, N) tensor, which then gives ``num_masks`` and ``size``.
+            as a (K, N, N) or (N, N) tensor, which then gives ``num_masks`` and ``size``; the paper's other starts are
+            :func:`~kornia_tidy.optics.initial_masks.initial_heights`.
         material: refractive index of the element. Default: 1.5 at every wavelength, as in the paper.
         generator: source of the noise.
         constraint: see :class:`PhaseMasks`; a sigmoid begins within a thousandth of the range of given heights.

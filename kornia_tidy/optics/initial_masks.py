@@ -1,0 +1,97 @@
+"""What the paper's sequences of masks start from: noise, a mask designed for depth, and mixtures of the two."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.optics.phase_masks import PixelwiseMask, ZernikeMask
+
+STARTS = ("noise", "fisher, noise", "fisher, noisy fishers", "3 fishers, 2 noisy")
+
+NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
+
+# What design_fisher_mask(seed=3) found: radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
+# fmt: off
+FISHER_COEFFICIENTS = (
+    -0.0056, 0.2993, -0.2471, 0.7524, 0.0021, -0.0805, 0.0000, 0.0000, 0.0001, 0.0000, 0.0000,
+    -0.5963, -0.0003, 0.0623, -0.0001, -0.0001, 0.0000, 0.0000, -0.0001, -0.0001, 0.0000, 0.0142,
+    0.0000, 0.1069, -0.0006, -0.0100, 0.0003, -0.0020, 0.0000, 0.0001, 0.0000, 0.0000, 0.0000,
+    0.0000, -0.0001, 0.0000, 0.0000, -0.0038, 0.0001, -0.0294, 0.0002, 0.0060, -0.0002, 0.0033,
+    0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000, 0.0000,
+)
+# fmt: on
+
+
+def fisher_mask(size: int = 23) -> Tensor:
+    """Return a mask designed for depth: the one of :func:`~kornia_tidy.optics.mask_design.design_fisher_mask`, seed 3.
+
+    Args:
+        size: pixels N along a side.
+
+    Returns:
+        Heights in metres for an index of 1.5, (N, N) float64, from 0 to 7.1e-7.
+
+    Convention:
+        - In the published setting it tells defocus to 0.0668 rad on average over -10 to 10 rad; the mask published
+          with PhaseCam3D to 0.0785 rad. See :func:`~kornia_tidy.optics.fisher_information.sampled_response`.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for the idea; the mask is our own.
+
+    Example:
+        >>> fisher_mask().shape, fisher_mask(64).shape
+        (torch.Size([23, 23]), torch.Size([64, 64]))
+    """
+    coefficients = torch.tensor(FISHER_COEFFICIENTS, dtype=torch.float64)
+    mask = ZernikeMask(1, size, len(coefficients), initial=torch.zeros(len(coefficients))).double()
+    with torch.no_grad():
+        mask.coefficients.copy_(coefficients)
+        heights = mask.heights()[0]
+    return heights - heights.min()
+
+
+def initial_heights(start: str, generator: torch.Generator | None = None) -> Tensor:
+    """Return the five masks that a sequence of the paper starts from.
+
+    Args:
+        start: one of the paper's four:
+
+            - ``"noise"``: each uniform on [0, 1.2e-6] m.
+            - ``"fisher, noise"``: the first the Fisher mask, the others such noise.
+            - ``"fisher, noisy fishers"``: Fisher masks turned by a quarter each, all but the first with noise added,
+              normal of mean 5.35e-7 and standard deviation 3.05e-7 m.
+            - ``"3 fishers, 2 noisy"``: the same, with noise on the last two.
+        generator: source of the noise.
+
+    Returns:
+        Heights in metres, (5, 23, 23), for ``PixelwiseMask(initial=...)``.
+
+    Raises:
+        ValueError: if there is no such start.
+
+    Convention:
+        - Quarter turns are exact on the grid, but there are four of them: the fifth mask is the first again, noisy.
+        - The noise's mean only raises a mask, which changes nothing; its numbers are the mean and the standard
+          deviation of PhaseCam3D's published heights.
+
+    Source: Shah et al., TiDy-PSFs (ICCV 2023), the ablation of initial masks, which ranks them for depth (RMSE 0.0254,
+    0.0329, 0.0271 and 0.0207 in this order).
+
+    Example:
+        >>> from kornia_tidy.optics import PixelwiseMask
+        >>> masks = PixelwiseMask(initial=initial_heights("3 fishers, 2 noisy"))
+        >>> masks.phase.shape
+        torch.Size([5, 23, 23])
+    """
+    check_choice("start", start, STARTS)
+    uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(5, 23, 23, generator=generator, dtype=torch.float64)
+    if start == "noise":
+        return uniform
+    fisher = fisher_mask()
+    if start == "fisher, noise":
+        return torch.cat([fisher[None], uniform[1:]])
+    turned = torch.stack([fisher.rot90(quarters) for quarters in range(5)])
+    noise = NOISE_MEAN + NOISE_STD * torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
+    noise[: 1 if start == "fisher, noisy fishers" else 3] = 0
+    return turned + noise
