@@ -153,3 +153,13 @@ class TestTimeAverageOrBurst(BaseTester):
         assert single[1] > added[1]
         assert "84% of the light, readouts: 3, pictures stored: 1" in capsys.readouterr().out
         assert picture(tmp_path / "time_average_or_burst.png").float().std() > 20
+
+
+@pytest.mark.parametrize("example", ["motion_blur"], indirect=True)
+class TestMotionBlur(BaseTester):
+    def test_feature_only_masks_that_change_tell_right_from_left(self, example, tmp_path):
+        few = ["--masks", "3", "--pixels", "8", "--size", "112", "--iterations", "30", "--output", str(tmp_path)]
+        one, random, learnt = (apart for apart, _ in example.main(few).values())
+        assert one < 1e-6
+        assert min(random, learnt) > 1e-3
+        assert picture(tmp_path / "motion_blur.png").float().std() > 20
