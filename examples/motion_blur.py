@@ -77,7 +77,7 @@ def draw(path: Path, rows: Sequence[tuple[str, tuple[Tensor, ...]]]) -> None:
     for axes, (name, pictures) in zip(figure.subplots(len(rows), 4), rows, strict=True):
         titles = ("at rest", "moving right", "moving left", "5 x (right - left)")
         for one, picture, title in zip(axes, pictures, titles, strict=True):
-            one.imshow(picture[0].clamp(0, 1).movedim(0, -1) ** (1 / 2.2))
+            one.imshow((picture[0].clamp(0, 1).movedim(0, -1) ** (1 / 2.2)).numpy())
             one.set(xticks=[], yticks=[], title=title)
         axes[0].set_ylabel(name)
     figure.savefig(path, dpi=110)

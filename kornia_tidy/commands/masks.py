@@ -34,7 +34,8 @@ MATERIALS = {
 DESCRIPTION = """\
 Phase masks, out of the library and back. MASKS is a file of heights in metres
 (.npy, K x rows x columns) or a camera's state_dict (.safetensors, masks.phase
-in radians at 530 nm).
+in radians at 530 nm). A state does not tell a constraint: masks with one, and
+families without a phase, are exported from Python (kornia_tidy.lab).
 """
 
 EXPORT = """\
@@ -53,7 +54,7 @@ examples:
   Frames for a 1920 x 1200 panel, seen through a mirror:
     kornia-tidy masks export camera.safetensors -o slm --flip left-right
 
-  A 10-bit panel with a measured response, masks shown for 20 ms each:
+  A 10-bit panel with a measured response and swaps of 4 ms:
     kornia-tidy masks export heights.npy -o slm --bits 10 --response lut.txt \\
         --exposure 0.1 --switching-time 0.004 --wavelength 532e-9
 
