@@ -54,6 +54,7 @@ def moving_capture(
           ``"occlusion"`` where ``Fidelity.occlusion_states`` is ``"each"``. ``"renormalize"`` scales the PSFs of each
           state to a sum of one, not their average: a state that keeps less light in the window weighs a little more.
         - Light is added in linear light; the sensor sees the sum once.
+        - Eager: torch.compile cannot trace the copies of the camera that look through one state each.
         - Cost: S captures and the PSFs of S states, instead of one of their average: about S times as long, with
           gradients about S / 2 to 2 S / 3 times (measured with 5 and 9 states, 256 pixels, one core).
 
