@@ -1,6 +1,7 @@
 """kornia_tidy: a programmable camera, with masks that change during the exposure, in front of any PyTorch pipeline."""
 
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.motion import moving_capture
 from kornia_tidy.multi_shot import burst
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
@@ -28,4 +29,5 @@ __all__ = [
     "ThinLensCamera",
     "TiDyOptics",
     "burst",
+    "moving_capture",
 ]

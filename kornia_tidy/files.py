@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from uuid import uuid4
 
@@ -43,3 +45,39 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], replace: bool = False) -> None:
+    """Write a folder of files so that nobody ever sees a part of it: under another name beside it, then renamed.
+
+    Args:
+        path: where to; with ``replace`` a folder of this name is replaced as a whole.
+        files: contents by name.
+        replace: whether there may be one.
+
+    Raises:
+        FileExistsError: if there is something of this name that is not to be replaced.
+        FileNotFoundError: if the folder it is to lie in does not exist.
+    """
+    path = Path(path).absolute()
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.exists() and not (replace and path.is_dir()):
+        raise FileExistsError(f"cannot write {path}: it exists")
+    new, old = (path.with_name(f".{uuid4().hex}.tmp") for _ in range(2))
+    try:
+        new.mkdir()
+        for name, data in files.items():
+            (new / name).write_bytes(data)
+        if path.exists():
+            path.rename(old)
+        try:
+            new.rename(path)
+        except OSError:
+            if old.exists():
+                old.rename(path)
+            raise
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        if path.exists():
+            shutil.rmtree(old, ignore_errors=True)

@@ -91,23 +91,12 @@ def burst(
     light = optics.decode(image)
     shots = []
     for k, share in enumerate(burst_shares(_dwell_shares(optics), dead_time, exposure)):
-        shot = _through_mask(optics, k)(light, depth) * share.to(light)
+        one = linear_through_state(optics, k)
+        one.check_inputs = optics.check_inputs and k == 0  # say once what is wrong
+        shot = one(light, depth) * share.to(light)
         shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1)
     return stack if batched else stack[0]
-
-
-class _OneMask(nn.Module):
-    """A modulator that shows one mask of another's for the whole exposure."""
-
-    def __init__(self, modulator: nn.Module, index: int) -> None:
-        super().__init__()
-        self.modulator, self.index = modulator, index
-        self.fill_factor = getattr(modulator, "fill_factor", 1.0)
-
-    def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
-        states, _ = self.modulator(phase)
-        return states[self.index : self.index + 1], phase.new_ones(1)
 
 
 def _dwell_shares(optics: TiDyOptics) -> Tensor:
@@ -120,12 +109,10 @@ def _dwell_shares(optics: TiDyOptics) -> Tensor:
     return shown / shown.sum()
 
 
-def _through_mask(optics: TiDyOptics, index: int) -> TiDyOptics:
-    """Return the camera with one of its masks, in linear light and without noise; the parts are shared."""
-    one = optics.with_fidelity(optics.fidelity.replace(window=optics.window))
-    one.modulator = _OneMask(optics.modulator, index)
+def linear_through_state(optics: TiDyOptics, state: int) -> TiDyOptics:
+    """Return the camera with one of its states shown all the time, in linear light and without noise."""
+    one = optics.through_state(state)
     one.sensor, one.color_space = None, "linear"
-    one.check_inputs = optics.check_inputs and index == 0  # say once what is wrong
     return one
 
 

@@ -163,3 +163,13 @@ class TestDesignMasks(BaseTester):
         assert min(scores, key=lambda name: scores[name][0]) == "depth design"
         assert min(scores, key=lambda name: scores[name][1]) == "EDoF design"
         assert picture(tmp_path / "design_masks.png").float().std() > 20
+
+
+@pytest.mark.parametrize("example", ["motion_blur"], indirect=True)
+class TestMotionBlur(BaseTester):
+    def test_feature_only_masks_that_change_tell_right_from_left(self, example, tmp_path):
+        few = ["--masks", "3", "--pixels", "8", "--size", "112", "--iterations", "30", "--output", str(tmp_path)]
+        one, random, learnt = (apart for apart, _ in example.main(few).values())
+        assert one < 1e-6
+        assert min(random, learnt) > 1e-3
+        assert picture(tmp_path / "motion_blur.png").float().std() > 20

@@ -51,6 +51,8 @@ class CodedLens(nn.Module):
         torch.Size([2, 3])
     """
 
+    _state: int | None = None  # the one state looked through, if not all
+
     def __init__(
         self,
         masks: PhaseMasks | None = None,
@@ -123,7 +125,7 @@ class CodedLens(nn.Module):
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
-        return self.modulator(self.masks.phase.to(dtype))[1]
+        return self._states(dtype)[1]
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
@@ -138,10 +140,36 @@ class CodedLens(nn.Module):
         Args:
             fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
         """
+        other = self._sharing_parts()
+        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        return other
+
+    def through_state(self, state: int) -> Self:
+        """Return this lens with one state of its modulator shown all the time. The parts and the window are shared.
+
+        Args:
+            state: index among the states that the modulator shows.
+
+        Raises:
+            ValueError: if there is no such state.
+
+        Example:
+            >>> lens = CodedLens()
+            >>> one, every = lens.through_state(2).psf_bank(defocus=[0.0]), lens.psf_bank(defocus=[0.0], states=True)
+            >>> torch.equal(one.psfs, every.psfs[2])
+            True
+        """
+        count = len(self.state_weights(torch.float32))
+        if not 0 <= state < count:
+            raise ValueError(f"state must be from 0 to {count - 1}, got {state}")
+        other, window = self._sharing_parts(), self.window
+        other.__dict__.update(_state=state, _window=window, _memories=self._memories)  # PSFs remembered by both
+        return other
+
+    def _sharing_parts(self) -> Self:
         other = copy.copy(self)
         for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
             other.__dict__[kind] = dict(self.__dict__[kind])
-        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
         return other
 
     # ------------------------------------------------------------------ the window of the PSFs
@@ -227,6 +255,8 @@ class CodedLens(nn.Module):
     def _states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """What the modulator shows over the pupil, and for what share of the exposure."""
         states, weights = self.modulator(self.masks.phase.to(dtype))
+        if self._state is not None:
+            states, weights = states[self._state : self._state + 1], torch.ones_like(weights[:1])
         return central_square(states), weights
 
     @property
@@ -279,7 +309,9 @@ class CodedLens(nn.Module):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
-        return self._memories[state].recall(setting, states, weights, nodes, build)
+        return self._memories[state if self._state is None else self._state].recall(
+            setting, states, weights, nodes, build
+        )
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.

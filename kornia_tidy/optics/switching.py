@@ -118,6 +118,30 @@ class Switching(nn.Module):
         weights = (times[:, None] * swap).expand(-1, swaps).flatten()
         return torch.cat([masks, between]), torch.cat([shares * max(0.0, 1 - swaps * swap), weights])
 
+    def middle_times(self, phase: Tensor) -> Tensor:
+        """Return when each state is shown, as a share of the exposure: its middle. The states are not in this order.
+
+        Args:
+            phase: (K, N, N), as for :meth:`forward`.
+
+        Returns:
+            (S',), in the order of the states.
+
+        Example:
+            >>> Switching(20e-3)(torch.zeros(3, 5, 5))[1], Switching(20e-3).middle_times(torch.zeros(3, 5, 5))
+            (tensor([0.2000, 0.2000, 0.2000, 0.2000, 0.2000]), tensor([0.1000, 0.5000, 0.9000, 0.3000, 0.7000]))
+        """
+        weights = self(phase)[1]
+        masks = len(phase)
+        swap = self.switching_time / self.exposure
+        ends = weights[:masks].cumsum(0) + swap * torch.arange(masks).to(weights)
+        swaps = masks if self.cyclic and masks > 1 else masks - 1
+        inside = [0.5]
+        if self.between != "random":
+            inside = (gauss_legendre(self.samples)[0] + 0.5).tolist()
+        between = [ends[:swaps] + share * swap for share in inside] if len(weights) > masks else []
+        return torch.cat([ends - weights[:masks] / 2, *between])
+
     def extra_repr(self) -> str:
         """Describe the swaps in a person's words."""
         between = self.between if isinstance(self.between, str) else f"measured ({len(self.between)} samples)"

@@ -1,0 +1,312 @@
+"""`kornia-tidy masks`: masks to the panel of a modulator or to a printer, and back."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.commands.report import tell
+from kornia_tidy.files import read_bytes
+from kornia_tidy.lab.frame_files import SUFFIXES, check_replaceable, read_slm_frames, write_slm_frames
+from kornia_tidy.lab.mask_files import read_dwell_shares, read_heights, write_heights
+from kornia_tidy.lab.placement import FLIPS, ROTATIONS, PanelPlacement
+from kornia_tidy.lab.printing import write_stl
+from kornia_tidy.lab.slm_frames import SLMFrames
+from kornia_tidy.lab.timing import frame_times
+from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, constant_index
+from kornia_tidy.optics.phase_panel import GreyLevels
+
+MATERIALS = {
+    "constant": constant_index(1.5),
+    "fused-silica": FUSED_SILICA,
+    "pmma": PMMA,
+    "pdms": PDMS,
+    "noa61": NOA61,
+}
+
+DESCRIPTION = """\
+Phase masks, out of the library and back. MASKS is a file of heights in metres
+(.npy, K x rows x columns) or a camera's state_dict (.safetensors, masks.phase
+in radians at 530 nm). A state does not tell a constraint: masks with one, and
+families without a phase, are exported from Python (kornia_tidy.lab).
+"""
+
+EXPORT = """\
+Write masks for the laboratory, by the name of OUT:
+  a folder  one frame a mask for the panel of a phase modulator (PNG or TIFF),
+            timing.csv, and frames.json with all that is needed to read them
+            back; up to 8 bits in 8-bit files, 9 and 10 in the least
+            significant bits of 16-bit files
+  x.npy     heights in metres
+  x.stl     one mask on a plate, in millimetres
+All of it is written or nothing, and frames are read back and compared.
+"""
+
+EXPORT_EXAMPLES = """\
+examples:
+  Frames for a 1920 x 1200 panel, seen through a mirror:
+    kornia-tidy masks export camera.safetensors -o slm --flip left-right
+
+  A 10-bit panel with a measured response and swaps of 4 ms:
+    kornia-tidy masks export heights.npy -o slm --bits 10 --response lut.txt \\
+        --exposure 0.1 --switching-time 0.004 --wavelength 532e-9
+
+  The second mask for a printer, over a pupil of 4 mm:
+    kornia-tidy masks export heights.npy -o mask.stl --mask 1 --pupil-radius 2e-3
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the command to argparse."""
+    masks = subparsers.add_parser(
+        "masks",
+        help="masks -> SLM frames, heights, STL; and back",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = masks.add_subparsers(required=True, metavar="ACTION", title="actions")
+
+    show = actions.add_parser("show", help="say what masks a file holds", description="Say what masks a file holds.")
+    _add_masks(show)
+    show.set_defaults(run=show_masks)
+
+    export = actions.add_parser(
+        "export",
+        help="write SLM frames, heights or STL",
+        description=EXPORT,
+        epilog=EXPORT_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_masks(export)
+    export.add_argument("-o", "--output", required=True, metavar="OUT", help="a folder, x.npy or x.stl")
+    export.add_argument("--force", action="store_true", help="replace what was written before")
+    export.add_argument(
+        "--pupil-radius",
+        type=float,
+        metavar="M",
+        help="of the pupil, on the panel or the plate, metres; 2.3 of it span the mask (default on a panel: the "
+        "largest that fits with whole panel pixels a mask pixel)",
+    )
+    _add_panel(export)
+    _add_timing(export)
+    plate = export.add_argument_group("plate (STL)")
+    plate.add_argument("--mask", type=int, metavar="K", help="which mask, from 0 (needed if there are several)")
+    plate.add_argument("--base", type=float, default=1e-3, metavar="M", help="thickness in metres (default: 1e-3)")
+    export.set_defaults(run=export_masks)
+
+    back = actions.add_parser(
+        "import",
+        help="read SLM frames back and check them",
+        description="Read a folder of SLM frames back, check every pixel; write the masks' heights if OUT is given.",
+    )
+    back.add_argument("frames", metavar="FOLDER", help="folder that export wrote")
+    back.add_argument("-o", "--output", metavar="OUT", help="x.npy (metres) or x.safetensors (masks.phase)")
+    back.add_argument(
+        "--shown",
+        action="store_true",
+        help="heights as the panel shows them, without the whole waves that it cannot (default: with them)",
+    )
+    _add_material(back)
+    back.add_argument("--force", action="store_true", help="replace OUT")
+    back.set_defaults(run=import_masks)
+
+
+def show_masks(args: argparse.Namespace) -> None:
+    """Say what masks a file holds."""
+    heights = read_heights(args.masks, MATERIALS[args.material])
+    tell("masks", _in_words(heights))
+    for k, one in enumerate(heights):
+        low, high = one.aminmax()
+        tell(
+            f"mask {k}",
+            f"{float(low) * 1e9:.1f} to {float(high) * 1e9:.1f} nm, RMS {float(one.std(correction=0)) * 1e9:.1f} nm",
+        )
+    if (shares := read_dwell_shares(args.masks)) is not None:
+        tell("dwell", " ".join(f"{share:.4f}" for share in shares))
+
+
+def export_masks(args: argparse.Namespace) -> None:
+    """Write SLM frames, heights or STL."""
+    kind = Path(args.output).suffix.lower()
+    check_choice("the suffix of what to write", kind, ("", ".npy", ".stl"))
+    _check_absent(args.output, args.force, args.masks, folder=not kind)
+    material = MATERIALS[args.material]
+    heights = read_heights(args.masks, material)
+    tell("masks", _in_words(heights))
+    if kind == ".npy":
+        write_heights(args.output, heights)
+    elif kind == ".stl":
+        _export_stl(args, heights)
+    else:
+        _export_frames(args, heights)
+    tell("wrote", args.output)
+
+
+def import_masks(args: argparse.Namespace) -> None:
+    """Read SLM frames back."""
+    if args.output is not None:
+        check_choice("the suffix of what to write", Path(args.output).suffix.lower(), (".npy", ".safetensors"))
+        _check_absent(args.output, args.force)
+    frames = read_slm_frames(args.frames)
+    heights = frames.heights_shown() if args.shown else frames.heights()
+    tell("masks", _in_words(heights))
+    tell("frames", _frames_in_words(frames))
+    if args.output is not None:
+        write_heights(args.output, heights, MATERIALS[args.material])
+        tell("wrote", args.output)
+
+
+def _export_frames(args: argparse.Namespace, heights: Tensor) -> None:
+    response = None if args.response is None else _numbers(args.response)
+    panel = GreyLevels(args.bits, args.phase_range, response)
+    placement = PanelPlacement(
+        (args.panel[1], args.panel[0]),
+        args.panel_pitch,
+        args.pupil_radius,
+        tuple(args.offset),
+        args.flip,
+        args.rotate,
+    )
+    shares = args.dwell or read_dwell_shares(args.masks) or [1.0] * len(heights)
+    if len(shares) != len(heights):
+        raise ValueError(f"there are {len(shares)} dwell shares for {len(heights)} masks")
+    times = frame_times(shares, args.exposure, args.switching_time, args.cyclic)
+    frames = SLMFrames.of(heights, panel, args.wavelength, MATERIALS[args.material])
+    write_slm_frames(args.output, frames, placement, times, args.suffix, replace=args.force)
+    size = (heights.shape[1], heights.shape[2])
+    scale = placement.scale(size)
+    uneven = "" if scale == round(scale) else ", so that blocks differ by one"
+    tell("panel", f"{args.panel[0]} x {args.panel[1]} px, {scale:.6g} a mask pixel{uneven}")
+    tell("pupil", f"radius {placement.radius(size) * 1e3:.4g} mm on the panel")
+    tell("frames", _frames_in_words(frames))
+    back = read_slm_frames(args.output).heights()
+    error, bound = float((back - heights).abs().max()), frames.largest_error() / frames.radians_per_metre
+    tell("check", f"read back, heights differ by up to {error * 1e9:.3g} nm, {bound * 1e9:.3g} nm allowed")
+    if error > bound * (1 + 1e-9):
+        raise ValueError(f"{args.output} does not hold the masks: heights differ by {error:g} m")
+
+
+def _export_stl(args: argparse.Namespace, heights: Tensor) -> None:
+    if args.pupil_radius is None:
+        raise ValueError("an STL file needs --pupil-radius, the metres of which 2.3 span the mask")
+    index = 0 if args.mask is None and len(heights) == 1 else args.mask
+    if index is None or not 0 <= index < len(heights):
+        raise ValueError(f"an STL file holds one mask: --mask must be from 0 to {len(heights) - 1}, got {args.mask}")
+    write_stl(args.output, heights[index], args.pupil_radius, args.base)
+
+
+def _add_masks(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("masks", metavar="MASKS", help="heights (.npy) or a state_dict (.safetensors)")
+    _add_material(parser)
+
+
+def _add_material(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--material",
+        choices=tuple(MATERIALS),
+        default="constant",
+        help="what turns height into phase (default: constant, index 1.5 at every wavelength)",
+    )
+
+
+def _add_panel(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("panel (frames)")
+    group.add_argument("--bits", type=int, default=8, metavar="B", help="of a grey level, 1 to 10 (default: 8)")
+    group.add_argument(
+        "--wavelength", type=float, default=530e-9, metavar="M", help="the panel's working wavelength (default: 530e-9)"
+    )
+    group.add_argument(
+        "--phase-range",
+        type=float,
+        default=2 * math.pi,
+        metavar="RAD",
+        help="phase at that wavelength that the levels span (default: 2 pi)",
+    )
+    group.add_argument(
+        "--response",
+        metavar="FILE",
+        help="instead: its measured phases at that wavelength, radians over evenly spaced levels, as text",
+    )
+    group.add_argument(
+        "--panel", type=_panel_size, default=(1920, 1200), metavar="WxH", help="its pixels (default: 1920x1200)"
+    )
+    group.add_argument("--panel-pitch", type=float, default=8e-6, metavar="M", help="between them (default: 8e-6)")
+    group.add_argument(
+        "--offset",
+        type=int,
+        nargs=2,
+        default=(0, 0),
+        metavar=("RIGHT", "DOWN"),
+        help="of the mask's centre from the panel's, panel pixels",
+    )
+    group.add_argument("--flip", choices=FLIPS, default="none", help="mirror the mask first (default: none)")
+    group.add_argument(
+        "--rotate", type=int, choices=ROTATIONS, default=0, help="then turn it counter-clockwise, degrees (default: 0)"
+    )
+    group.add_argument("--suffix", choices=SUFFIXES, default=".png", help="kind of files (default: .png)")
+
+
+def _add_timing(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("timing (frames)")
+    group.add_argument("--exposure", type=float, default=0.1, metavar="S", help="seconds (default: 0.1)")
+    group.add_argument("--switching-time", type=float, default=0.0, metavar="S", help="of a swap (default: 0)")
+    group.add_argument(
+        "--dwell", type=float, nargs="+", metavar="SHARE", help="of each mask (default: as learnt, or equal)"
+    )
+    group.add_argument("--cyclic", action="store_true", help="the swap back to the first falls into the exposure too")
+
+
+def _panel_size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"a panel is WIDTHxHEIGHT in pixels, such as 1920x1200, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def _numbers(path: str) -> list[float]:
+    """Return the numbers of a text file, whatever separates them."""
+    try:
+        return [float(word) for word in re.split(r"[\s,;]+", read_bytes(path).decode()) if word]
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: a response is phases in radians as text ({error})") from None
+
+
+def _check_absent(path: str, force: bool, source: str | None = None, folder: bool = False) -> None:
+    """Refuse what may not be replaced, before any work.
+
+    Raises:
+        FileExistsError: if it is there and not to be replaced.
+        FileNotFoundError: if the folder it is to lie in does not exist.
+    """
+    target = Path(path)
+    if not target.absolute().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {target.parent}")
+    if source is not None and target.exists() and Path(source).exists() and target.samefile(source):
+        raise FileExistsError(f"cannot write {path}: it is the input")
+    if target.exists() and not force:
+        raise FileExistsError(f"cannot write {path}: it exists, and --force was not given")
+    if folder:
+        check_replaceable(path, force)
+
+
+def _in_words(heights: Tensor) -> str:
+    count, rows, columns = heights.shape
+    low, high = torch.aminmax(heights)
+    return f"{count} of {rows}x{columns} pixels, heights {float(low) * 1e9:.1f} to {float(high) * 1e9:.1f} nm"
+
+
+def _frames_in_words(frames: SLMFrames) -> str:
+    phases = frames.level_phases
+    beyond = float((frames.turns != 0).double().mean())
+    wrapped = f", {beyond:.1%} of the pixels wrapped by whole waves" if beyond else ""
+    return (
+        f"{len(frames.grey)} of {frames.bits} bits, {float(phases.min()):.3f} to {float(phases.max()):.3f} rad at "
+        f"{frames.wavelength * 1e9:g} nm{wrapped}"
+    )
