@@ -95,34 +95,36 @@ def run(args: argparse.Namespace) -> None:
         for system in progress:
             progress.set_postfix_str(system.name)
             with stages("cameras"):
-                optics = TiDyOptics.from_preset(system.name, generator=torch.Generator().manual_seed(args.seed))
+                camera = system.camera()
+                masks = torch.Generator().manual_seed(args.seed)
+                optics = TiDyOptics.from_preset(system.name, generator=masks, camera=camera)
             with stages("surveys"):
                 seen = survey(optics)
             with stages("captures"):
                 generator = torch.Generator().manual_seed(args.seed)
-                capture = optics(image, stretched_depth(nearness, optics.camera), generator=generator)
+                capture = optics(image, stretched_depth(nearness, camera), generator=generator)
             portraits.append(Portrait(system, optics, seen, capture))
         with stages("picture"):
             picture = BytesIO()
             suffix = Path(args.output).suffix[1:]
             draw_systems(portraits, image, nearness, scene).savefig(picture, dpi=DOTS_PER_INCH, format=suffix)
-    print("\n".join(table([(portrait.system, portrait.optics.camera) for portrait in portraits])))
+    print("\n".join(table([portrait.system for portrait in portraits])))
     print()
     write_bytes(args.output, picture.getvalue())
     tell("wrote", f"{args.output}: look at it")
     tell("time", stages.summary())
 
 
-def table(systems: list[tuple[System, Any]]) -> list[str]:
+def table(systems: list[System]) -> list[str]:
     """Return the systems as lines of aligned columns, the headings first.
 
     Example:
-        >>> system = published_system("ikoma2021")
-        >>> print(table([(system, system.camera())])[1][:68])
+        >>> print(table([published_system("ikoma2021")])[1][:68])
         ikoma2021  50 mm f/6.3, focus 1.7 m  radial profile, 61 radii, noise
     """
     rows = [HEADINGS]
-    for system, camera in systems:
+    for system in systems:
+        camera = system.camera()
         (near, far), (lo, hi) = camera.depth_range, camera.defocus_range
         rows.append(
             (

@@ -100,7 +100,7 @@ def cauchy_through(name: str, source: str, indices: tuple[tuple[float, float], .
     Example:
         >>> glass = cauchy_through("glass", "a data sheet", ((450e-9, 1.53), (650e-9, 1.51)))
         >>> round(glass.index(450e-9), 6), round(glass.index(550e-9), 4)
-        (1.53, 1.5177)
+        (1.53, 1.5173)
     """
     waves = [wavelength * 1e6 for wavelength, _ in indices]
     if len(indices) < 2 or len(set(waves)) < len(waves):

@@ -1,8 +1,8 @@
 """Nine published optical systems as plain tables: lens, mask, colours, compositing, noise, and where each was read.
 
 What could not be read anywhere is a guess, and its entry in :attr:`System.sources` begins with that word. Learnt masks
-are not shipped: most have no licence, and a mask is the user's to learn. Each system starts where its paper starts; where
-that is a flat mask, which is only the lens, it starts from what the system is known for, and says so.
+are not shipped: most have no licence, and a mask is the user's to learn. Each system starts where its paper starts.
+Where that is a flat mask, which is only the lens, most start from what the system is known for, and say so.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from kornia_tidy.optics.phase_masks import (
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.sensor.noise import SensorNoise
 
+RGB = Spectrum.rgb()
 GUESS = "guess"
 """How the source of a value begins that stands in no text or code that could be read."""
 
@@ -71,7 +72,7 @@ class System:
     camera: Callable[[], ThinLensCamera]
     masks: Callable[[torch.Generator | None], PhaseMasks]
     sources: Mapping[str, str]
-    spectrum: Spectrum = Spectrum.rgb()
+    spectrum: Spectrum = RGB
     compositing: str = "gather"
     sigma: float = 0.01
     modulator: Callable[[], nn.Module] = DwellTimes
@@ -233,8 +234,8 @@ FISHER_ZERNIKES = (
 """Zernike coefficients in radians rms of a mask designed for depth, in the order of OSA/ANSI.
 
 Found by 250 steps of Adam (rate 0.05, no tilt, the best of 4 random starts) on the bound on defocus, averaged over 11
-depths from psi = -10 to 10 rad, of a point in an unknown place with 3000 photons a channel on a background of 5 a pixel,
-through PhaseCam3D's lens here: 0.0353 rad. See Shechtman et al., Physical Review Letters 113, 133902 (2014).
+depths from psi = -10 to 10 rad, of a point in an unknown place with 3000 photons a channel on a background of 5 a
+pixel, through PhaseCam3D's lens here: 0.0353 rad. See Shechtman et al., Physical Review Letters 113, 133902 (2014).
 """
 
 CUBIC = 27.0
@@ -338,7 +339,7 @@ _ALL = (
             "masks": "a radial profile: code, of 400 radii; 61 here, which 138 pixels across resolve",
             "start": "guess: noise at 13 radii; the code starts flat",
         },
-        spectrum=Spectrum((632e-9, 550e-9, 450e-9), Spectrum.rgb().weights),
+        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
         compositing="occlusion",
         sigma=0.003,
         modulator=lambda: DiffractionEfficiency(0.7),
@@ -380,7 +381,7 @@ _ALL = (
             "masks": "a pixel-wise height map: TiDy-PSFs, results",
             "size": "guess: 23 x 23 pixels",
         },
-        spectrum=Spectrum((632e-9, 550e-9, 450e-9), Spectrum.rgb().weights),
+        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
         compositing="occlusion",
         sigma=0.003,
     ),
@@ -399,7 +400,7 @@ _ALL = (
             "PSF turns less than once",
             "start": "guess: charges 1 to 13",
         },
-        spectrum=Spectrum((632e-9, 550e-9, 450e-9), Spectrum.rgb().weights),
+        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
         compositing="occlusion",
         sigma=0.003,
     ),
@@ -424,7 +425,7 @@ _ALL = (
             "masks": "350 Zernikes: code",
             "start": "guess: a cubic, the classic of extended depth of field; the code starts flat",
         },
-        spectrum=Spectrum((640e-9, 550e-9, 460e-9), Spectrum.rgb().weights),
+        spectrum=Spectrum((640e-9, 550e-9, 460e-9), RGB.weights),
         sigma=0.0105,
     ),
 )

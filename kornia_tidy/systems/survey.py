@@ -38,7 +38,7 @@ def survey(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> Survey:
         frequencies: number F of spatial frequencies.
 
     Example:
-        >>> from kornia_tidy.optics import CodedLens, PixelwiseMask
+        >>> from kornia_tidy.optics import PixelwiseMask
         >>> seen = survey(CodedLens(PixelwiseMask(1, initial="flat")), nodes=5)
         >>> int(seen.contrast.mean((1, 2)).argmax())  # a plain lens is sharpest in the middle, in focus
         2
@@ -71,9 +71,9 @@ def contrast_transfer(psfs: Tensor, frequencies: int = 32) -> Tensor:
         tensor([[1., 1., 1., 1.]])
     """
     size = max(128, 2 * psfs.shape[-1])
-    spectrum = torch.fft.rfft2(psfs, s=(size, size)).abs()
-    y, x = torch.fft.fftfreq(size)[:, None], torch.fft.rfftfreq(size)
-    ring = (torch.hypot(y, x) * 2 * frequencies).long().flatten()
+    spectrum = torch.fft.fft2(psfs, s=(size, size)).abs()
+    frequency = torch.fft.fftfreq(size, dtype=torch.float64)
+    ring = (torch.hypot(frequency[:, None], frequency) * 2 * frequencies).long().flatten()
     seen = (ring < frequencies).nonzero()[:, 0].to(psfs.device)
     ring = ring.to(psfs.device)[seen]
     count = torch.bincount(ring, minlength=frequencies)
@@ -97,7 +97,7 @@ def depth_bound(lens: CodedLens, defocus: list[float]) -> Tensor:
     Source: Shechtman et al., Physical Review Letters 113, 133902 (2014), with x and y known.
 
     Example:
-        >>> from kornia_tidy.optics import CodedLens, PixelwiseMask
+        >>> from kornia_tidy.optics import PixelwiseMask
         >>> bound = depth_bound(CodedLens(PixelwiseMask(1, initial="flat")), [-8.0, 0.0, 8.0])
         >>> bool(bound[1] > 10 * bound[0])  # in focus, a plain lens does not tell which way the point moves
         True
