@@ -122,7 +122,7 @@ def _head(figure: Figure, height: float, image: Tensor, nearness: Tensor, scene:
         _text(figure, LEFT, height - 0.72 - 0.17 * line, words, LABEL + 1, color=FAINT)
     y = height - HEAD + 0.34
     headings = (
-        (LEFT, "System", "before training; guessed where neither text nor code says"),
+        (LEFT, "System", "what no text or code says is guessed"),
         (MASK_X, "Mask", "phase, 0 to 2π"),
         (PSF_X, "Point spread functions over depth", "near to far, evenly spaced in dioptres"),
         (CONTRAST_X, "Contrast (MTF)", "of red, green and blue; to ½ cycle a pixel"),
@@ -151,7 +151,7 @@ def _words(figure: Figure, y: float, portrait: Portrait) -> None:
     pixels = f"{camera.pixel_pitch * 1e6:.3g} µm pixels"
     _text(figure, LEFT, y + 0.85, system.title, TITLE + 1, weight="bold")
     lines = [
-        (textwrap.shorten(system.paper.split(": ")[1], 50, placeholder=" …"), FAINT),
+        (f"{system.year}: {textwrap.shorten(system.paper.split(': ')[1], 42, placeholder=' …')}", FAINT),
         (f"{lens} {aperture}, {pixels}, {system.compositing}", INK),
         *((words, ACCENT) for words in textwrap.wrap(system.known_for, 47)[:2]),
     ]

@@ -8,6 +8,7 @@ Where that is a flat mask, which is only the lens, most start from what the syst
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -82,6 +83,11 @@ class System:
     def guesses(self) -> tuple[str, ...]:
         """Names of the values that are guesses."""
         return tuple(name for name, source in self.sources.items() if source.startswith(GUESS))
+
+    @property
+    def year(self) -> int:
+        """Year of publication."""
+        return int(re.findall(r"\b20\d\d\b", self.paper)[-1])
 
     def parts(self, generator: torch.Generator | None = None, **overrides: Any) -> dict[str, Any]:
         """Return the arguments that make a camera of the system.

@@ -335,3 +335,4 @@ class TestFromPreset(BaseTester):
     def test_smoke_a_system_is_found_by_its_name(self):
         assert all(published_system(name).name == name for name in NAMES)
         assert len(NAMES) == 9
+        assert [SYSTEMS[name].year for name in NAMES] == [2023, 2023, 2023, 2019, 2021, 2019, 2022, 2022, 2018]
