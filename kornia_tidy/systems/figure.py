@@ -15,8 +15,8 @@ from torch import Tensor
 from kornia_tidy.figures import ACCENT, DEPTH_COLORS, FAINT, INK, PHASE_COLORS, depth_at, require_matplotlib
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.phase_masks import central_square
-from kornia_tidy.systems.presets import System
 from kornia_tidy.systems.survey import Survey
+from kornia_tidy.systems.system import System
 from kornia_tidy.tidy_optics import TiDyOptics
 
 if TYPE_CHECKING:
