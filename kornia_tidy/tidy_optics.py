@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
@@ -24,6 +24,7 @@ from kornia_tidy.scene.bands import padded_band
 from kornia_tidy.scene.compositing import COMPOSITING, render
 from kornia_tidy.scene.convolution import BORDERS, check_border
 from kornia_tidy.sensor.noise import STRIP, SensorNoise
+from kornia_tidy.systems import published_system
 
 if TYPE_CHECKING:
     from kornia_tidy.render_plan import RenderPlan
@@ -132,6 +133,36 @@ class TiDyOptics(CodedLens):
         self.memory_budget = memory_budget
         self._clamped: Tensor | None = None
         self._warned = False
+
+    @classmethod
+    def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
+        """Return a published optical system, its masks as they are before training.
+
+        Args:
+            name: one of ``tidy-5``, ``tidy-1``, ``fresnel``, ``phasecam3d``, ``ikoma2021``, ``chang2019``,
+                ``liu2022-pixelwise``, ``liu2022-spiral`` and ``sitzmann2018``. What each is, and where every value of
+                it was read or guessed, stands in :data:`kornia_tidy.systems.SYSTEMS`.
+            generator: source of the noise that masks start from, where they do. Default: the global generator.
+            overrides: arguments of the class that replace the system's, such as ``fidelity``, ``sensor`` or ``camera``.
+
+        Raises:
+            ValueError: if there is no system of this name, or an override contradicts another argument.
+            TypeError: if an override is no argument of the class.
+
+        Convention:
+            - The fidelity is ``"balanced"``, which samples honestly. ``from_preset("tidy-5", fidelity="paper")`` is the
+              published system with its discretisation; its data, a normalised disparity, go with
+              ``camera=DefocusRange(-20, 20)``.
+
+        Example:
+            >>> optics = TiDyOptics.from_preset("tidy-5", generator=torch.Generator().manual_seed(0))
+            >>> optics.masks.phase.shape, [round(psi, 6) for psi in optics.defocus_nodes[::10]]
+            (torch.Size([5, 23, 23]), [-20.0, 0.0, 20.0])
+            >>> optics = TiDyOptics.from_preset("ikoma2021", sensor=None)
+            >>> optics.compositing, optics.sensor
+            ('occlusion', None)
+        """
+        return cls(**published_system(name).parts(generator, **overrides))
 
     # ------------------------------------------------------------------ the camera at work
 

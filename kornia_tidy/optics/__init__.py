@@ -4,8 +4,8 @@ from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, pol
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera, thin_lens_defocus
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.initial_masks import fisher_mask, initial_heights
-from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, constant_index
-from kornia_tidy.optics.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
+from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, cauchy_through, constant_index
+from kornia_tidy.optics.modulator import DiffractionEfficiency, DwellTimes, LearnableDwellTimes, SpatialLightModulator
 from kornia_tidy.optics.paper import AliasingWarning, paper_psf_bank
 from kornia_tidy.optics.phase_masks import (
     CubicMask,
@@ -34,6 +34,7 @@ __all__ = [
     "AliasingWarning",
     "CubicMask",
     "DefocusRange",
+    "DiffractionEfficiency",
     "DwellTimes",
     "FourierMask",
     "FresnelLens",
@@ -57,6 +58,7 @@ __all__ = [
     "annular_aperture",
     "autocorrelation_witness",
     "camera_spectrum",
+    "cauchy_through",
     "circular_aperture",
     "constant_index",
     "exact_psf_bank",

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from kornia_tidy.checks import check_positive
 
 Terms = tuple[tuple[float, float], ...]
@@ -78,6 +80,35 @@ def constant_index(index: float) -> Material:
     if not 1 < index < math.inf:
         raise ValueError(f"index must be finite and above 1, got {index}")
     return Material(f"constant index {index:g}", "by definition", _power_series, ((float(index), 0),))
+
+
+def cauchy_through(name: str, source: str, indices: tuple[tuple[float, float], ...]) -> Material:
+    r"""Return the material whose dispersion is Cauchy's equation through known indices.
+
+    .. math:: n(\lambda) = \sum_j c_j \, \lambda^{-2j}, \qquad \text{as many terms as there are indices}
+
+    Args:
+        name: what the material is called.
+        source: who measured or used the indices.
+        indices: pairs of a wavelength in metres and the index there; the material is known between the outer ones.
+
+    Raises:
+        ValueError: if there are fewer than two, or a wavelength comes twice.
+
+    Source: Cauchy (1836), the oldest formula of dispersion; Born and Wolf, Principles of Optics, section 2.3.4.
+
+    Example:
+        >>> glass = cauchy_through("glass", "a data sheet", ((450e-9, 1.53), (650e-9, 1.51)))
+        >>> round(glass.index(450e-9), 6), round(glass.index(550e-9), 4)
+        (1.53, 1.5173)
+    """
+    waves = [wavelength * 1e6 for wavelength, _ in indices]
+    if len(indices) < 2 or len(set(waves)) < len(waves):
+        raise ValueError(f"indices must be known at two or more different wavelengths, got {indices}")
+    powers = [-2 * j for j in range(len(waves))]
+    terms = np.linalg.solve([[um**power for power in powers] for um in waves], [index for _, index in indices])
+    known = tuple((float(term), power) for term, power in zip(terms, powers, strict=True))
+    return Material(name, source, _power_series, known, (min(waves) * 1e-6, max(waves) * 1e-6))
 
 
 def _sellmeier(um: float, terms: Terms) -> float:

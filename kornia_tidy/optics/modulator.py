@@ -86,6 +86,46 @@ class LearnableDwellTimes(nn.Module):
         return f"learnable dwell shares {tuple(round(s, 4) for s in self.logits.detach().softmax(0).tolist())}"
 
 
+class DiffractionEfficiency(nn.Module):
+    """A fixed diffractive element: a share of the light sees the masks, the rest passes as if they were flat.
+
+    What a real element does not send where its design says is added as intensity, as a state of its own.
+
+    Args:
+        efficiency: share of the light that sees the masks, above 0 and at most 1.
+
+    Shape:
+        - input: phase (K, N, N) radians; output: states (K + 1, N, N), the last flat, and weights (K + 1,).
+
+    Raises:
+        ValueError: if the efficiency is out of range.
+
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), who take 0.7.
+
+    Example:
+        >>> import torch
+        >>> states, weights = DiffractionEfficiency(0.7)(torch.rand(1, 23, 23))
+        >>> states.shape, weights
+        (torch.Size([2, 23, 23]), tensor([0.7000, 0.3000]))
+    """
+
+    def __init__(self, efficiency: float) -> None:
+        super().__init__()
+        if not 0 < efficiency <= 1:
+            raise ValueError(f"efficiency must be above 0 and at most 1, got {efficiency}")
+        self.efficiency = efficiency
+
+    def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states shown and their weights."""
+        masks = phase.shape[0]
+        weights = phase.new_tensor([self.efficiency / masks] * masks + [1 - self.efficiency])
+        return torch.cat([phase, torch.zeros_like(phase[:1])]), weights
+
+    def extra_repr(self) -> str:
+        """Describe the element in a person's words."""
+        return f"{self.efficiency:.0%} of the light sees the mask"
+
+
 class SpatialLightModulator(nn.Module):
     """A modulator made of parts: what its panel does to each mask, and how it passes from one to the next.
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, constant_index
+from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, cauchy_through, constant_index
 from tests.base import DATA, BaseTester, needs_data
 
 FILES = {
@@ -146,3 +146,31 @@ class TestConstantIndex(BaseTester):
     @settings(deadline=None)
     def test_property_is_the_same_at_every_wavelength(self, wavelength):
         assert constant_index(1.5).index(wavelength) == 1.5
+
+
+class TestCauchyThrough(BaseTester):
+    POINTS = ((450e-9, 1.5763), (530e-9, 1.5643), (650e-9, 1.5559))
+
+    def test_feature_goes_through_what_is_known(self):
+        glass = cauchy_through("glass", "here", self.POINTS)
+        for wavelength, index in self.POINTS:
+            assert glass.index(wavelength) == pytest.approx(index, abs=1e-12)
+
+    def test_feature_finds_a_published_cauchy_equation_again(self):
+        """NOA61 has three terms, so three of its values give all others."""
+        waves = (450e-9, 600e-9, 1550e-9)
+        found = cauchy_through("NOA61 again", "NOA61", tuple((w, NOA61.index(w)) for w in waves))
+        for um in (0.47, 0.53, 0.7, 1.2):
+            assert found.index(um * 1e-6) == pytest.approx(NOA61.index(um * 1e-6), abs=1e-12)
+
+    def test_exception(self):
+        for points in (((530e-9, 1.5),), ((530e-9, 1.5), (530e-9, 1.6))):
+            with pytest.raises(ValueError, match="indices must be known at two or more different wavelengths"):
+                cauchy_through("glass", "here", points)
+        with pytest.raises(ValueError, match="published for 450 to 650 nm, got 440 nm"):
+            cauchy_through("glass", "here", self.POINTS).index(440e-9)
+
+    def test_feature_is_plain_data(self):
+        glass = cauchy_through("glass", "here", self.POINTS)
+        assert pickle.loads(pickle.dumps(glass)) == glass
+        assert hash(glass) == hash(cauchy_through("glass", "here", self.POINTS))

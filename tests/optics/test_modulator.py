@@ -7,7 +7,7 @@ import torch
 from torch.func import functional_call
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.optics.modulator import LearnableDwellTimes, SpatialLightModulator
+from kornia_tidy.optics.modulator import DiffractionEfficiency, LearnableDwellTimes, SpatialLightModulator
 from kornia_tidy.optics.phase_panel import GreyLevels, PixelCrosstalk
 from kornia_tidy.optics.switching import Switching
 from tests.base import BaseTester
@@ -131,3 +131,30 @@ class TestSpatialLightModulator(BaseTester):
         )
         for words in ("8 bits", "4 ms a swap", "random", "fill factor 0.93", "learnable dwell shares (0.25, 0.75)"):
             assert words in repr(modulator)
+
+
+class TestDiffractionEfficiency(BaseTester):
+    def test_exception(self):
+        for efficiency in (0.0, -0.1, 1.1, float("nan")):
+            with pytest.raises(ValueError, match=f"efficiency must be above 0 and at most 1, got {efficiency}"):
+                DiffractionEfficiency(efficiency)
+
+    def test_feature_what_the_masks_do_not_take_passes_flat(self):
+        masks = PixelwiseMask(2)
+        mixed, own = (
+            TiDyOptics(masks, modulator=part, fidelity=SMALL).psf_bank().psfs.detach()
+            for part in (DiffractionEfficiency(0.6), DwellTimes())
+        )
+        flat = TiDyOptics(PixelwiseMask(1, initial="flat"), fidelity=SMALL).psf_bank().psfs.detach()
+        self.assert_close(mixed, 0.6 * own + 0.4 * flat, rtol=0, atol=1e-7)
+
+    def test_feature_an_ideal_element_leaves_nothing(self):
+        masks = PixelwiseMask(3)
+        ideal, own = (
+            TiDyOptics(masks, modulator=part, fidelity=SMALL).psf_bank().psfs.detach()
+            for part in (DiffractionEfficiency(1.0), DwellTimes())
+        )
+        self.assert_close(ideal, own, rtol=0, atol=1e-7)
+
+    def test_gradcheck(self):
+        self.gradcheck(DiffractionEfficiency(0.7), (torch.rand(2, 3, 3),))

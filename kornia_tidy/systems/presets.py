@@ -1,0 +1,358 @@
+"""Nine published optical systems as plain tables: lens, mask, colours, compositing, noise, and where each was read.
+
+What could not be read anywhere is a guess, and its entry in ``System.sources`` begins with that word. Learnt masks
+are not shipped: most have no licence, and a mask is the user's to learn. Each system starts where its paper starts.
+Where that is a flat mask, which is only the lens, most start from what the system is known for, and say so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import nn
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.materials import NOA61, PMMA, cauchy_through
+from kornia_tidy.optics.modulator import DiffractionEfficiency
+from kornia_tidy.optics.phase_masks import (
+    FresnelLens,
+    PhaseMasks,
+    PixelwiseMask,
+    RadialMask,
+    SpiralMask,
+    ZernikeMask,
+)
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.systems.system import RGB, System
+
+# ---------------------------------------------------------------------- the PhaseCam3D family
+
+
+def _implied_pitch(aperture_radius: float, image_distance: float) -> float:
+    """Sensor pixels that a 27-point transform of mask pixels of a tenth of a radius implies at 530 nm, in metres."""
+    return REFERENCE_WAVELENGTH * image_distance / (27 * aperture_radius / 10)
+
+
+def _tidy_camera() -> ThinLensCamera:
+    lens = ThinLensCamera.for_scene((0.2975, math.inf), (-20.0, 20.0))
+    pitch = _implied_pitch(lens.aperture_radius, float(lens.image_distance))
+    return ThinLensCamera.for_scene((0.2975, math.inf), (-20.0, 20.0), pixel_pitch=pitch)
+
+
+def _phasecam_camera() -> ThinLensCamera:
+    focus, diameter, reach = 0.85, 2.835e-3, 10.0
+    dioptres = reach * REFERENCE_WAVELENGTH / (math.pi * (diameter / 2) ** 2)
+    pitch = _implied_pitch(diameter / 2, 1 / (1 / 50e-3 - 1 / focus))
+    return ThinLensCamera(50e-3, diameter, focus, pitch, (1 / (1 / focus + dioptres), 1 / (1 / focus - dioptres)))
+
+
+_TIDY_LENS = {
+    "defocus": "psi from -20 to 20 rad in 21 bins: paper, training details",
+    "wavelengths": "610, 530, 470 nm: paper, training details",
+    "index": "1.5 at every wavelength: code of PhaseCam3D, whose model the paper takes",
+    "iris": "317 of 23 x 23 pixels: code of PhaseCam3D",
+    "focal length": "50 mm: of PhaseCam3D's lens, and of CodedVO by the same first author",
+    "focus": "guess: 0.595 m, at which psi = -20 is infinity",
+    "aperture": "guess: 2.834 mm, so that psi is 20 at half that distance; PhaseCam3D's is 2.835 mm",
+    "pixels": "7.56 um: implied by a 27-point transform at 530 nm in code of PhaseCam3D",
+    "compositing": "gather: paper, equation 1",
+    "noise": "guess: 0.01 as in code of PhaseCam3D; the paper is silent",
+}
+_TIDY_START = "heights uniform on [0, 1.2e-6] m: paper, ablation of the sequence length (extended depth of field)"
+_TIDY_PAPER = "Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023"
+
+
+def _pixelwise(count: int) -> Callable[[torch.Generator | None], PhaseMasks]:
+    return lambda generator: PixelwiseMask(count, generator=generator)
+
+
+# ---------------------------------------------------------------------- Stanford and Hong Kong
+
+
+def _ikoma_camera() -> ThinLensCamera:
+    return ThinLensCamera(50e-3, 50e-3 / 6.3, 1.7, 6.45e-6, (1.0, 5.0))
+
+
+def _ikoma_masks(generator: torch.Generator | None) -> PhaseMasks:
+    """A smooth profile of noise: 13 free radii and straight lines between them."""
+    knots = 2.05 * torch.randn(1, 1, 13, generator=generator)
+    profile = nn.functional.interpolate(knots, size=61, mode="linear", align_corners=True)[0]
+    return RadialMask(1, 138, 61, initial=profile, material=NOA61)
+
+
+def _chang_camera() -> ThinLensCamera:
+    return ThinLensCamera(50e-3, 50e-3 / 8, 5 / 3, 6.45e-6, (1.0, 5.0), lens_material=PMMA)
+
+
+SITZMANN_PLATE = cauchy_through(
+    "the plate of Sitzmann et al.",
+    "code of Sitzmann et al. (2018) at three wavelengths",
+    ((460e-9, 1.499), (550e-9, 1.493), (640e-9, 1.488)),
+)
+
+
+def _sitzmann_camera() -> ThinLensCamera:
+    focal_length = 1 / (1 / 35.5e-3 + 1 / 1.0)
+    return ThinLensCamera(focal_length, 1356 * 3.69e-6, 1.0, 3.69e-6, (0.5, 1000.0), lens_material=SITZMANN_PLATE)
+
+
+def cubic_in_zernikes(strength: float, num_modes: int = 350) -> torch.Tensor:
+    r"""Return the Zernike coefficients of a cubic mask, less the tilt that would shift its image.
+
+    .. math:: \alpha (x^3 + y^3) - \tfrac{3}{4} \alpha (x + y)
+
+    whose slope is zero on average over the pupil, so that the light's centre of mass stays on the axis.
+
+    Args:
+        strength: alpha in radians at 530 nm where an axis meets the pupil's edge.
+        num_modes: number M of polynomials, at least 10.
+
+    Returns:
+        (M,) radians rms, for :class:`~kornia_tidy.optics.ZernikeMask`.
+
+    Source: Dowski and Cathey, Applied Optics 34(11) 1859 (1995).
+
+    Example:
+        >>> cubic_in_zernikes(8.0, 10).round(decimals=3)
+        tensor([ 0.0000, -1.0000, -1.0000,  0.0000,  0.0000,  0.0000, -0.7070,  0.7070,
+                 0.7070,  0.7070])
+    """
+    coefficients = torch.zeros(num_modes)
+    third = strength / math.sqrt(128)  # x^3 = (Z(3,1) + Z(3,3)) / sqrt(128) + Z(1,1) / 4, and y^3 alike
+    coefficients[[7, 8, 9]], coefficients[6] = third, -third
+    coefficients[[1, 2]] = strength / 4 - 0.75 * strength / 2  # Z(1,1) = 2x
+    return coefficients
+
+
+# fmt: off
+FISHER_ZERNIKES = (
+    0.0,  # radial order 0
+    0.0, 0.0,  # radial order 1
+    -0.63, 0.01, -0.68,  # radial order 2
+    -0.11, -0.11, -0.14, -0.14,  # radial order 3
+    0.0, 0.63, 0.0, 0.43, 0.0,  # radial order 4
+    0.11, -0.08, -0.09, -0.12, -0.1, -0.14,  # radial order 5
+    -0.22, 0.0, -0.03, 0.0, -0.13, 0.0, 0.03,  # radial order 6
+    0.1, 0.11, -0.1, -0.09, -0.12, -0.12, -0.1, -0.1,  # radial order 7
+    0.0, -0.17, 0.0, 0.24, 0.0, 0.05, 0.0, -0.02, 0.0,  # radial order 8
+    -0.06, 0.1, 0.11, -0.08, -0.08, -0.08, -0.08, -0.1, -0.07, -0.09,  # radial order 9
+)
+# fmt: on
+"""Zernike coefficients in radians rms of a mask designed for depth, in the order of OSA/ANSI.
+
+Found by 250 steps of Adam (rate 0.05, no tilt, the best of 4 random starts) on the bound on defocus, averaged over 11
+depths from psi = -10 to 10 rad, of a point in an unknown place with 3000 photons a channel on a background of 5 a
+pixel, through PhaseCam3D's lens here: 0.0353 rad. See Shechtman et al., Physical Review Letters 113, 133902 (2014).
+"""
+
+CUBIC = 27.0
+"""Strength of the cubic that Sitzmann's system starts from, in radians at the pupil's edge."""
+
+_LIU_SOURCES = {
+    "lens": "guess: that of Ikoma et al., whose network and task the paper takes: 50 mm f/6.3 focused at 1.7 m",
+    "depth": "guess: 1 to 5 m, as Ikoma et al.",
+    "pixels": "guess: 6.45 um, as Ikoma et al.",
+    "wavelengths": "guess: 632, 550, 450 nm, as Ikoma et al.",
+    "index": "guess: NOA61, as Ikoma et al.",
+    "compositing": "guess: occlusion, as Ikoma et al.",
+    "noise": "guess: 0.003, as Ikoma et al.",
+    "start": "guess: noise of heights uniform on [0, 1.2e-6] m",
+}
+
+
+# ---------------------------------------------------------------------- the table
+
+_ALL = (
+    System(
+        name="tidy-5",
+        title="TiDy, five masks",
+        paper=_TIDY_PAPER,
+        known_for="five masks in one exposure: averaged PSFs that no single mask can make",
+        mask="5 pixel-wise, 23 x 23, noise",
+        camera=_tidy_camera,
+        masks=_pixelwise(5),
+        sources={**_TIDY_LENS, "masks": "five of 23 x 23 pixels: paper, training details", "start": _TIDY_START},
+        smooth_iris=False,
+    ),
+    System(
+        name="tidy-1",
+        title="TiDy, one mask",
+        paper=_TIDY_PAPER,
+        known_for="the same with one mask all the time",
+        mask="1 pixel-wise, 23 x 23, noise",
+        camera=_tidy_camera,
+        masks=_pixelwise(1),
+        sources={**_TIDY_LENS, "masks": "one of 23 x 23 pixels: paper, training details", "start": _TIDY_START},
+        smooth_iris=False,
+    ),
+    System(
+        name="fresnel",
+        title="Fresnel lens",
+        paper=f"{_TIDY_PAPER} (its baseline of 0 masks)",
+        known_for="nothing to learn: a diffractive lens moves the focus of each colour to another depth",
+        mask="diffractive lens, fixed",
+        camera=_tidy_camera,
+        masks=lambda _: FresnelLens(),
+        sources={
+            **_TIDY_LENS,
+            "masks": "a fixed Fresnel lens: paper, ablation of the sequence length",
+            "strength": "guess: 10 rad, the strongest round number that 23 pixels carry",
+        },
+        smooth_iris=False,
+    ),
+    System(
+        name="phasecam3d",
+        title="PhaseCam3D",
+        paper="Wu et al.: PhaseCam3D, ICCP 2019",
+        known_for="a mask whose image of a point tells its depth best (Fisher information)",
+        mask="55 Zernikes, 23 x 23, Fisher",
+        camera=_phasecam_camera,
+        masks=lambda _: ZernikeMask(1, 23, 55, initial=torch.tensor(FISHER_ZERNIKES)),
+        sources={
+            "defocus": "psi from -10 to 10 rad in 21 bins: code",
+            "wavelengths": "610, 530, 470 nm: code",
+            "index": "1.5 at every wavelength: code",
+            "iris": "317 of 23 x 23 pixels: code",
+            "focal length": "50 mm: paper",
+            "focus": "guess: 0.85 m, of CodedVO, which has this lens",
+            "aperture": "guess: 2.835 mm, 21 mask pixels of 135 um",
+            "pixels": "7.36 um: implied by a 27-point transform at 530 nm in the code",
+            "compositing": "gather: code",
+            "noise": "0.01: code",
+            "masks": "55 Zernikes to radial order 9: code",
+            "start": "a Fisher mask, as in the paper; not theirs, which has no licence, but one designed here",
+        },
+        smooth_iris=False,
+    ),
+    System(
+        name="ikoma2021",
+        title="Ikoma et al.",
+        paper="Ikoma et al.: Depth from Defocus with Learned Optics, ICCP 2021",
+        known_for="a mask turned on a lathe: round PSFs, and near things that hide far ones",
+        mask="radial profile, 61 radii, noise",
+        camera=_ikoma_camera,
+        masks=_ikoma_masks,
+        sources={
+            "focal length": "50 mm: code",
+            "aperture": "f/6.3: code",
+            "focus": "1.7 m: code",
+            "depth": "1 to 5 m: code",
+            "pixels": "6.45 um: code; its colour filter mosaic is left out",
+            "wavelengths": "632, 550, 450 nm: code",
+            "index": "NOA61, Cauchy's equation: code",
+            "compositing": "occlusion: code and paper",
+            "noise": "0.003, the middle of 0.001 to 0.005: code",
+            "diffraction": "0.7 of the light sees the mask, 0.3 a flat one: code",
+            "masks": "a radial profile: code, of 400 radii; 61 here, which 138 pixels across resolve",
+            "start": "guess: noise at 13 radii; the code starts flat",
+        },
+        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
+        compositing="occlusion",
+        sigma=0.003,
+        modulator=lambda: DiffractionEfficiency(0.7),
+    ),
+    System(
+        name="chang2019",
+        title="Chang and Wetzstein",
+        paper="Chang, Wetzstein: Deep Optics for Monocular Depth Estimation and 3D Object Detection, ICCV 2019",
+        known_for="a single lens: red, green and blue are sharp at different depths",
+        mask="singlet, 55 Zernikes, flat",
+        camera=_chang_camera,
+        masks=lambda _: ZernikeMask(1, 46, 55, initial="flat", material=PMMA),
+        sources={
+            "lens": "a single element, focused by colour: abstract; TiDy-PSFs, results",
+            "focal length": "guess: 50 mm; no code, and the paper's numbers could not be read",
+            "aperture": "guess: f/8",
+            "focus": "guess: 1.67 m, the middle of the depths in dioptres",
+            "depth": "guess: 1 to 5 m",
+            "pixels": "guess: 6.45 um",
+            "wavelengths": "guess: 610, 530, 470 nm",
+            "index": "guess: PMMA",
+            "compositing": "gather: TiDy-PSFs, background",
+            "noise": "guess: 0.01",
+            "masks": "a free-form surface: abstract",
+            "modes": "guess: 55 Zernikes, as PhaseCam3D",
+            "start": "flat: the singlet as it is",
+        },
+    ),
+    System(
+        name="liu2022-pixelwise",
+        title="Liu et al., pixel-wise",
+        paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
+        known_for="every pixel of the mask is free",
+        mask="1 pixel-wise, 23 x 23, noise",
+        camera=_ikoma_camera,
+        masks=lambda generator: PixelwiseMask(1, 23, generator=generator, material=NOA61),
+        sources={
+            **_LIU_SOURCES,
+            "masks": "a pixel-wise height map: TiDy-PSFs, results",
+            "size": "guess: 23 x 23 pixels",
+        },
+        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
+        compositing="occlusion",
+        sigma=0.003,
+    ),
+    System(
+        name="liu2022-spiral",
+        title="Liu et al., spiral",
+        paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
+        known_for="rings that wind the phase around the axis: the PSF turns with depth",
+        mask="13 spiral rings",
+        camera=_ikoma_camera,
+        masks=lambda _: SpiralMask(1, 256, 13, initial="rotating", material=NOA61),
+        sources={
+            **_LIU_SOURCES,
+            "masks": "orbital angular momentum: TiDy-PSFs, results",
+            "formula": "guess: Prasad's spiral zones stand in for one that could not be read; 13 of them, so that the "
+            "PSF turns less than once",
+            "start": "guess: charges 1 to 13",
+        },
+        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
+        compositing="occlusion",
+        sigma=0.003,
+    ),
+    System(
+        name="sitzmann2018",
+        title="Sitzmann et al.",
+        paper="Sitzmann et al.: End-to-end Optimization of Optics and Image Processing, ACM Trans. Graph. 37(4), 2018",
+        known_for="extended depth of field: much the same blur at every depth, to be undone by one inverse",
+        mask="350 Zernikes, cubic",
+        camera=_sitzmann_camera,
+        masks=lambda _: ZernikeMask(1, 69, 350, initial=cubic_in_zernikes(CUBIC), material=SITZMANN_PLATE),
+        sources={
+            "focal length": "34.3 mm: a sensor 35.5 mm behind the plate, which is the lens too: code",
+            "aperture": "5.00 mm: 1356 samples of 3.69 um: code",
+            "focus": "1 m, where the plate starts: code",
+            "depth": "0.5 to 1000 m: code",
+            "pixels": "3.69 um: code",
+            "wavelengths": "640, 550, 460 nm: code",
+            "index": "1.488, 1.493, 1.499 there, by Cauchy's equation between: code",
+            "compositing": "gather: code",
+            "noise": "0.0105, the middle of 0.001 to 0.02: code",
+            "masks": "350 Zernikes: code",
+            "start": "guess: a cubic, the classic of extended depth of field; the code starts flat",
+        },
+        spectrum=Spectrum((640e-9, 550e-9, 460e-9), RGB.weights),
+        sigma=0.0105,
+    ),
+)
+
+SYSTEMS: dict[str, System] = {system.name: system for system in _ALL}
+"""The published systems by name."""
+
+
+def published_system(name: str) -> System:
+    """Return a published system by its name.
+
+    Raises:
+        ValueError: if there is none of that name; the message lists those there are.
+
+    Example:
+        >>> published_system("tidy-5").title
+        'TiDy, five masks'
+    """
+    check_choice("the name of a published system", name, tuple(SYSTEMS))
+    return SYSTEMS[name]
