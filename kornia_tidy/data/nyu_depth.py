@@ -86,14 +86,14 @@ class NYUDepthV2(SceneDataset):
                 raise ValueError(f"cannot read {self.path}: {error}") from error
         # MATLAB keeps columns together and HDF5 rows: (480, 640, 3) arrives as (3, 640, 480).
         window = INSIDE if self.crop_border else (slice(None), slice(None))
-        image, depth = image.transpose(0, 2, 1)[:, *window], depth.T[window].astype(np.float32)
+        image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
         known = (depth > 0) & np.isfinite(depth)
         if not known.any():
             raise ValueError(f"cannot read {self.path}: the frame has no valid depth at any pixel")
         return Scene(
-            torch.from_numpy(image.astype(np.float32) / np.float32(255)),
-            torch.from_numpy(np.ascontiguousarray(fill_holes(depth, known)))[None],
-            torch.from_numpy(np.ascontiguousarray(known))[None],
+            torch.from_numpy(np.ascontiguousarray(image, np.float32) / np.float32(255)),
+            torch.from_numpy(fill_holes(depth, known))[None],
+            torch.from_numpy(known)[None],
         )
 
     def _count(self) -> int:
