@@ -87,7 +87,7 @@ class NYUDepthV2(SceneDataset):
         # MATLAB keeps columns together and HDF5 rows: (480, 640, 3) arrives as (3, 640, 480).
         window = INSIDE if self.crop_border else (slice(None), slice(None))
         image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
-        known = (depth > 0) & np.isfinite(depth)
+        known = depth > 0  # False for NaN too
         if not known.any():
             raise ValueError(f"cannot read {self.path}: the frame has no valid depth at any pixel")
         return Scene(

@@ -39,6 +39,9 @@ class SceneDataset(Dataset[Any]):
           1 nearest, where a data set says so.
         - ``"mask"``: :math:`(1, H, W)` bool, False where depth was unknown and is filled in.
         - ``"index"``: int; ``"name"``: str.
+
+        kornia's containers warp ``"mask"`` with the image, and what is called ``"depth"`` not at all: rename it to
+        ``"mask_depth"`` first, which the camera takes as well. :class:`~kornia_tidy.data.Patches` needs no renaming.
     """
 
     def __init__(self, transform: Transform | None = None) -> None:

@@ -6,6 +6,7 @@ import multiprocessing
 
 import pytest
 import torch
+from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
 from torch.utils.data import ConcatDataset, DataLoader, Subset
 
 from kornia_tidy.data import (
@@ -121,6 +122,16 @@ class TestWorkers(BaseTester):
 
 
 class TestSceneDataset(BaseTester):
+    def test_convention_kornia_warps_depth_under_the_name_of_a_mask(self):
+        batch = next(iter(DataLoader(DeadLeaves(2, 12, 16, num_leaves=20), batch_size=2)))
+        renamed = {"mask_depth" if key == "depth" else key: value for key, value in batch.items()}
+        warp = AugmentationSequential(RandomHorizontalFlip(p=1.0), data_keys=None)
+        warped = warp(renamed)
+        for key in ("image", "mask", "mask_depth"):
+            assert warped[key].dtype == renamed[key].dtype
+            assert torch.equal(warped[key], renamed[key].flip(-1))
+        assert torch.equal(warp(batch)["depth"], batch["depth"])  # the trap of which the documentation tells
+
     def test_feature_transform_gets_the_sample(self):
         assert Stub(transform=lambda sample: (sample["name"], sample["index"]))[0] == ("a", 0)
 
