@@ -10,30 +10,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from kornia_tidy import TiDyOptics
-from kornia_tidy.data.dead_leaves import dead_leaves
-
-
-class DeadLeaves(Dataset):
-    """Scenes painted on demand: item i is the scene of seed i."""
-
-    def __init__(self, length: int, size: int, transform: Callable[[Any], Any]) -> None:
-        self.length, self.size, self.transform = length, size, transform
-
-    def __len__(self) -> int:
-        """Return the number of scenes."""
-        return self.length
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return one scene, photographed."""
-        image, depth = dead_leaves(self.size, self.size, seed=index)
-        return self.transform({"image": image, "depth": depth, "index": index})
+from kornia_tidy.data import DeadLeaves
 
 
 def main(arguments: Sequence[str] | None = None) -> list[torch.Tensor]:
@@ -41,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> list[torch.Tensor]:
     options = parse(arguments)
     torch.manual_seed(0)
     optics = TiDyOptics()
-    data = DeadLeaves(options.items, options.size, transform=optics.as_transform(seed=7))
+    data = DeadLeaves(options.items, options.size, options.size, transform=optics.as_transform(seed=7))
 
     start = time.perf_counter()
     coded = [batch["image"] for batch in DataLoader(data, options.batch, num_workers=options.workers)]

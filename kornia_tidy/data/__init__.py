@@ -1,8 +1,32 @@
-"""Scenes with depth: readers for files, and scenes made by the library."""
+"""Scenes with depth: readers for files, data sets, and scenes made by the library."""
 
-from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
 from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth
+from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches
 from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.data.nyu_depth import NYUDepthV2
+from kornia_tidy.data.patches import Patches, crop, random_crop
 from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.data.rgbd_folder import RGBDFolder
+from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
 
-__all__ = ["DepthMap", "Scene", "dead_leaves", "read_depth", "read_image", "read_rgbd", "write_depth", "write_image"]
+__all__ = [
+    "DeadLeaves",
+    "DepthMap",
+    "FlyingThings3D",
+    "NYUDepthV2",
+    "Patches",
+    "RGBDFolder",
+    "Scene",
+    "SceneDataset",
+    "UnreadableItemError",
+    "crop",
+    "dead_leaves",
+    "paper_patches",
+    "random_crop",
+    "read_depth",
+    "read_image",
+    "read_rgbd",
+    "write_depth",
+    "write_image",
+]

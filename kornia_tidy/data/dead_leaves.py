@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.data.leaf_textures import paint_leaves
+from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.dataset_transform import item_generator
 
 COVERAGE = 3.0  # how many leaves lie over a pixel on average; exp(-3) = 5 % of the picture shows the background
 LARGEST_RADIUS = 0.25  # of the picture's geometric mean side
@@ -83,15 +86,8 @@ def dead_leaves(
         >>> bool(depth.min() >= 0.5), bool(depth.isinf().any())
         (True, True)
     """
-    for name, value in (("height", height), ("width", width), ("num_leaves", num_leaves)):
-        if not isinstance(value, Integral) or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    _check_arguments(height, width, depth_range, num_leaves, seed)
     near, far = depth_range
-    if not (0 < near < far and math.isfinite(near)):
-        raise ValueError(f"depth_range must be (near, far) in metres with 0 < near < far, got {depth_range}")
-    if not isinstance(seed, Integral) or seed < 0:
-        raise ValueError(f"seed must be an integer of 0 or more, got {seed!r}")
-
     rng = np.random.default_rng(seed)
     leaves = _scatter_leaves(height, width, num_leaves, rng)
     index, nearness = _rasterise(height, width, leaves)
@@ -102,6 +98,73 @@ def dead_leaves(
     np.divide(1.0, dioptres, out=depth, where=dioptres > 0)
     depth = depth.astype(np.float32).clip(near, far)
     return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))), torch.from_numpy(depth[None])
+
+
+class DeadLeaves(SceneDataset):
+    """Scenes painted when they are asked for: as many as one likes, none of them stored. See :func:`dead_leaves`.
+
+    Args:
+        length: number of scenes.
+        height: rows in pixels.
+        width: columns in pixels.
+        depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
+        num_leaves: number of shapes in a scene.
+        seed: data sets of different seeds share no scene: train with one, test with another.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+
+    Raises:
+        ValueError: if the length is not a positive integer, or as :func:`dead_leaves` does.
+
+    Example:
+        >>> scenes = DeadLeaves(1000, 48, 64, num_leaves=200)
+        >>> len(scenes), scenes[7]["image"].shape, scenes[7]["name"]
+        (1000, torch.Size([3, 48, 64]), 'dead leaves 0/7')
+    """
+
+    def __init__(
+        self,
+        length: int,
+        height: int,
+        width: int,
+        *,
+        depth_range: tuple[float, float] = (0.3, 10.0),
+        num_leaves: int = 3000,
+        seed: int = 0,
+        transform: Transform | None = None,
+    ) -> None:
+        super().__init__(transform)
+        if not isinstance(length, Integral) or length < 1:
+            raise ValueError(f"length must be a positive integer, got {length!r}")
+        _check_arguments(height, width, depth_range, num_leaves, seed)
+        self.length, self.height, self.width = length, height, width
+        self.depth_range, self.num_leaves, self.seed = depth_range, num_leaves, seed
+
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+        return self.length
+
+    def name(self, index: int) -> str:
+        """Return the seed and the number of a scene."""
+        return f"dead leaves {self.seed}/{index}"
+
+    def read(self, index: int) -> Scene:
+        """Paint a scene; its depth is known everywhere."""
+        seed = item_generator(self.seed, index).initial_seed() % 2**64
+        image, depth = dead_leaves(
+            self.height, self.width, depth_range=self.depth_range, num_leaves=self.num_leaves, seed=seed
+        )
+        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+def _check_arguments(height: int, width: int, depth_range: tuple[float, float], num_leaves: int, seed: int) -> None:
+    for name, value in (("height", height), ("width", width), ("num_leaves", num_leaves)):
+        if not isinstance(value, Integral) or value < 1:
+            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    near, far = depth_range
+    if not (0 < near < far and math.isfinite(near)):
+        raise ValueError(f"depth_range must be (near, far) in metres with 0 < near < far, got {depth_range}")
+    if not isinstance(seed, Integral) or seed < 0:
+        raise ValueError(f"seed must be an integer of 0 or more, got {seed!r}")
 
 
 def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Leaves:

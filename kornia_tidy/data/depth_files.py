@@ -74,22 +74,7 @@ def read_depth(
         >>> depth, valid
         (tensor([[[0.5000, 0.5000, 2.0000, 2.0000]]]), tensor([[[ True, False, False,  True]]]))
     """
-    check_choice("kind", kind, ("depth", "disparity"))
-    check_positive("scale", scale)
-    if kind == "depth":
-        if focal_px is not None or baseline_m is not None or doffs_px:
-            raise ValueError("focal_px, baseline_m and doffs_px belong to kind='disparity', got kind='depth'")
-    elif focal_px is None or baseline_m is None:
-        raise ValueError(
-            "disparity without calibration cannot give metres: focal_px and baseline_m are needed, "
-            f"got {focal_px} and {baseline_m}"
-        )
-    else:
-        check_positive("focal_px", focal_px, "pixels")
-        check_positive("baseline_m", baseline_m, "metres")
-        if not np.isfinite(doffs_px):
-            raise ValueError(f"doffs_px must be finite pixels, got {doffs_px}")
-
+    check_depth_options(scale, kind=kind, focal_px=focal_px, baseline_m=baseline_m, doffs_px=doffs_px)
     stored = read_stored(path)
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
@@ -105,7 +90,37 @@ def read_depth(
     known &= depth > 0
     if not known.any():
         raise ValueError(f"cannot read {path}: it has no valid {kind} at any pixel")
-    return DepthMap(torch.from_numpy(_fill_holes(depth, known))[None], torch.from_numpy(known)[None])
+    return DepthMap(torch.from_numpy(fill_holes(depth, known))[None], torch.from_numpy(known)[None])
+
+
+def check_depth_options(
+    scale: float = 1.0,
+    *,
+    kind: str = "depth",
+    focal_px: float | None = None,
+    baseline_m: float | None = None,
+    doffs_px: float = 0.0,
+) -> None:
+    """Raise as :func:`read_depth` does if its options contradict each other, before there is a file.
+
+    Raises:
+        ValueError: if disparity comes without calibration or depth with one, or if a number is not positive.
+    """
+    check_choice("kind", kind, ("depth", "disparity"))
+    check_positive("scale", scale)
+    if kind == "depth":
+        if focal_px is not None or baseline_m is not None or doffs_px:
+            raise ValueError("focal_px, baseline_m and doffs_px belong to kind='disparity', got kind='depth'")
+    elif focal_px is None or baseline_m is None:
+        raise ValueError(
+            "disparity without calibration cannot give metres: focal_px and baseline_m are needed, "
+            f"got {focal_px} and {baseline_m}"
+        )
+    else:
+        check_positive("focal_px", focal_px, "pixels")
+        check_positive("baseline_m", baseline_m, "metres")
+        if not np.isfinite(doffs_px):
+            raise ValueError(f"doffs_px must be finite pixels, got {doffs_px}")
 
 
 def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0) -> None:
@@ -149,8 +164,8 @@ def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -
     return depth
 
 
-def _fill_holes(depth: NDArray[np.float32], known: NDArray[Any]) -> NDArray[np.float32]:
-    """Give every hole the value of its nearest known pixel."""
+def fill_holes(depth: NDArray[np.float32], known: NDArray[Any]) -> NDArray[np.float32]:
+    """Give every hole of a map (H, W) the value of its nearest known pixel; at least one must be known."""
     if known.all():
         return depth
     _, label = cv2.distanceTransformWithLabels(

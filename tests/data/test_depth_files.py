@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from kornia_tidy.data.depth_files import _fill_holes, read_depth, write_depth
+from kornia_tidy.data.depth_files import fill_holes, read_depth, write_depth
 from tests.base import BaseTester
 
 STEREO = {"kind": "disparity", "focal_px": 1000.0, "baseline_m": 0.1}
@@ -137,7 +137,7 @@ class TestFillHoles(BaseTester):
         known = rng.random((height, width)) < share
         known[rng.integers(height), rng.integers(width)] = True
         values = rng.permutation(height * width).reshape(height, width).astype(np.float32) + 1  # tells its pixel
-        filled = _fill_holes(np.where(known, values, np.float32(np.nan)), known)
+        filled = fill_holes(np.where(known, values, np.float32(np.nan)), known)
         assert np.array_equal(filled[known], values[known])
         place = np.empty((height * width, 2))
         place[values.astype(int).ravel() - 1] = np.indices((height, width)).reshape(2, -1).T
@@ -149,7 +149,7 @@ class TestFillHoles(BaseTester):
 
     def test_feature_infinity_fills_too(self):
         known = np.array([[True, False, False, True]])
-        filled = _fill_holes(np.array([[1, 0, 0, np.inf]], np.float32), known)
+        filled = fill_holes(np.array([[1, 0, 0, np.inf]], np.float32), known)
         assert filled.tolist() == [[1, 1, INF, INF]]
 
 

@@ -1,0 +1,203 @@
+"""FlyingThings3D: synthetic stereo frames with exact disparity, whole or as the patches on which the paper trains."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Literal
+
+from torch.utils.data import Subset
+
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.data.patches import Patches
+from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+
+FOCAL_PX = 1050.0  # 35 mm on a sensor 32 mm and 960 pixels wide
+SOURCE = "https://lmb.informatik.uni-freiburg.de/resources/datasets/SceneFlowDatasets.en.html"
+
+PATCH_SIZE = 278  # px: 256 remain where a PSF of 23 pixels sees no border
+PATCH_COUNTS = {"train": 5077, "val": 553, "test": 419}
+HELD_OUT = 10  # every tenth sequence of TRAIN is for validation: 553 of 5630 patches are one in ten
+
+
+class FlyingThings3D(SceneDataset):
+    r"""The frames of FlyingThings3D with depth, :math:`z = f B / d` from disparity d, or with normalised disparity.
+
+    Args:
+        root: the folder that holds ``frames_cleanpass`` (PNG) or ``frames_cleanpass_webp``, and ``disparity``, as
+            published.
+        split: the published halves; they share no object and no texture.
+        frames: ``"cleanpass"`` is sharp everywhere. ``"finalpass"`` has motion blur and defocus of its own.
+        view: which of the two cameras.
+        subsets: which of the parts A, B and C; they differ in how things and camera move.
+        baseline_m: B, how many metres the two cameras are taken to be apart. Default: 1.
+        disparity_range: (far, near) in pixels: depth is then the disparity, scaled to 0 at the first and 1 at the
+            second, for a camera of :class:`~kornia_tidy.DefocusRange`. What lies outside is clamped, and False in the
+            mask.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+
+    Raises:
+        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        ValueError: if frames have no disparity, or an argument is not as above.
+
+    Convention:
+        - The data have no size: the cameras are 1 unit apart. Taken as a metre, the median disparities of frames seen
+          (26 to 46 pixels) are 23 to 40 m; ``baseline_m=0.05`` brings them to 1.1 to 2.0 m.
+        - A name is the published path without its suffix, ``"TRAIN/A/0000/left/0006"``.
+
+    Source: Mayer et al., A Large Dataset to Train Convolutional Networks for Disparity, Optical Flow, and Scene Flow
+    Estimation, CVPR 2016.
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: Literal["train", "test"] = "train",
+        *,
+        frames: Literal["cleanpass", "finalpass"] = "cleanpass",
+        view: Literal["left", "right"] = "left",
+        subsets: str = "ABC",
+        baseline_m: float | None = None,
+        disparity_range: tuple[float, float] | None = None,
+        transform: Transform | None = None,
+    ) -> None:
+        super().__init__(transform)
+        check_choice("split", split, ("train", "test"))
+        check_choice("frames", frames, ("cleanpass", "finalpass"))
+        check_choice("view", view, ("left", "right"))
+        if not subsets or not set(subsets) <= set("ABC"):
+            raise ValueError(f"subsets must be some of the letters of 'ABC', got {subsets!r}")
+        if disparity_range is not None:
+            _check_disparity_range(disparity_range, baseline_m)
+        self.baseline_m = 1.0 if baseline_m is None else baseline_m
+        check_positive("baseline_m", self.baseline_m, "metres")
+        self.root = Path(root)
+        self.disparity_range = disparity_range
+        self.folder, self.suffix = _frames_folder(self.root, frames)
+        self.names = [
+            name
+            for subset in sorted(set(subsets))
+            for name in _list_names(self.folder, f"{split.upper()}/{subset}", view, self.suffix)
+        ]
+        if not self.names:
+            raise FileNotFoundError(f"{self.folder} has no {view} frames *{self.suffix} of {split.upper()} {subsets}")
+        self._check_disparities(split, view, subsets)
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.names)
+
+    def name(self, index: int) -> str:
+        """Return the published path of a frame, without its suffix."""
+        return self.names[index]
+
+    def read(self, index: int) -> Scene:
+        """Read a frame and its disparity."""
+        name = self.names[index]
+        image = self.folder / f"{name}{self.suffix}"
+        disparity = self.root / "disparity" / f"{name}.pfm"
+        if self.disparity_range is None:
+            return read_rgbd(image, disparity, kind="disparity", focal_px=FOCAL_PX, baseline_m=self.baseline_m)
+        scene = read_rgbd(image, disparity, kind="disparity", focal_px=1.0, baseline_m=1.0)
+        far, near = self.disparity_range
+        level = (1 / scene.depth - far) / (near - far)
+        return Scene(scene.image, level.clamp(0, 1), scene.valid & (level >= 0) & (level <= 1))
+
+    def _check_disparities(self, split: str, view: str, subsets: str) -> None:
+        """A frame without disparity is found here, not hours into an epoch."""
+        disparity = self.root / "disparity"
+        parts = [f"{split.upper()}/{subset}" for subset in sorted(set(subsets))]
+        known = {name for part in parts for name in _list_names(disparity, part, view, ".pfm")}
+        unpaired = [name for name in self.names if name not in known]
+        if unpaired:
+            raise ValueError(
+                f"{len(unpaired)} of {len(self.names)} frames have no disparity, the first is {unpaired[0]}: "
+                f"there is no {disparity / unpaired[0]}.pfm"
+            )
+
+
+def paper_patches(
+    root: str | os.PathLike[str],
+    split: Literal["train", "val", "test"] = "train",
+    *,
+    count: int | None = None,
+    disparity_range: tuple[float, float] = (0.0, 160.0),
+    seed: int = 0,
+    transform: Transform | None = None,
+) -> Patches:
+    """Patches of 278x278 pixels from FlyingThings3D with normalised disparity, on which the paper trains.
+
+    The paper takes 5077 patches for training and 419 for testing, which others cut, with 553 for validation; from which
+    frames, and how disparity was normalised, is not published. These are as many, drawn by the seed from the left clean
+    frames: results compare with the paper's in kind, not to the digit.
+
+    Args:
+        root: see :class:`FlyingThings3D`.
+        split: training and validation are from different sequences of the published TRAIN, testing from TEST.
+        count: how many patches. Default: as many as in the paper.
+        disparity_range: (far, near) in pixels that become 0 and 1; the default holds what was seen (1.1 to 152).
+        seed: another one cuts other patches.
+        transform: called with each patch.
+
+    Returns:
+        A data set for a camera of ``DefocusRange(-20, 20)``.
+
+    Raises:
+        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        ValueError: if frames have no disparity, or an argument is not as above.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
+    """
+    check_choice("split", split, tuple(PATCH_COUNTS))
+    frames = FlyingThings3D(root, "test" if split == "test" else "train", disparity_range=disparity_range)
+    chosen = range(len(frames))
+    if split != "test":
+        sequences = sorted({_sequence(name) for name in frames.names})
+        held_out = set(sequences[HELD_OUT - 1 :: HELD_OUT])
+        chosen = [i for i in chosen if (_sequence(frames.names[i]) in held_out) == (split == "val")]
+        if not chosen:
+            raise ValueError(
+                f"{root} has {len(sequences)} sequences of TRAIN: {HELD_OUT} or more are needed to validate"
+            )
+    count = PATCH_COUNTS[split] if count is None else count
+    return Patches(Subset(frames, chosen), PATCH_SIZE, count, seed=seed, transform=transform)
+
+
+def _sequence(name: str) -> str:
+    """'TRAIN/A/0000/left/0006' -> 'TRAIN/A/0000'."""
+    return name.rsplit("/", 2)[0]
+
+
+def _check_disparity_range(disparity_range: tuple[float, float], baseline_m: float | None) -> None:
+    far, near = disparity_range
+    if not (0 <= far < near and math.isfinite(near)):
+        raise ValueError(f"disparity_range must be (far, near) in pixels with 0 <= far < near, got {disparity_range}")
+    if baseline_m is not None:
+        raise ValueError(
+            f"normalised disparity has no metres: give disparity_range or baseline_m={baseline_m}, not both"
+        )
+
+
+def _frames_folder(root: Path, frames: str) -> tuple[Path, str]:
+    """Where the frames lie and how they end; PNG where both are."""
+    for folder, suffix in ((root / f"frames_{frames}", ".png"), (root / f"frames_{frames}_webp", ".webp")):
+        if folder.is_dir() and (root / "disparity").is_dir():
+            return folder, suffix
+    raise FileNotFoundError(
+        f"FlyingThings3D is not in {root}: download 'RGB images ({frames})', as PNG or WebP, and 'Disparity' of "
+        f"FlyingThings3D from {SOURCE}, and unpack both there, so that there are "
+        f"{root / f'frames_{frames}' / 'TRAIN/A/0000/left/0006.png'} and "
+        f"{root / 'disparity/TRAIN/A/0000/left/0006.pfm'}"
+    )
+
+
+def _list_names(folder: Path, part: str, view: str, suffix: str) -> list[str]:
+    """Published paths in a part, without suffix, in order; names are numbers, which leaves out what systems add."""
+    if not (folder / part).is_dir():
+        raise FileNotFoundError(
+            f"{folder} has no {part}: unpack the whole archive, or name the parts that are there with subsets="
+        )
+    files = (folder / part).glob(f"[0-9]*/{view}/[0-9]*{suffix}")
+    return sorted(file.relative_to(folder).with_suffix("").as_posix() for file in files)

@@ -1,0 +1,166 @@
+"""NYU Depth v2: the 1449 labelled indoor frames of a Kinect, from the one MATLAB file in which they are published."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kornia_tidy.data.depth_files import fill_holes
+from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.files import read_bytes
+
+LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
+SOURCES = {
+    LABELED: "http://horatio.cs.nyu.edu/mit/silberman/nyu_depth_v2/nyu_depth_v2_labeled.mat (2.8 GB)",
+    SPLITS: "http://horatio.cs.nyu.edu/mit/silberman/indoor_seg_sup/splits.mat",
+}
+FRAME = (480, 640)
+INSIDE = slice(44, 471), slice(40, 601)  # rows and columns that the toolbox keeps, MATLAB's 45:471 and 41:601
+
+
+class NYUDepthV2(SceneDataset):
+    """The labelled frames of NYU Depth v2, with depth in metres. Needs h5py: ``pip install 'kornia-tidy[data]'``.
+
+    Args:
+        root: the folder that holds ``nyu_depth_v2_labeled.mat`` and ``splits.mat``, as published.
+        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``, for which SciPy is needed; ``"all"``; or
+            the path of a text file with the numbers of frames, from 1, one a line.
+        raw: take the depth that the Kinect measured, with holes filled from their nearest neighbour and False in the
+            mask. Default: the published depth, whose holes were filled by colour (Levin et al.).
+        crop_border: cut the frame to the 427x561 pixels on which the set is evaluated, without its white border.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+
+    Raises:
+        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        ImportError: if h5py is missing, or SciPy where it is needed.
+        ValueError: if a file is damaged or does not hold what it should.
+
+    Convention:
+        - A name is the published number of the frame, from ``"0001"`` to ``"1449"``.
+        - The file is opened for each item and closed again: an open HDF5 file does not survive a fork. It takes half a
+          millisecond of ten.
+
+    Source: Silberman et al., Indoor Segmentation and Support Inference from RGBD Images, ECCV 2012.
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str | os.PathLike[str] = "train",
+        *,
+        raw: bool = False,
+        crop_border: bool = True,
+        transform: Transform | None = None,
+    ) -> None:
+        super().__init__(transform)
+        self.path = _published(Path(root), LABELED)
+        self.depths = "rawDepths" if raw else "depths"
+        self.crop_border = crop_border
+        count = self._count()
+        self.numbers = range(1, count + 1) if split == "all" else _read_split(Path(root), split)
+        outside = [number for number in self.numbers if not 1 <= number <= count]
+        if outside:
+            raise ValueError(f"split {split} names frame {outside[0]}, and {self.path} has frames 1 to {count}")
+
+    def __len__(self) -> int:
+        """Return the number of frames in the split."""
+        return len(self.numbers)
+
+    def name(self, index: int) -> str:
+        """Return the published number of a frame."""
+        return f"{self.numbers[index]:04d}"
+
+    def read(self, index: int) -> Scene:
+        """Read a frame."""
+        row = self.numbers[index] - 1
+        with _open(self.path) as file:
+            try:
+                image, depth = file["images"][row], file[self.depths][row]
+            except OSError as error:
+                raise ValueError(f"cannot read {self.path}: {error}") from error
+        # MATLAB keeps columns together and HDF5 rows: (480, 640, 3) arrives as (3, 640, 480).
+        window = INSIDE if self.crop_border else (slice(None), slice(None))
+        image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
+        known = depth > 0  # False for NaN too
+        if not known.any():
+            raise ValueError(f"cannot read {self.path}: the frame has no valid depth at any pixel")
+        return Scene(
+            torch.from_numpy(np.ascontiguousarray(image, np.float32) / np.float32(255)),
+            torch.from_numpy(fill_holes(depth, known))[None],
+            torch.from_numpy(known)[None],
+        )
+
+    def _count(self) -> int:
+        """The number of frames, once everything that items will take is known to be there."""
+        with _open(self.path) as file:
+            shapes = {key: getattr(file.get(key), "shape", None) for key in ("images", self.depths)}
+        images = shapes["images"]
+        count = images[0] if images else 0
+        height, width = FRAME
+        wanted = {"images": (count, 3, width, height), self.depths: (count, width, height)}
+        if shapes != wanted or not count:
+            raise ValueError(f"cannot read {self.path}: it should hold {wanted} (N first), found {shapes}")
+        return count
+
+
+def _published(root: Path, name: str) -> Path:
+    """The path of a published file; says where to find it if it is not there."""
+    if not (root / name).is_file():
+        raise FileNotFoundError(f"NYU Depth v2 is not in {root}: download {SOURCES[name]} and keep it as {root / name}")
+    return root / name
+
+
+def _open(path: Path) -> Any:
+    try:
+        import h5py  # noqa: PLC0415 - an extra, and slow to import
+    except ImportError:
+        raise ImportError("NYU Depth v2 needs h5py: pip install 'kornia-tidy[data]'") from None
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(
+            f"cannot read {path}: it is not a MATLAB 7.3 (HDF5) file, or it is damaged: {error}"
+        ) from error
+
+
+def _read_split(root: Path, split: str | os.PathLike[str]) -> list[int]:
+    if split in {"train", "test"}:
+        path = _published(root, SPLITS)
+        numbers = _read_splits_mat(path, f"{split}Ndxs")
+    else:
+        path = Path(split)
+        try:
+            numbers = np.array([int(word) for word in read_bytes(path).decode().split()])
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                f"split must be 'train', 'test', 'all' or a text file of numbers: {error}"
+            ) from error
+        except ValueError as error:
+            raise ValueError(
+                f"cannot read {path}: it should hold the numbers of frames, one a line: {error}"
+            ) from error
+    if not len(numbers) or len(np.unique(numbers)) != len(numbers):
+        raise ValueError(f"cannot read {path}: it should name frames, each once, found {len(numbers)} numbers")
+    return numbers.tolist()
+
+
+def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
+    try:
+        from scipy.io import loadmat  # noqa: PLC0415 - only this needs it
+    except ImportError:
+        raise ImportError(
+            f"{path} is a MATLAB 5 file, which needs SciPy: pip install scipy, or give split= a text file with the "
+            "numbers of the frames, one a line"
+        ) from None
+    try:
+        return loadmat(path)[key].ravel().astype(int)
+    except Exception as error:  # loadmat raises whatever its parser trips over
+        raise ValueError(f"cannot read {path}: it should hold trainNdxs and testNdxs: {error!r}") from error

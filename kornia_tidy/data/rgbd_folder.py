@@ -1,0 +1,108 @@
+"""Folders of pictures with depth: pairs of files found by the patterns of their names."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from kornia_tidy.data.depth_files import check_depth_options
+from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+
+
+class RGBDFolder(SceneDataset):
+    """Pairs of image and depth files in a folder.
+
+    Args:
+        root: the folder.
+        image: pattern of the images' paths in it. Each ``*`` stands for a part of the name, of at least one character,
+            within one folder; everything else is literal.
+        depth: pattern of the depth files. Image and depth are a pair if every ``*`` stands for the same in both.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+        **depth_options: how depth is stored: passed on to :func:`~kornia_tidy.data.depth_files.read_depth`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or no file fits a pattern.
+        ValueError: if a file has no partner, a pattern has no ``*`` or not as many as the other, or the options
+            contradict each other.
+
+    Convention:
+        - Items are in the order of their names; a name is what the ``*`` stand for, joined by ``/``.
+        - A file that fits both patterns belongs to the longer one: ``"*.png"`` and ``"*_depth.png"`` may lie together.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from kornia_tidy.data import write_depth, write_image
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> for name in ("lamp", "chair"):
+        ...     write_image(f"{folder.name}/{name}.png", torch.rand(3, 4, 6))
+        ...     write_depth(f"{folder.name}/{name}_depth.png", torch.full((1, 4, 6), 1.25), scale=0.001)
+        >>> scenes = RGBDFolder(folder.name, "*.png", "*_depth.png", scale=0.001)
+        >>> len(scenes), scenes[0]["name"], scenes[0]["depth"].unique()
+        (2, 'chair', tensor([1.2500]))
+        >>> folder.cleanup()
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        image: str,
+        depth: str,
+        *,
+        transform: Transform | None = None,
+        **depth_options: Any,
+    ) -> None:
+        super().__init__(transform)
+        check_depth_options(**{key: value for key, value in depth_options.items() if key != "invalid"})
+        self.root = Path(root)
+        self.pairs = _pair(self.root, image, depth)
+        self.depth_options = depth_options
+
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+        return len(self.pairs)
+
+    def name(self, index: int) -> str:
+        """Return what the patterns' ``*`` stand for."""
+        return self.pairs[index][0]
+
+    def read(self, index: int) -> Scene:
+        """Read a pair."""
+        _, image, depth = self.pairs[index]
+        return read_rgbd(self.root / image, self.root / depth, **self.depth_options)
+
+
+def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
+    """Name, image and depth file of each pair, in the order of names; paths are within the root."""
+    if image.count("*") != depth.count("*") or "*" not in image:
+        raise ValueError(f"patterns must have a * and equally many of them, got image={image!r}, depth={depth!r}")
+    if not root.is_dir():
+        raise FileNotFoundError(f"there is no folder {root}")
+    images, depths = _matches(root, image), _matches(root, depth)
+    shared = set(images.values()) & set(depths.values())
+    if len(image) < len(depth):
+        images = {name: path for name, path in images.items() if path not in shared}
+    else:
+        depths = {name: path for name, path in depths.items() if path not in shared}
+    for kind, pattern, found in (("image", image, images), ("depth file", depth, depths)):
+        if not found:
+            raise FileNotFoundError(f"no {kind} in {root} fits {pattern!r}")
+    unpaired = [images[name] for name in images.keys() - depths.keys()]
+    unpaired += [depths[name] for name in depths.keys() - images.keys()]
+    if unpaired:
+        shown = ", ".join(sorted(unpaired)[:3]) + (", ..." if len(unpaired) > 3 else "")
+        raise ValueError(f"{len(unpaired)} files in {root} have no partner by {image!r} and {depth!r}: {shown}")
+    return [("/".join(name), images[name], depths[name]) for name in sorted(images)]
+
+
+def _matches(root: Path, pattern: str) -> dict[tuple[str, ...], str]:
+    """What fits a pattern: from what the ``*`` stand for to the path within the root."""
+    parts = pattern.split("*")
+    fits = re.compile("([^/]+)".join(map(re.escape, parts)))
+    found = (
+        file.relative_to(root).as_posix() for file in root.glob("*".join(map(glob.escape, parts))) if file.is_file()
+    )
+    return {match.groups(): match.string for match in map(fits.fullmatch, found) if match}

@@ -1,0 +1,76 @@
+"""Small data sets in the published formats, written without the library's own writers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+HEADER_7_3 = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Sun Oct 14 19:14:16 2012 HDF5 schema 1.00 ."
+
+
+def write_pfm(path: Path, values: NDArray[np.float32]) -> None:
+    """As FlyingThings3D has it: a blank before the end of the first lines, rows from bottom to top."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    height, width = values.shape
+    path.write_bytes(f"Pf \n{width} {height}\n-1.0\n".encode() + values[::-1].astype("<f4").tobytes())
+
+
+def write_flying_things(
+    root: Path,
+    sequences: dict[str, int],
+    *,
+    frames: str = "frames_cleanpass",
+    suffix: str = ".png",
+    size: tuple[int, int] = (12, 20),
+) -> None:
+    """Write as many sequences of two frames as said for each part, 'TRAIN/A': left and right, images and disparity.
+
+    The red channel of an image is 8 times the disparity, so that both tell which frame they are and what is where.
+    """
+    number = 0
+    for part, count in sequences.items():
+        for sequence in range(count):
+            for view in ("left", "right"):
+                for frame in ("0006", "0007"):
+                    name = f"{part}/{sequence:04d}/{view}/{frame}"
+                    disparity = flying_things_disparity(number, size)
+                    image = np.zeros((*size, 3), np.uint8)
+                    image[..., 2] = 8 * disparity  # OpenCV's order is blue, green, red
+                    path = root / frames / f"{name}{suffix}"
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []  # above 100: lossless
+                    assert cv2.imwrite(str(path), image, options)
+                    write_pfm(root / "disparity" / f"{name}.pfm", disparity)
+                    number += 1
+
+
+def flying_things_disparity(number: int, size: tuple[int, int] = (12, 20)) -> NDArray[np.float32]:
+    """Whole pixels from 1 to 31, different for each file written, and not symmetric in any way."""
+    rows, columns = np.indices(size)
+    return (1 + (7 * number + 3 * rows + 5 * columns + rows * columns) % 31).astype(np.float32)
+
+
+def write_nyu(root: Path, count: int = 5) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    """Write the labelled set and its split; returns MATLAB's images (H, W, 3, N), depths and rawDepths (H, W, N)."""
+    rng = np.random.default_rng(0)
+    images = np.kron(rng.integers(0, 255, (24, 32, 3, count), np.uint8), np.ones((20, 20, 1, 1), np.uint8))
+    depths = np.kron(rng.uniform(0.7, 9.9, (24, 32, count)).astype(np.float32), np.ones((20, 20, 1), np.float32))
+    raw = depths.copy()
+    raw[100:130, 200:260] = 0
+    with h5py.File(root / "nyu_depth_v2_labeled.mat", "w", userblock_size=512) as file:
+        for key, values in {"images": images, "depths": depths, "rawDepths": raw}.items():
+            columns_first = values.transpose()  # HDF5 keeps rows together, MATLAB columns: every axis is turned round
+            data = file.create_dataset(
+                key, data=columns_first, chunks=(1, *columns_first.shape[1:]), compression="gzip"
+            )
+            data.attrs["MATLAB_class"] = np.bytes_(values.dtype.name.replace("float32", "single"))
+    with (root / "nyu_depth_v2_labeled.mat").open("r+b") as file:
+        file.write(HEADER_7_3.ljust(116) + bytes(8) + b"\x00\x02IM")
+    half = np.arange(1, count + 1, dtype=np.uint16)
+    savemat(root / "splits.mat", {"trainNdxs": half[1::2, None], "testNdxs": half[::2, None]}, do_compression=True)
+    return images, depths, raw

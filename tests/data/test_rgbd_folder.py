@@ -1,0 +1,119 @@
+"""Folders of pictures with depth: what belongs together, by name, and what is left over."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy.data import RGBDFolder, UnreadableItemError
+from tests.base import DATA, BaseTester, needs_data
+from tests.data.published import write_pfm
+
+
+def write(root, image, depth, millimetres, size=(4, 6)):
+    """A grey-blue picture and a depth map, each of one value."""
+    for name, values in ((image, np.full((*size, 3), (255, 51, 51), np.uint8)), (depth, np.full(size, millimetres))):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(root / name), values.astype(np.uint16) if name == depth else values)
+
+
+class TestRGBDFolder(BaseTester):
+    @pytest.mark.parametrize(
+        ("image", "depth", "name"),
+        [
+            ("{}.color.png", "{}.depth.png", "{}"),
+            ("rgb/{}.png", "depth/{}.png", "{}"),
+            ("{}.png", "{}_depth.png", "{}"),
+            ("{}_rgb.png", "{}.png", "{}"),
+            ("{}/rgb.png", "{}/depth.png", "{}"),
+            ("a [1]/({}).png", "a [1]/({})?.png", "{}"),
+        ],
+    )
+    def test_feature_pairs_are_found_by_their_names(self, tmp_path, image, depth, name):
+        for number in (3, 1, 2):
+            write(tmp_path, image.format(f"s{number}"), depth.format(f"s{number}"), 1000 * number)
+        (tmp_path / "notes.txt").touch()
+        data = RGBDFolder(tmp_path, image.format("*"), depth.format("*"), scale=0.001)
+        assert [data.name(index) for index in range(len(data))] == [name.format(f"s{n}") for n in (1, 2, 3)]
+        for index, sample in enumerate(data):
+            self.assert_close(sample["image"][:, 0, 0], torch.tensor([0.2, 0.2, 1.0]))
+            assert torch.equal(sample["depth"], torch.full((1, 4, 6), index + 1.0))
+
+    def test_feature_several_stars_must_all_agree(self, tmp_path):
+        for scene, frame, millimetres in (("b", "0", 1), ("a", "1", 2), ("a", "0", 3)):
+            write(tmp_path, f"{scene}/color/{frame}.png", f"{scene}/depth/{frame}.png", millimetres)
+        data = RGBDFolder(tmp_path, "*/color/*.png", "*/depth/*.png")
+        assert [(s["name"], s["depth"].mean().item()) for s in data] == [("a/0", 3), ("a/1", 2), ("b/0", 1)]
+
+    def test_feature_depth_options_are_passed_on(self, tmp_path):
+        write(tmp_path, "x.png", "unused/x.png", 1)
+        write_pfm(tmp_path / "x.pfm", np.array([[5, 10, 7, np.inf, 20, 0]] * 4, np.float32))
+        options = {"kind": "disparity", "focal_px": 100.0, "baseline_m": 0.1, "invalid": [7]}
+        sample = RGBDFolder(tmp_path, "*.png", "*.pfm", **options)[0]
+        assert sample["mask"][0, 0].tolist() == [True, True, False, False, True, True]
+        self.assert_close(sample["depth"][0, 0], torch.tensor([2.0, 1.0, 1.0, 0.5, 0.5, torch.inf]))
+
+    def test_feature_grey_pictures_get_three_channels(self, tmp_path):
+        write(tmp_path, "x.png", "x_depth.png", 500)
+        cv2.imwrite(str(tmp_path / "x.png"), np.full((4, 6), 51, np.uint8))
+        image = RGBDFolder(tmp_path, "*.png", "*_depth.png", scale=0.001)[0]["image"]
+        self.assert_close(image, torch.full((3, 4, 6), 0.2))
+
+    def test_exception_files_without_a_partner_are_named(self, tmp_path):
+        for name in ("a", "b", "c", "d", "e"):
+            write(tmp_path, f"rgb/{name}.png", f"depth/{name}.png", 1)
+        (tmp_path / "depth/b.png").unlink()
+        (tmp_path / "rgb/d.png").unlink()
+        with pytest.raises(
+            ValueError, match=r"2 files in .* have no partner by 'rgb/\*\.png' .*: depth/d.png, rgb/b.png$"
+        ):
+            RGBDFolder(tmp_path, "rgb/*.png", "depth/*.png")
+        for name in ("a", "e"):
+            (tmp_path / f"depth/{name}.png").unlink()
+        with pytest.raises(ValueError, match=r"4 files .*: depth/d.png, rgb/a.png, rgb/b.png, \.\.\.$"):
+            RGBDFolder(tmp_path, "rgb/*.png", "depth/*.png")
+
+    def test_exception_nothing_there(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"there is no folder .*nowhere"):
+            RGBDFolder(tmp_path / "nowhere", "*.png", "*.pfm")
+        with pytest.raises(FileNotFoundError, match=r"no image in .* fits '\*\.png'"):
+            RGBDFolder(tmp_path, "*.png", "*.pfm")
+        write(tmp_path, "x.png", "y.tiff", 1)
+        with pytest.raises(FileNotFoundError, match=r"no depth file in .* fits '\*\.pfm'"):
+            RGBDFolder(tmp_path, "*.png", "*.pfm")
+
+    @pytest.mark.parametrize(("image", "depth"), [("*.png", "x.pfm"), ("x.png", "x.pfm"), ("*/*.png", "*.pfm")])
+    def test_exception_patterns_without_equally_many_stars(self, tmp_path, image, depth):
+        with pytest.raises(ValueError, match=r"must have a \* and equally many"):
+            RGBDFolder(tmp_path, image, depth)
+
+    def test_exception_options_are_checked_before_any_file(self, tmp_path):
+        with pytest.raises(ValueError, match="focal_px and baseline_m are needed"):
+            RGBDFolder(tmp_path, "*.png", "*.pfm", kind="disparity", invalid=[0])
+        with pytest.raises(TypeError, match="focal"):
+            RGBDFolder(tmp_path, "*.png", "*.pfm", focal=3.0)
+
+    def test_exception_sizes_that_differ_are_an_unreadable_item(self, tmp_path):
+        write(tmp_path, "x.png", "x_depth.png", 1)
+        write(tmp_path, "unused.png", "x_depth.png", 1, size=(6, 4))
+        (tmp_path / "unused.png").unlink()
+        with pytest.raises(UnreadableItemError, match=r"item 0 of RGBDFolder, x: .* must have the same size"):
+            RGBDFolder(tmp_path, "*.png", "*_depth.png")[0]
+
+    @needs_data
+    @pytest.mark.parametrize(
+        ("folder", "image", "depth", "count", "median"),
+        [
+            ("7scenes", "*.color.jpg", "*.depth.png", 3, 1.7),
+            ("icl_nuim_o3d", "image_*.jpg", "depth_*.png", 3, 1.8),
+            ("open3d/RGBD", "color/*.jpg", "depth/*.png", 5, 1.7),
+        ],
+    )
+    def test_feature_real_folders(self, folder, image, depth, count, median):
+        data = RGBDFolder(DATA / "rgbd" / folder, image, depth, scale=0.001, invalid=[65535])
+        assert len(data) == count
+        for sample in data:
+            assert sample["image"].shape == (3, 480, 640)
+            assert sample["depth"][sample["mask"]].median().item() == pytest.approx(median, rel=0.3)
