@@ -266,8 +266,10 @@ class MeanScores:
         Raises:
             ValueError: if names or shapes do not fit.
         """
-        if not scores or (self._totals and self._totals.keys() != scores.keys()):
-            raise ValueError(f"scores must have the names {sorted(self._totals) or 'of metrics'}, got {sorted(scores)}")
+        if not scores:
+            raise ValueError("scores must hold at least one metric, got none")
+        if self._totals and self._totals.keys() != scores.keys():
+            raise ValueError(f"scores must be {sorted(self._totals)} as in the first batch, got {sorted(scores)}")
         sizes = {tuple(value.shape) for value in [*scores.values(), *([] if counted is None else [counted])]}
         if len(sizes) > 1 or len(next(iter(sizes))) != 1:
             raise ValueError(f"scores and counted must all have one shape (B,), got {sorted(sizes)}")

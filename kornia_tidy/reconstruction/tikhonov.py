@@ -8,6 +8,8 @@ images that do repeat.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -61,8 +63,8 @@ def tikhonov(
         >>> psf = torch.zeros(1, 3, 3)
         >>> psf[0, 1, 2] = 1.0  # moves every point to the right
         >>> capture = torch.tensor([0.0, 0.0, 1.0, 0.0]).view(1, 1, 1, 4)
-        >>> tikhonov(capture, psf, 1e-6, border="circular").flatten().round(decimals=3)
-        tensor([0., 1., 0., 0.])
+        >>> tikhonov(capture, psf, 1e-6, border="circular").flatten() > 0.999
+        tensor([False,  True, False, False])
     """
     check_float_tensor("psf", psf, 3, "(C, P, P)")
     if prior is not None and prior.shape != capture.shape:
@@ -154,7 +156,7 @@ class Tikhonov(Inversion):
     Kept near the capture, so white stays white whatever the weight. See :func:`tikhonov` and :class:`Inversion`.
 
     Args:
-        weight: as for :class:`Inversion`. 0.01 suits read noise of 1 %.
+        weight: as for :class:`Inversion`. 0.03 suits cubic masks and read noise of 1 %.
         border: as for :class:`Inversion`.
         correlate: as for :class:`Inversion`.
 
@@ -168,7 +170,7 @@ class Tikhonov(Inversion):
         1.0
     """
 
-    def __init__(self, weight: float = 1e-2, border: str = "smooth", *, correlate: bool = False) -> None:
+    def __init__(self, weight: float = 3e-2, border: str = "smooth", *, correlate: bool = False) -> None:
         super().__init__(weight, border, correlate=correlate)
 
     def forward(self, capture: Tensor, bank: PSFBank) -> Tensor:
@@ -231,15 +233,20 @@ class Preconditioned(nn.Module):
 
 
 def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None = None) -> Tensor:
-    """Return the half spectrum of PSFs on a plane that repeats, the chief ray on its first pixel.
+    r"""Return the half spectrum of PSFs on a plane that repeats, the chief ray on its first pixel.
+
+    .. math:: H_{uv} = \sum_{yx} e^{-2 \pi i \, u y / M} \, h_{yx} \, e^{-2 \pi i \, v x / N}
+
+    as two matrix products: of a plane's rows and columns a PSF fills so few that this is faster than a transform of
+    the whole plane, and no plane is filled with zeros.
 
     Args:
-        psfs: (..., P, P) with P odd. Those larger than the plane wrap around, as light does there.
-        size: rows and columns of the plane.
+        psfs: (..., P, P) with P odd, float32 or float64. Those larger than the plane wrap around, as light does there.
+        size: rows M and columns N of the plane.
         veil: (...) share of light spread evenly over the plane, or None.
 
     Returns:
-        Complex (..., rows, columns // 2 + 1).
+        Complex (..., M, N // 2 + 1).
 
     Example:
         >>> psf = torch.zeros(3, 3)
@@ -247,13 +254,20 @@ def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None =
         >>> transfer_function(psf, (1, 2), veil=torch.tensor(0.25)).real
         tensor([[0.7500, 0.5000]])
     """
-    rows, columns, side = *size, psfs.shape[-1]
-    filling = (0, -side % columns, 0, -side % rows)  # up to whole planes, which then lie on top of each other
-    planes = nn.functional.pad(psfs, filling).unflatten(-1, (-1, columns)).unflatten(-3, (-1, rows))
-    plane = planes.sum((-4, -2)).roll((-(side // 2), -(side // 2)), dims=(-2, -1))
-    if veil is not None:
-        plane = plane + veil[..., None, None] / (rows * columns)
-    return torch.fft.rfft2(plane)
+    rows, columns = size
+    below, across = (_fourier_matrix(psfs, side, count) for side, count in ((rows, rows), (columns, columns // 2 + 1)))
+    transfer = below @ (psfs.to(below.dtype) @ across.mT)
+    if veil is None:
+        return transfer
+    return transfer + nn.functional.pad(veil[..., None, None], (0, columns // 2, 0, rows - 1))  # the zero frequency
+
+
+def _fourier_matrix(psfs: Tensor, side: int, count: int) -> Tensor:
+    """(count, P): the first frequencies of a line of ``side`` pixels, of points about its first one."""
+    points = torch.arange(psfs.shape[-1], device=psfs.device) - psfs.shape[-1] // 2
+    turns = torch.arange(count, device=psfs.device)[:, None] * points % side  # whole numbers: exact however long
+    phase = turns.double() * (-2 * math.pi / side)
+    return torch.polar(torch.ones_like(phase), phase).to(torch.promote_types(psfs.dtype, torch.complex64))
 
 
 def _spectra(
