@@ -265,8 +265,8 @@ def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None =
 def _fourier_matrix(psfs: Tensor, side: int, count: int) -> Tensor:
     """(count, P): the first frequencies of a line of ``side`` pixels, of points about its first one."""
     points = torch.arange(psfs.shape[-1], device=psfs.device) - psfs.shape[-1] // 2
-    turns = torch.arange(count, device=psfs.device)[:, None] * points % side  # whole numbers: exact however long
-    phase = turns.double() * (-2 * math.pi / side)
+    turns = torch.arange(count, device=psfs.device)[:, None] * points
+    phase = turns.double() * (-2 * math.pi / side)  # float32 would lose it on wide planes
     return torch.polar(torch.ones_like(phase), phase).to(torch.promote_types(psfs.dtype, torch.complex64))
 
 

@@ -160,6 +160,8 @@ class TestInverses(BaseTester):
         capture = flat_capture(image, psfs[0], veil=veil)
         self.assert_close(Tikhonov(1e-9, "circular")(capture, bank), image, atol=1e-6, rtol=0)
         self.assert_close(TikhonovLayers(1e-9, "circular")(capture, bank)[:, 0], image, atol=1e-6, rtol=0)
+        twice = [torch.cat([value, value]) for value in (psfs, bank.defocus, bank.energy, veil)]
+        self.assert_close(Tikhonov(1e-9, "circular")(capture, PSFBank(*twice)), image, atol=1e-6, rtol=0)
 
     @borders
     @pytest.mark.parametrize("weight", [1e-4, 1.0, 1e4])

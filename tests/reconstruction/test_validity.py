@@ -19,10 +19,18 @@ class TestValidMaps(BaseTester):
         (gradient,) = torch.autograd.grad((shown * truth).sum(), prediction)
         assert gradient.flatten().tolist() == [0.5, 0.0, 0.0, 0.0]
 
-    def test_feature_half_is_compared_in_float32(self, device, dtype):
-        shown, truth, _ = valid_maps(*torch.ones(2, 1, 1, 2, 2, device=device, dtype=dtype))
-        expected = torch.float64 if dtype == torch.float64 else torch.float32
-        assert (shown.dtype, truth.dtype) == (expected, expected)
+    @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+    def test_feature_half_is_compared_in_float32_and_nothing_below_the_better_of_two(self, device, half):
+        maps = {
+            kind: torch.ones(1, 1, 2, 2, device=device, dtype=kind) for kind in (half, torch.float32, torch.float64)
+        }
+        for kinds, expected in (
+            ((half, half), torch.float32),
+            ((half, torch.float32), torch.float32),
+            ((torch.float64, half), torch.float64),
+        ):
+            shown, truth, _ = valid_maps(*[maps[kind] for kind in kinds])
+            assert (shown.dtype, truth.dtype) == (expected, expected)
 
     @pytest.mark.parametrize("shape", [(1, 1, 4, 5), (2, 1, 4, 5), (2, 3, 4, 5), (1, 1, 1, 5), (2, 1, 1, 1)])
     def test_cardinality_masks_broadcast(self, device, shape):
