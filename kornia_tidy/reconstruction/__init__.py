@@ -1,0 +1,1 @@
+"""From captures back to scenes: all-in-focus images and depth maps."""

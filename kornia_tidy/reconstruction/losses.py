@@ -1,0 +1,201 @@
+"""Losses of depth and all-in-focus images, over the pixels whose true value is known.
+
+Each is pooled over all valid samples of the batch, as training wants it; :mod:`kornia_tidy.reconstruction.metrics` has
+one value an image. Gradients of masked pixels are exactly zero.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
+
+
+def mse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return the mean squared error, the paper's loss for depth maps and for all-in-focus images.
+
+    .. math:: L = \frac{1}{N} \lVert x - \hat{x} \rVert_2^2
+
+    Args:
+        prediction: (B, C, H, W), in any unit.
+        target: (B, C, H, W), in the same unit; anything, NaN included, where the mask is False.
+        mask: bool (B, 1, H, W), True where the target is known. None: everywhere.
+
+    Returns:
+        A scalar in float32 or float64, in the unit squared; N counts the valid samples of the whole batch.
+
+    Raises:
+        TypeError: if prediction or target are not floating point, or the mask is not bool.
+        ValueError: if shapes do not fit, or the mask is False everywhere (waits for the device). Compiled code, which
+            does not look at values, then returns zero with zero gradients.
+
+    Source: Shah et al., TiDy-PSFs, ICCV 2023.
+
+    Example:
+        >>> depth = torch.tensor([2.0, float("nan")]).view(1, 1, 1, 2)
+        >>> mse_loss(torch.ones(1, 1, 1, 2), depth, ~depth.isnan())
+        tensor(1.)
+    """
+    prediction, target, mask = valid_maps(prediction, target, mask)
+    return _mean((prediction - target).square(), mask)
+
+
+def l1_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return the mean absolute error, which Ikoma et al. take for depth maps.
+
+    .. math:: L = \frac{1}{N} \lVert x - \hat{x} \rVert_1
+
+    Args:
+        prediction: as for :func:`mse_loss`.
+        target: as for :func:`mse_loss`.
+        mask: as for :func:`mse_loss`.
+
+    Returns:
+        A scalar in the unit of the maps; errors are those of :func:`mse_loss`. Its gradient is zero where both agree.
+
+    Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021.
+
+    Example:
+        >>> l1_loss(torch.ones(1, 1, 1, 2), torch.tensor([2.0, -1.0]).view(1, 1, 1, 2))
+        tensor(1.5000)
+    """
+    prediction, target, mask = valid_maps(prediction, target, mask)
+    return _mean((prediction - target).abs(), mask)
+
+
+def rmse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return the root of the mean squared error, PhaseCam3D's loss of depth maps.
+
+    .. math:: L = \frac{1}{\sqrt{N}} \lVert x - \hat{x} \rVert_2
+
+    Args:
+        prediction: as for :func:`mse_loss`.
+        target: as for :func:`mse_loss`. PhaseCam3D's maps are in [0, 1] and it weights this loss by 20.
+        mask: as for :func:`mse_loss`.
+
+    Returns:
+        A scalar in the unit of the maps; errors are those of :func:`mse_loss`. Its gradient is zero where both agree.
+
+    Source: Wu et al., PhaseCam3D, ICCP 2019.
+
+    Example:
+        >>> rmse_loss(torch.zeros(1, 1, 1, 2), torch.tensor([1.0, 7.0]).view(1, 1, 1, 2))
+        tensor(5.)
+    """
+    return safe_sqrt(mse_loss(prediction, target, mask))
+
+
+def gradient_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return how far the slopes of two maps differ, PhaseCam3D's loss for sharp depth edges.
+
+    .. math:: L = \frac{1}{\sqrt{N_x}} \lVert \partial_x x - \partial_x \hat{x} \rVert_2
+                + \frac{1}{\sqrt{N_y}} \lVert \partial_y x - \partial_y \hat{x} \rVert_2
+
+    with differences between neighbouring pixels that are both valid; N counts these pairs.
+
+    Args:
+        prediction: as for :func:`mse_loss`, at least two pixels a side.
+        target: as for :func:`mse_loss`.
+        mask: as for :func:`mse_loss`.
+
+    Returns:
+        A scalar in the unit of the maps a pixel; it does not see a constant offset.
+
+    Raises:
+        TypeError: as :func:`mse_loss`.
+        ValueError: as :func:`mse_loss`, or if along one axis no two neighbours are both valid.
+
+    Source: Wu et al., PhaseCam3D, ICCP 2019.
+
+    Example:
+        >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
+        >>> gradient_loss(3 * ramp + 7, ramp)
+        tensor(2.)
+    """
+    prediction, target, mask = valid_maps(prediction, target, mask)
+    error, loss = prediction - target, prediction.new_zeros(())
+    for axis, name in ((-1, "beside"), (-2, "above")):
+        pairs = mask.narrow(axis, 1, mask.shape[axis] - 1) & mask.narrow(axis, 0, mask.shape[axis] - 1)
+        squares = torch.where(pairs, error.diff(dim=axis), 0).square()
+        loss = loss + safe_sqrt(_mean(squares, pairs, f"pair of pixels {name} each other"))
+    return loss
+
+
+def joint_loss(
+    depth: Tensor,
+    image: Tensor,
+    true_depth: Tensor,
+    true_image: Tensor,
+    mask: Tensor | None = None,
+    *,
+    depth_weight: float = 1.0,
+    image_weight: float = 1.0,
+) -> Tensor:
+    r"""Return the paper's loss of depth map and all-in-focus image together.
+
+    .. math:: L = \lambda_{Depth} L_{Depth} + \lambda_{AiF} L_{AiF}
+
+    Args:
+        depth: predicted depth map (B, 1, H, W).
+        image: predicted all-in-focus image (B, C, H, W).
+        true_depth: (B, 1, H, W).
+        true_image: (B, C, H, W).
+        mask: bool (B, 1, H, W), True where the true depth is known. The image is known everywhere.
+        depth_weight: :math:`\lambda_{Depth}`, 1 in the paper.
+        image_weight: :math:`\lambda_{AiF}`, 1 in the paper.
+
+    Returns:
+        A scalar; both terms are :func:`mse_loss`, whose errors it raises.
+
+    Source: Shah et al., TiDy-PSFs, ICCV 2023.
+
+    Example:
+        >>> maps = torch.zeros(1, 1, 2, 2), torch.zeros(1, 3, 2, 2), torch.ones(1, 1, 2, 2), torch.ones(1, 3, 2, 2)
+        >>> joint_loss(*maps, depth_weight=0.5)
+        tensor(1.5000)
+    """
+    return depth_weight * mse_loss(depth, true_depth, mask) + image_weight * mse_loss(image, true_image)
+
+
+class JointLoss(nn.Module):
+    """The paper's joint loss with its two weights; see :func:`joint_loss`.
+
+    Args:
+        depth_weight: weight of the depth term.
+        image_weight: weight of the image term.
+
+    Raises:
+        ValueError: if a weight is negative or not finite.
+
+    Example:
+        >>> criterion = JointLoss(depth_weight=10)
+        >>> criterion(*[torch.full((1, 1, 2, 2), value) for value in (0.0, 0.0, 0.5, 1.0)])
+        tensor(3.5000)
+    """
+
+    def __init__(self, depth_weight: float = 1.0, image_weight: float = 1.0) -> None:
+        super().__init__()
+        for name, weight in (("depth_weight", depth_weight), ("image_weight", image_weight)):
+            if not 0 <= weight < float("inf"):
+                raise ValueError(f"{name} must be finite and not negative, got {weight}")
+        self.depth_weight, self.image_weight = depth_weight, image_weight
+
+    def forward(
+        self, depth: Tensor, image: Tensor, true_depth: Tensor, true_image: Tensor, mask: Tensor | None = None
+    ) -> Tensor:
+        """Return the loss."""
+        weights = {"depth_weight": self.depth_weight, "image_weight": self.image_weight}
+        return joint_loss(depth, image, true_depth, true_image, mask, **weights)
+
+    def extra_repr(self) -> str:
+        """Return the weights."""
+        return f"depth_weight={self.depth_weight}, image_weight={self.image_weight}"
+
+
+def _mean(error: Tensor, mask: Tensor, sample: str = "pixel") -> Tensor:
+    """The mean of an error, zero where masked, over the samples that are not."""
+    count = mask.sum()
+    if not torch.compiler.is_compiling() and not bool(count):
+        raise ValueError(f"a loss needs at least one valid {sample}, got a mask {tuple(mask.shape)} with none")
+    return error.sum() / count.clamp(min=1)

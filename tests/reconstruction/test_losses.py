@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kornia_tidy.reconstruction.losses import JointLoss, gradient_loss, joint_loss, l1_loss, mse_loss, rmse_loss
+from tests.base import BaseTester
+
+LOSSES = (mse_loss, l1_loss, rmse_loss, gradient_loss)
+
+
+def make_maps(shape=(2, 3, 6, 7), device="cpu", dtype=torch.float64):
+    """A prediction, a target with NaN holes, and the mask of what is known, of one channel."""
+    prediction = torch.rand(shape, device=device, dtype=dtype)
+    target = torch.rand(shape, device=device, dtype=dtype)
+    mask = torch.rand(shape[0], 1, *shape[2:], device=device) > 0.3
+    return prediction, target.masked_fill(~mask, torch.nan), mask
+
+
+def by_hand(loss, prediction, target, mask) -> float:
+    """The losses in NumPy, sample by sample."""
+    x, z = (value.double().cpu().numpy() for value in (prediction, target))
+    seen = np.broadcast_to(mask.cpu().numpy(), z.shape)
+    error = x - z
+    if loss is gradient_loss:
+        rows = np.array([e for e in np.diff(error, axis=2).ravel() if not np.isnan(e)])  # NaN marks an unknown pixel
+        columns = np.array([e for e in np.diff(error, axis=3).ravel() if not np.isnan(e)])
+        return np.linalg.norm(rows) / len(rows) ** 0.5 + np.linalg.norm(columns) / len(columns) ** 0.5
+    error = error[seen]
+    return {
+        mse_loss: np.linalg.norm(error) ** 2 / error.size,
+        l1_loss: np.linalg.norm(error, 1) / error.size,
+        rmse_loss: np.linalg.norm(error) / error.size**0.5,
+    }[loss]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+class TestLosses(BaseTester):
+    def test_smoke_without_a_mask_all_pixels_count(self, loss, device, dtype):
+        prediction, target = torch.rand(2, 2, 3, 6, 7, device=device, dtype=dtype)
+        everywhere = torch.ones(2, 1, 6, 7, dtype=torch.bool, device=device)
+        assert loss(prediction, target) == loss(prediction, target, everywhere)
+
+    def test_feature_equals_numpy(self, loss, device, dtype):
+        maps = make_maps(device=device, dtype=dtype)
+        value = loss(*maps)
+        assert value.shape == ()
+        assert value.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
+        self.assert_close(value.double().cpu(), torch.tensor(by_hand(loss, *maps), dtype=torch.float64))
+
+    def test_feature_masked_pixels_have_exactly_no_gradient(self, loss, device, dtype):
+        prediction, target, mask = make_maps(device=device, dtype=dtype)
+        prediction.requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(prediction, target, mask), prediction)
+        assert gradient.isfinite().all()
+        hidden = ~mask.expand_as(gradient)
+        assert (gradient[hidden] == 0).all()
+        if loss is not gradient_loss:  # whose pixels may have no valid neighbour
+            assert (gradient[~hidden] != 0).all()
+
+    def test_feature_equal_maps_have_no_loss_and_a_finite_gradient(self, loss, device, dtype):
+        target = torch.rand(1, 1, 4, 4, device=device, dtype=dtype)
+        prediction = target.clone().requires_grad_()
+        value = loss(prediction, target)
+        assert value == 0
+        assert (torch.autograd.grad(value, prediction)[0] == 0).all()
+
+    @pytest.mark.parametrize("share", [0.0, 0.4])
+    def test_gradcheck(self, loss, device, share):
+        prediction, target = torch.rand(2, 2, 1, 4, 5, device=device, dtype=torch.float64)
+        mask = torch.rand(2, 1, 4, 5, device=device) >= share
+        self.gradcheck(lambda x, z: loss(x, z, mask), (prediction, target))
+
+    def test_exception_an_empty_mask(self, loss, device):
+        maps = torch.zeros(2, 1, 4, 5, device=device)
+        with pytest.raises(
+            ValueError, match=r"at least one valid (pixel|pair of pixels beside each other), got a mask .* with none"
+        ):
+            loss(maps, maps, torch.zeros(2, 1, 4, 5, dtype=torch.bool, device=device))
+
+    @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+    def test_dynamo_one_graph_and_an_empty_mask_has_no_loss(self, loss, device, backend):
+        torch._dynamo.reset()
+        compiled = torch.compile(loss, fullgraph=True, backend=backend)
+        prediction, target, mask = make_maps(device=device, dtype=torch.float32)
+        assert compiled(prediction, target, mask) == loss(prediction, target, mask)
+        prediction.requires_grad_()
+        value = compiled(prediction, target, torch.zeros_like(mask))
+        assert value == 0
+        assert (torch.autograd.grad(value, prediction)[0] == 0).all()
+
+    def test_feature_autocast_changes_nothing(self, loss, device):
+        maps = make_maps(device=device, dtype=torch.float32)
+        with torch.autocast(device.type, dtype=torch.bfloat16):
+            value = loss(*maps)
+        assert value == loss(*maps)
+
+
+class TestGradientLoss(BaseTester):
+    def test_feature_two_ramps_differ_by_their_slopes(self, device, dtype):
+        """Slopes 3 and -1 along x and y against 1 and 1: |2| + |-2|."""
+        y, x = torch.meshgrid(*[torch.arange(5.0, device=device, dtype=dtype)] * 2, indexing="ij")
+        value = gradient_loss((3 * x - y + 9).expand(1, 1, 5, 5), (x + y).expand(1, 1, 5, 5))
+        assert value == 4
+
+    def test_feature_a_step_across_masked_pixels_is_not_an_edge(self, device, dtype):
+        """Both sides are flat; what lies between is not known, so neither is the slope."""
+        target = torch.tensor([1.0, 1.0, float("nan"), 5.0, 5.0], device=device, dtype=dtype).expand(1, 1, 3, 5)
+        assert gradient_loss(torch.zeros_like(target), target, ~target.isnan()) == 0
+
+    @pytest.mark.parametrize(("shape", "name"), [((1, 1, 4, 1), "beside"), ((1, 1, 1, 4), "above")])
+    def test_exception_one_pixel_has_no_slope(self, device, shape, name):
+        maps = torch.zeros(shape, device=device)
+        with pytest.raises(ValueError, match=f"at least one valid pair of pixels {name} each other"):
+            gradient_loss(maps, maps)
+
+
+class TestJointLoss(BaseTester):
+    def make(self, device, dtype=torch.float64):
+        depth, true_depth, mask = make_maps((2, 1, 4, 5), device, dtype)
+        return depth, torch.rand(2, 3, 4, 5, device=device, dtype=dtype), true_depth, mask
+
+    def test_feature_weighs_depth_where_known_and_the_image_everywhere(self, device, dtype):
+        depth, image, true_depth, mask = self.make(device, dtype)
+        true_image = torch.zeros_like(image)
+        value = joint_loss(depth, image, true_depth, true_image, mask, depth_weight=3, image_weight=0.5)
+        expected = 3 * by_hand(mse_loss, depth, true_depth, mask) + 0.5 * image.double().square().mean().item()
+        self.assert_close(value.double().cpu(), torch.tensor(expected, dtype=torch.float64))
+        assert JointLoss(3, 0.5)(depth, image, true_depth, true_image, mask) == value
+
+    def test_feature_the_papers_weights_are_one(self, device):
+        zeros, ones = torch.zeros(1, 1, 2, 2, device=device), torch.ones(1, 1, 2, 2, device=device)
+        assert joint_loss(zeros, 2 * ones, ones, zeros) == 1 + 4
+        assert JointLoss()(zeros, 2 * ones, ones, zeros) == 1 + 4
+
+    def test_gradcheck(self, device):
+        depth, image, true_depth, mask = self.make(device)
+        self.gradcheck(lambda d, i: joint_loss(d, i, true_depth, torch.zeros_like(i), mask), (depth, image))
+
+    @pytest.mark.parametrize("weight", [-1.0, float("inf"), float("nan")])
+    def test_exception_names_the_weight(self, weight):
+        with pytest.raises(ValueError, match=f"depth_weight must be finite and not negative, got {weight}"):
+            JointLoss(depth_weight=weight)
+
+    def test_feature_it_says_what_it_is(self):
+        assert repr(JointLoss(2.0)) == "JointLoss(depth_weight=2.0, image_weight=1.0)"
+
+
+class TestProperties(BaseTester):
+    @given(seed=st.integers(0, 2**31), hidden=st.sampled_from([0.0, -1e30, float("inf"), float("nan")]))
+    @settings(max_examples=25, deadline=None)
+    def test_property_what_stands_behind_the_mask_does_not_matter(self, seed, hidden):
+        torch.manual_seed(seed)
+        prediction, target, mask = make_maps()
+        covered = prediction.masked_fill(~mask, hidden), target.masked_fill(~mask, hidden)
+        for loss in LOSSES:
+            assert loss(*covered, mask) == loss(prediction, target, mask)

@@ -1,0 +1,137 @@
+"""The inversions as modules: precision, learning, what a network sees of them, errors, and a real scene."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from torch import nn
+
+from kornia_tidy import PSFBank, SensorNoise, TiDyOptics
+from kornia_tidy.optics.phase_masks.cubic import CubicMask
+from kornia_tidy.reconstruction.metrics import psnr
+from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers, tikhonov, tikhonov_layers
+from tests.base import BaseTester
+from tests.reconstruction.banks import make_bank, make_psfs
+from tests.scenes import load_scene
+
+
+class TestPrecision(BaseTester):
+    def test_feature_float32_is_float64_to_rounding(self, device):
+        capture, bank = torch.rand(1, 3, 61, 47, device=device), make_bank(5, 3, 9, device=device, dtype=torch.float32)
+        double = PSFBank(*(v.double() for v in (bank.psfs, bank.defocus, bank.energy)))
+        for module in (Tikhonov(1e-3), TikhonovLayers(1e-3)):
+            self.assert_close(module(capture, bank).double(), module(capture.double(), double), atol=2e-6, rtol=0)
+
+    @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+    def test_feature_half_is_float32_rounded_at_the_end(self, half, device):
+        capture, bank = torch.rand(1, 2, 12, 9, device=device).to(half), make_bank(device=device, dtype=torch.float32)
+        for module in (Tikhonov(), TikhonovLayers()):
+            assert torch.equal(module(capture, bank), module(capture.float(), bank).to(half))
+
+    def test_feature_autocast_changes_nothing(self, device):
+        capture, bank = torch.rand(1, 2, 12, 9, device=device), make_bank(device=device, dtype=torch.float32)
+        for module in (Tikhonov(), TikhonovLayers()):
+            expected = module(capture, bank)
+            with torch.autocast(device.type, dtype=torch.bfloat16):
+                out = module(capture, bank)
+            assert torch.equal(out, expected)
+
+    def test_feature_gradients_are_finite_without_light(self, device):
+        """Black captures, and PSFs that pass nothing."""
+        psfs = torch.zeros(2, 1, 3, 3, device=device, requires_grad=True)
+        bank = PSFBank(psfs, torch.arange(2.0, device=device), torch.zeros(2, 1, device=device))
+        for module in (Tikhonov().to(device), TikhonovLayers().to(device)):
+            out = module(torch.zeros(1, 1, 6, 6, device=device), bank)
+            assert (out == 0).all()
+            for gradient in torch.autograd.grad(out.sum(), [psfs, module.log_weight]):
+                assert gradient.isfinite().all()
+
+
+class TestModules(BaseTester):
+    @pytest.mark.parametrize("module", [Tikhonov, TikhonovLayers])
+    def test_feature_the_weight_stays_positive_whatever_the_step(self, module, device):
+        inversion = module(0.25).to(device)
+        assert inversion.weight.item() == pytest.approx(0.25, rel=1e-6)
+        bank = make_bank(device=device, dtype=torch.float32)
+        inversion(torch.rand(1, 2, 8, 8, device=device), bank).square().sum().backward()
+        assert inversion.log_weight.grad.isfinite()
+        assert inversion.log_weight.grad != 0
+        with torch.no_grad():
+            inversion.log_weight -= 50
+        assert inversion.weight > 0
+        assert inversion(torch.rand(1, 2, 8, 8, device=device), bank).isfinite().all()
+        assert list(inversion.state_dict()) == ["log_weight"]
+
+    def test_feature_a_network_sees_the_capture_and_then_the_layers_in_order(self, device):
+        capture, bank = torch.rand(2, 2, 9, 8, device=device), make_bank(device=device, dtype=torch.float32)
+        seen = Preconditioned(nn.Identity())(capture, bank)
+        assert seen.shape == (2, 2 + 3 * 2, 9, 8)
+        layers = TikhonovLayers(1.0)(capture, bank)
+        assert torch.equal(seen, torch.cat([capture, layers[:, 0], layers[:, 1], layers[:, 2]], dim=1))
+        seen = Preconditioned(nn.Identity(), Tikhonov())(capture, bank)
+        assert torch.equal(seen, torch.cat([capture, Tikhonov()(capture, bank)], dim=1))
+
+    def test_feature_gradients_reach_network_weight_and_masks(self, device):
+        optics = TiDyOptics(fidelity="draft").to(device)
+        bank = optics.psf_bank()
+        head = Preconditioned(nn.Conv2d(3 + 3 * len(bank.psfs), 1, 1)).to(device)
+        head(torch.rand(1, 3, 24, 20, device=device), bank).square().mean().backward()
+        for parameter in (optics.masks.phase, head.inversion.log_weight, head.network.weight):
+            assert parameter.grad.isfinite().all()
+            assert parameter.grad.abs().max() > 0
+
+    @pytest.mark.parametrize("module", [Tikhonov, TikhonovLayers])
+    def test_dynamo(self, module, device):
+        torch._dynamo.reset()
+        inversion, bank = module().to(device), make_bank(device=device, dtype=torch.float32)
+        capture = torch.rand(1, 2, 12, 9, device=device)
+        compiled = torch.compile(inversion, fullgraph=True, backend="eager")
+        self.assert_close(compiled(capture, bank), inversion(capture, bank), atol=0, rtol=0)
+
+    def test_feature_it_says_what_it_is(self):
+        assert repr(Tikhonov(0.5)) == "Tikhonov(weight=0.5, border='smooth', correlate=False)"
+
+    @pytest.mark.parametrize("module", [Tikhonov, TikhonovLayers])
+    def test_exception_of_the_constructor(self, module):
+        with pytest.raises(ValueError, match="weight must be positive and finite, got 0"):
+            module(0)
+        with pytest.raises(ValueError, match="border must be one of 'smooth', 'circular', got 'reflect'"):
+            module(border="reflect")
+
+    def test_exception_of_the_functions(self, device):
+        capture, psfs = torch.rand(1, 2, 8, 8, device=device), make_psfs(device=device)
+        with pytest.raises(
+            ValueError, match=r"\(..., 1, P, P\) with P odd for a capture of 1 channels, got \(3, 2, 5, 5\)"
+        ):
+            tikhonov_layers(capture[:, :1], psfs, 1.0)
+        with pytest.raises(ValueError, match=r"P odd .* got \(3, 2, 4, 4\)"):
+            tikhonov_layers(capture, psfs[..., 1:, 1:], 1.0)
+        with pytest.raises(ValueError, match=r"psf must have shape \(C, P, P\), got \(3, 2, 5, 5\)"):
+            tikhonov(capture, psfs, 1.0)
+        with pytest.raises(ValueError, match=r"weight must be positive and finite, got -1\.0"):
+            tikhonov(capture, psfs[0], -1.0)
+        with pytest.raises(ValueError, match=r"prior must have the capture's shape \(1, 2, 8, 8\), got \(1, 2, 8, 7\)"):
+            tikhonov(capture, psfs[0], 1.0, prior=capture[..., 1:])
+        with pytest.raises(ValueError, match="border must be one of 'smooth', 'circular', got 'valid'"):
+            tikhonov(capture, psfs[0], 1.0, border="valid")
+        with pytest.raises(ValueError, match=r"capture must have shape \(B, C, H, W\), got \(2, 8, 8\)"):
+            tikhonov(capture[0], psfs[0], 1.0)
+
+
+class TestRealScene(BaseTester):
+    @pytest.mark.parametrize(("sigma", "gain"), [(0.0, 3.5), (0.01, 2.5)])
+    def test_feature_a_cubic_masks_capture_gets_sharp(self, sigma, gain):
+        """Adirondack through a cubic mask of 20 rad: decibels of PSNR gained, in sRGB."""
+        scene = load_scene("middlebury-adirondack")
+        image, depth = scene.image[None, :, 100:356, 200:456], scene.depth[None, :, 100:356, 200:456]
+        depth = torch.where(depth.isfinite() & (depth > 0), depth, 2.2)
+        optics = TiDyOptics(masks=CubicMask(20.0), sensor=SensorNoise(sigma))
+        with torch.no_grad():
+            capture = optics(image, depth)
+            sharp = Tikhonov()(rgb_to_linear_rgb(capture), optics.psf_bank())
+        restored = linear_rgb_to_rgb(sharp.clamp(0, 1))
+        assert psnr(restored, image).item() > psnr(capture, image).item() + gain
+        assert math.isfinite(psnr(restored, image).item())
