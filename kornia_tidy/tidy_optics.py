@@ -69,7 +69,8 @@ class TiDyOptics(CodedLens):
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
         - ``optics((image, depth, ...))`` to ``(coded, depth, ...)``.
         - ``optics({"image": ..., "depth": ..., ...})`` to the same mapping with ``"image"`` coded, and
-          ``"all_in_focus"`` the clean image. The depth may stand under ``"mask_depth"`` instead.
+          ``"all_in_focus"`` the clean image. The depth may stand under ``"mask_depth"`` instead; a ``"mask"`` of what
+          is valid is cropped like the depth.
 
     Raises:
         TypeError: if image or depth are not floating-point tensors.
@@ -482,7 +483,8 @@ class TiDyOptics(CodedLens):
             )
         image, depth = sample["image"], sample[keys[0]]
         coded = self.capture(image, depth, params, generator)
-        return {**sample, "image": coded, "all_in_focus": self._cropped(image), keys[0]: self._cropped(depth)}
+        cropped = {name: self._cropped(sample[name]) for name in (keys[0], "mask") if name in sample}
+        return {**sample, "image": coded, "all_in_focus": self._cropped(image), **cropped}
 
 
 def _any_channels(function: Any, image: Tensor) -> Tensor:

@@ -59,8 +59,9 @@ def labels_of(psi: Tensor, bank: Bank) -> Tensor:
 
 def by_one_conv2d(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
     radius = bank.psfs.shape[-1] // 2
-    weight = bank.psfs.flip((-2, -1)).transpose(0, 1).reshape(-1, 1, 2 * radius + 1, 2 * radius + 1)
-    blurred = conv2d(pad(image, (radius,) * 4, mode="reflect"), weight, groups=3).unflatten(1, (3, -1))
+    weight, padded = bank.psfs.flip((-2, -1)).transpose(0, 1)[:, :, None], pad(image, (radius,) * 4, mode="reflect")
+    # Channel by channel: with groups=3 the same takes minutes.
+    blurred = torch.stack([conv2d(padded[:, c : c + 1], weight[c]) for c in range(3)], 1)
     return blurred.gather(2, labels_of(psi, bank)[:, None].expand(-1, 3, -1, -1, -1)).squeeze(2)
 
 
