@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -30,9 +33,19 @@ class SeeingHead(ReconstructionHead):
         return image
 
 
+@functools.cache
+def drawn(name):
+    return HEADS[name]()
+
+
+def fresh(name):
+    """A head as it starts."""
+    return copy.deepcopy(drawn(name))
+
+
 def trained(name):
-    """A head whose layers all matter: their last one starts small, and their statistics start as the identity."""
-    head = HEADS[name]()
+    """A head whose layers all matter: the last one starts small, and statistics start as the identity."""
+    head = fresh(name)
     generator = torch.Generator().manual_seed(1)
     for module in head.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
@@ -96,17 +109,17 @@ class TestReconstructionHead(BaseTester):
 class TestEveryHead(BaseTester):
     @every_head
     def test_smoke(self, name, device, dtype):
-        head = HEADS[name]().to(device, dtype)
+        head = fresh(name).to(device, dtype)
         out = head(torch.rand(2, 3, 64, 64, device=device, dtype=dtype))
         assert out.dtype == dtype
         assert out.isfinite().all()
 
     @every_head
-    @pytest.mark.parametrize("size", [(32, 64), (33, 31), (1, 50), (17, 3), (1, 1)])
-    def test_cardinality(self, name, size, device):
-        head = HEADS[name]().to(device).eval()
-        with torch.no_grad():
-            assert head(torch.rand(2, 3, *size, device=device)).shape == (2, head.out_channels, *size)
+    def test_cardinality(self, name, device):
+        head = fresh(name).to(device).eval()
+        for size in [(32, 64), (33, 31), (1, 50), (17, 3), (1, 1)]:
+            with torch.no_grad():
+                assert head(torch.rand(2, 3, *size, device=device)).shape == (2, head.out_channels, *size)
 
     @every_head
     def test_feature_images_of_a_batch_do_not_mix_when_predicting(self, name, device):
@@ -117,7 +130,7 @@ class TestEveryHead(BaseTester):
     @pytest.mark.parametrize("name", ["attention", "phasecam3d"])
     def test_feature_a_shift_by_the_stride_is_a_shift(self, name, device):
         """Where the borders, which are padded with zeros inside, are out of sight. MiDaS interpolates across all."""
-        head = HEADS[name]().to(device).double().eval()
+        head = fresh(name).to(device).double().eval()
         image = torch.zeros(2, 3, 256, 256, device=device, dtype=torch.float64)
         image[0, :, 100:104, 100:104] = 1
         image[1] = image[0].roll((16, 16), (1, 2))
@@ -129,7 +142,7 @@ class TestEveryHead(BaseTester):
 
     @every_head
     def test_feature_every_parameter_that_may_learn_gets_a_gradient(self, name, device):
-        head = HEADS[name]().to(device)
+        head = fresh(name).to(device)
         torch.manual_seed(1)
         for parameter in head.parameters():  # zero residual units hide what is before them
             if not parameter.any():
@@ -142,36 +155,41 @@ class TestEveryHead(BaseTester):
 
     @every_head
     def test_feature_a_few_steps_learn_one_picture(self, name, device):
-        head = HEADS[name]().to(device)
+        head = fresh(name).to(device)
         image = torch.rand(2, 3, 32, 32, device=device)
         target = image.mean(1, keepdim=True).expand(2, head.out_channels, 32, 32).roll(5, -1)
-        optimiser = torch.optim.Adam(head.parameters(), lr=1e-2 if name != "midas" else 1e-3)
+        optimiser = torch.optim.Adam(head.parameters(), lr=1e-4 if name == "midas" else 1e-2)
         errors = []
-        for _ in range(8):
+        for _ in range(4):
             error = (head(image) - target).square().mean()
             optimiser.zero_grad()
             error.backward()
             optimiser.step()
             errors.append(error.item())
-        assert errors[-1] < 0.9 * errors[0]
+        assert errors[-1] < 0.95 * errors[0]
 
     @every_head
     def test_feature_a_reset_draws_anew_and_follows_the_seed(self, name, device):
-        torch.manual_seed(3)
-        head = HEADS[name]().to(device)
+        head = fresh(name).to(device)
         first = {key: value.clone() for key, value in head.state_dict().items()}
         head(torch.rand(2, 3, 32, 64, device=device))  # statistics move
-        head.reset_parameters()
-        again = head.state_dict()
-        same = {key for key in first if torch.equal(first[key], again[key])}
-        drawn = {key for key in first if first[key].ndim == 4 and first[key].any()}
-        assert same == set(first) - drawn
         torch.manual_seed(3)
-        if device.type == "cpu":
-            HEADS[name]()  # the constructor's own first draw
-            torch.manual_seed(3)
-            other = HEADS[name]().state_dict()
-            assert all(torch.equal(first[key], other[key]) for key in first)
+        head.reset_parameters()
+        again = {key: value.clone() for key, value in head.state_dict().items()}
+        random = {key for key in first if first[key].ndim == 4 and first[key].any()}
+        assert {key for key in first if torch.equal(first[key], again[key])} == set(first) - random
+        torch.manual_seed(3)
+        head.reset_parameters()
+        assert all(torch.equal(value, again[key]) for key, value in head.state_dict().items())
+
+    @every_head
+    def test_feature_weights_start_with_the_spread_that_keeps_the_variance(self, name):
+        """He: 2 / fan_in; 1 / fan_in in MiDaS' decoder, which nothing normalises. Of the larger weights, to 10 %."""
+        for label, weight in fresh(name).named_parameters():
+            if weight.ndim == 4 and weight.numel() > 2000 and weight.any():
+                gain = 1 if label.startswith("scratch") else 2
+                expected = (gain / weight[0].numel()) ** 0.5
+                assert abs(weight.std().item() / expected - 1) < 0.1, label
 
     @every_head
     def test_feature_half_precision_autocast_is_near(self, name, device):
@@ -203,14 +221,15 @@ class TestEveryHead(BaseTester):
     @every_head
     def test_gradcheck(self, name, device):
         head = trained(name).to(device).double()
-        image = torch.rand(1, 3, 17, 30, device=device, dtype=torch.float64)
-        assert torch.autograd.functional.jvp(head, image, torch.randn_like(image))[1].abs().max() > 1e-3
+        image = torch.rand(1, 3, 17, 30, device=device, dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(head(image).sum(), image)
+        assert gradient.abs().max() > 1e-2  # well above the check's tolerance
         self.gradcheck(head, (image,))
 
-    @every_head
-    def test_dynamo_is_one_graph(self, name, device):
+    def test_dynamo_is_one_graph(self, device):
+        """Of the smallest: tracing takes seconds, and the exports below trace them all."""
         torch._dynamo.reset()
-        head, image = trained(name).to(device), torch.rand(1, 3, 30, 33, device=device)
+        head, image = trained("phasecam3d").to(device), torch.rand(1, 3, 30, 33, device=device)
         with torch.no_grad():
             self.assert_close(torch.compile(head, fullgraph=True, backend="eager")(image), head(image))
 
