@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from kornia_tidy.reconstruction import AttentionUNet, MiDaSSmall, PhaseCam3DUNet, ReconstructionHead
 from tests.base import BaseTester
-from tests.reconstruction.onnx_export import check_onnx
 
 HEADS = {
     "attention": lambda: AttentionUNet(width=2),
@@ -232,10 +231,3 @@ class TestEveryHead(BaseTester):
         head, image = trained("phasecam3d").to(device), torch.rand(1, 3, 30, 33, device=device)
         with torch.no_grad():
             self.assert_close(torch.compile(head, fullgraph=True, backend="eager")(image), head(image))
-
-    @every_head
-    def test_feature_onnx_is_equal(self, name):
-        check_onnx(trained(name), torch.rand(1, 3, 37, 50))
-
-    def test_feature_onnx_takes_another_batch(self):
-        check_onnx(SeeingHead(3, 3), torch.rand(2, 3, 13, 16), torch.rand(5, 3, 13, 16))
