@@ -1,1 +1,21 @@
-"""From captures back to scenes: all-in-focus images and depth maps."""
+"""From captures back to the scene: networks and inversion for the all-in-focus image and the depth, losses, metrics."""
+
+from kornia_tidy.reconstruction.attention_unet import AttentionUNet
+from kornia_tidy.reconstruction.head import ReconstructionHead
+from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
+from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
+from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
+from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
+
+__all__ = [
+    "AttentionUNet",
+    "JointEstimate",
+    "JointHead",
+    "MiDaSSmall",
+    "PhaseCam3DUNet",
+    "Preconditioned",
+    "ReconstructionHead",
+    "Tikhonov",
+    "TikhonovLayers",
+    "load_midas_small",
+]

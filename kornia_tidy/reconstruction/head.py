@@ -1,0 +1,87 @@
+"""What every reconstruction network does: takes a picture of any size and returns maps of the same size."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from kornia_tidy.checks import check_float_tensor
+
+
+class ReconstructionHead(nn.Module, ABC):
+    """Base of the networks: a head defines :meth:`predict` for sizes that are multiples of its ``stride``.
+
+    Args:
+        in_channels: channels of the image.
+        out_channels: maps to estimate.
+
+    Shape:
+        - image: (B, in_channels, H, W), of any size.
+        - output: (B, out_channels, H, W).
+
+    Raises:
+        ValueError: if the image has another rank or number of channels, or a number of channels is not positive.
+        TypeError: if the image is not a floating-point tensor.
+
+    Convention:
+        - An image whose sides are no multiples of ``stride`` is continued at its borders, half of what is missing on
+          each side, and the result is cropped. It is continued by reflection, which makes no edge where there is
+          none; where a side is too short to be reflected that far, by repeating the outermost pixels.
+        - An ONNX export holds the padding of the size it was made for; the batch may be dynamic.
+    """
+
+    stride: int
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        check_count("in_channels", in_channels)
+        check_count("out_channels", out_channels)
+        self.in_channels = in_channels
+        self.out_channels = out_channels
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return the estimated maps, (B, out_channels, H, W)."""
+        check_float_tensor("image", image, 4, "(B, C, H, W)")
+        if image.shape[1] != self.in_channels:
+            raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}")
+        height, width = image.shape[-2:]
+        top, bottom = _margins(height, self.stride)
+        left, right = _margins(width, self.stride)
+        if bottom or right:
+            mode = "reflect" if bottom < height and right < width else "replicate"
+            image = functional.pad(image, (left, right, top, bottom), mode)
+        return self.predict(image)[..., top : top + height, left : left + width]
+
+    @abstractmethod
+    def predict(self, image: Tensor) -> Tensor:
+        """Return the maps of an image whose sides are multiples of ``stride``."""
+
+    def reset_parameters(self) -> None:
+        """Draw all parameters anew from the global generator.
+
+        Convolutions get He's normal weights, which keep the variance from layer to layer through rectified units,
+        and no bias; batch normalisation starts as the identity on normalised values, with empty statistics.
+
+        Source: He et al., Delving Deep into Rectifiers (ICCV 2015), equation 10.
+        """
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+            elif isinstance(module, nn.BatchNorm2d):
+                module.reset_parameters()
+
+
+def check_count(name: str, value: int, least: int = 1) -> None:
+    """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
+    if not isinstance(value, int) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+
+
+def _margins(size: int, multiple: int) -> tuple[int, int]:
+    """Return the pixels to add before and after ``size`` to make it a multiple."""
+    missing = -size % multiple
+    return missing // 2, missing - missing // 2

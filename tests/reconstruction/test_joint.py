@@ -1,0 +1,36 @@
+"""Depth and image by name."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_tidy.reconstruction import AttentionUNet, JointHead, MiDaSSmall, PhaseCam3DUNet
+from tests.base import BaseTester
+from tests.reconstruction.onnx_export import check_onnx
+from tests.reconstruction.test_head import SeeingHead
+
+
+class TestJointHead(BaseTester):
+    @pytest.mark.parametrize("make", [AttentionUNet, PhaseCam3DUNet, MiDaSSmall])
+    def test_smoke_any_head_can_be_joint(self, make, device):
+        small = {} if make is MiDaSSmall else {"width": 2}
+        head = JointHead(make(out_channels=4, **small)).to(device).eval()
+        with torch.no_grad():
+            estimate = head(torch.rand(2, 3, 21, 40, device=device))
+        assert estimate.depth.shape == (2, 1, 21, 40)
+        assert estimate.image.shape == (2, 3, 21, 40)
+
+    def test_convention_depth_is_the_first_channel(self, device, dtype):
+        maps = torch.rand(2, 4, 8, 8, device=device, dtype=dtype)
+        depth, image = JointHead(SeeingHead(4, 4))(maps)
+        assert torch.equal(depth, maps[:, :1])
+        assert torch.equal(image, maps[:, 1:])
+
+    def test_exception_names_the_outputs(self):
+        with pytest.raises(ValueError, match="network must have 4 outputs, depth and three colours, got 3"):
+            JointHead(AttentionUNet(width=2))
+
+    def test_feature_onnx_has_both_outputs(self):
+        names = check_onnx(JointHead(SeeingHead(4, 4)), torch.rand(1, 4, 13, 16))
+        assert len(names) == 2
