@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import TextIO
 
 import kornia_tidy
-from kornia_tidy.commands import demo, simulate, trade
+from kornia_tidy.commands import demo, evaluate, simulate, trade, train
 
-COMMANDS = (simulate, demo, trade)  # each with add_parser(subparsers), which sets run(args)
+COMMANDS = (simulate, demo, trade, train, evaluate)  # each with add_parser(subparsers), which sets run(args)
 
 DESCRIPTION = """\
 A programmable camera: a phase mask in its lens changes while the shutter is open, so that each depth of the scene

@@ -45,7 +45,8 @@ def train(
     Args:
         settings: what is trained, and how.
         folder: made if missing. It gets ``settings.json``, ``last.safetensors`` (to go on from), ``best.safetensors``
-            (weights of the best epoch), ``training.csv``, ``validation.csv``, ``pictures/`` and a TensorBoard log.
+            (weights of the best epoch), ``training.csv``, ``validation.csv``, ``pictures/`` and a TensorBoard log;
+            with ``pretrain_epochs`` the same of that stage in ``pretrain/``.
         resume: go on with the run in the folder, if there is one.
         head_from: checkpoint whose network is taken to begin with, such as one trained with a fixed Fresnel lens.
         save_every: steps between checkpoints within an epoch.
@@ -62,6 +63,11 @@ def train(
     """
     folder = Path(folder)
     checkpoint = _prepare(folder, settings, resume)
+    if settings.pretrain_epochs and checkpoint is None:
+        first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
+        stage = {"head_from": head_from, "save_every": save_every, "workers": workers, "progress": progress}
+        train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
+        head_from = folder / "pretrain" / LAST
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
     module = TidyTraining.from_settings(settings)
     assert module.settings is not None
@@ -135,6 +141,7 @@ def _prepare(folder: Path, settings: TrainingSettings, resume: bool) -> Path | N
     if not resume:
         if last.exists():
             raise ValueError(f"{folder} holds a run already: resume it, or choose another folder")
+        settings.write(path)
         return None
     if path.exists():
         stored = TrainingSettings.read(path)

@@ -49,6 +49,8 @@ class TrainingSettings:
         batch: scenes in a batch.
         accumulate: batches in a step of the optimiser.
         epochs: passes over the data.
+        pretrain_epochs: passes before these in which the network alone learns, behind a fixed Fresnel lens. The paper
+            takes 300 for the tasks edof and joint.
         patience: stop after so many epochs without improvement. None: never.
         ema: decay of the moving average of the network. 0: none.
         depth_weight: of the depth loss in the joint task.
@@ -88,6 +90,7 @@ class TrainingSettings:
     batch: int = 32
     accumulate: int = 1
     epochs: int = 300
+    pretrain_epochs: int = 0
     patience: int | None = None
     ema: float = 0.999
     depth_weight: float = 1.0
@@ -104,7 +107,7 @@ class TrainingSettings:
         for name in ("focal_length", "pixel_pitch", "lr", "lr_metres"):
             check_positive(name, getattr(self, name))
         least = {"masks": 0, "size": 1, "scenes": 1, "validation_scenes": 1, "batch": 1, "accumulate": 1, "epochs": 1}
-        for name, lowest in {**least, "seed": 0}.items():
+        for name, lowest in {**least, "pretrain_epochs": 0, "seed": 0}.items():
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
