@@ -1,11 +1,12 @@
 """Put a learnable camera in front of an ordinary PyTorch training loop, here for depth.
 
-    python examples/plain_training_loop.py --steps 200
+python examples/plain_training_loop.py --steps 200
 """
 
 import argparse
 
 import torch
+
 from kornia_tidy import TiDyOptics
 from kornia_tidy.training.heads import PlainHead
 from kornia_tidy.training.scenes import DeadLeavesScenes

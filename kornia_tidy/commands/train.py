@@ -158,7 +158,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)
-    """Add an option for a setting; one that is not given does not appear, so that stored settings can take its place."""
+    """Add an option for a setting. One that is not given does not appear, and leaves its place to stored settings."""
     default = next(field.default for field in fields(TrainingSettings) if field.name == name)
     told = help if default is None else f"{help} (default: {default})"
     group.add_argument(f"--{name.replace('_', '-')}", dest=name, default=argparse.SUPPRESS, help=told, **options)

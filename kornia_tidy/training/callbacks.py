@@ -38,25 +38,25 @@ class SaveCheckpoints(pl.Callback):
         self._saved_step = 0
         self._pending: Mapping[str, Any] | None = None
 
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:  # noqa: ARG002
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Begin counting, and stop a run that had stopped."""
         self._saved_step = trainer.global_step
         self._stop_if_old(trainer)
 
-    def on_train_batch_start(self, *args: Any) -> None:  # noqa: ARG002
+    def on_train_batch_start(self, *args: Any) -> None:
         """Put the generators where they were: only here is all done that may draw from them on the way."""
         if self._pending is not None:
             set_random_state(self._pending)
             self._pending = None
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any) -> None:  # noqa: ARG002
+    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any) -> None:
         """Save within an epoch. Its last step is saved when the epoch has been validated."""
         step = trainer.global_step
         last = trainer.fit_loop.epoch_loop.batch_progress.current.ready == trainer.num_training_batches
         if step % self.every == 0 and step != self._saved_step and not last:
             self._save(trainer)
 
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:  # noqa: ARG002
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Keep the best weights."""
         if trainer.sanity_checking or self.monitor not in trainer.callback_metrics:
             return
@@ -68,7 +68,7 @@ class SaveCheckpoints(pl.Callback):
             self.waited += 1
         self._stop_if_old(trainer)
 
-    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:  # noqa: ARG002
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save."""
         self._save(trainer)
 
@@ -101,14 +101,14 @@ class WriteLog(pl.Callback):
         self.folder, self.every = Path(folder), every
         self._since, self._step = 0.0, 0
 
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:  # noqa: ARG002
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Forget lines of steps that will be taken again."""
         self._since, self._step = time.perf_counter(), trainer.global_step
         if trainer.is_global_zero:
             for name in ("training.csv", "validation.csv"):
                 drop_rows_after(self.folder / name, trainer.global_step)
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any) -> None:  # noqa: ARG002
+    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any) -> None:
         """Add a line for a step."""
         step = trainer.global_step
         if step == self._step or step % self.every:
@@ -118,7 +118,7 @@ class WriteLog(pl.Callback):
         self._write(trainer, "training.csv", {**row, "seconds_a_step": round(seconds, 4)})
         self._since, self._step = time.perf_counter(), step
 
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:  # noqa: ARG002
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Add a line for an epoch."""
         if trainer.sanity_checking:
             return
@@ -144,7 +144,9 @@ class DrawPictures(pl.Callback):
         self.folder, self.every = Path(folder), every
         self._batch: Any = None
 
-    def on_validation_batch_start(self, trainer: pl.Trainer, pl_module: Any, batch: Any, batch_idx: int, *_: Any) -> None:
+    def on_validation_batch_start(
+        self, trainer: pl.Trainer, pl_module: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
         """Keep the first scenes."""
         if batch_idx == 0 and trainer.is_global_zero:
             self._batch = batch

@@ -18,7 +18,7 @@ class SafetensorsIO(CheckpointIO):
         self,
         checkpoint: dict[str, Any],
         path: str | os.PathLike[str],
-        storage_options: Any | None = None,  # noqa: ARG002 (Lightning's signature)
+        storage_options: Any | None = None,
     ) -> None:
         """Write a checkpoint. See :func:`~kornia_tidy.training.state_file.write_state`."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -27,8 +27,8 @@ class SafetensorsIO(CheckpointIO):
     def load_checkpoint(
         self,
         path: str | os.PathLike[str],
-        map_location: Any | None = None,  # noqa: ARG002
-        weights_only: bool | None = None,  # noqa: ARG002 (there is nothing else in them)
+        map_location: Any | None = None,
+        weights_only: bool | None = None,
     ) -> dict[str, Any]:
         """Read a checkpoint, on the CPU. See :func:`~kornia_tidy.training.state_file.read_state`."""
         return read_state(path)

@@ -25,7 +25,13 @@ class SceneData(pl.LightningDataModule):
     """
 
     def __init__(
-        self, train: Dataset, validation: Dataset, batch: int = 32, seed: int = 0, augment: bool = False, workers: int = 0
+        self,
+        train: Dataset,
+        validation: Dataset,
+        batch: int = 32,
+        seed: int = 0,
+        augment: bool = False,
+        workers: int = 0,
     ) -> None:
         super().__init__()
         self.train, self.validation = train, validation

@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from kornia_tidy.checks import check_choice
 
@@ -60,5 +58,5 @@ class PlainHead(nn.Module):
         """Return the maps."""
         features = image
         for layer in self.layers[:-1]:
-            features = F.leaky_relu(layer(features), 0.1)
+            features = nn.functional.leaky_relu(layer(features), 0.1)
         return self.layers[-1](features)

@@ -136,14 +136,14 @@ class TidyTraining(pl.LightningModule):
         mask = torch.ones_like(sample["depth"], dtype=torch.bool) if mask is None else mask
         return Seen(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
 
-    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:  # noqa: ARG002 (Lightning's signature)
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
         seen = self.see(batch)
         loss = task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)
         self.log("loss", loss.detach(), prog_bar=True, batch_size=len(seen.coded))
         return loss
 
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:  # noqa: ARG002
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Log the mean over all scenes of the loss and of each map's root mean squared error."""
         seen = self.see(batch)
         scores = {"val_loss": task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)}
@@ -158,6 +158,11 @@ class TidyTraining(pl.LightningModule):
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
         groups.append({"params": list(self.head.parameters()), "lr": self.lr})
         return torch.optim.Adam(groups, lr=self.lr, betas=self.betas)
+
+    def on_train_start(self) -> None:
+        """Compute all PSFs at once: those of a fixed lens are remembered, and rounded by what is computed with them."""
+        with torch.no_grad():
+            self.optics.psf_bank()
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Take a step, and let the average follow."""

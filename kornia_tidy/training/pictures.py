@@ -8,7 +8,6 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.tidy_optics import TiDyOptics
@@ -84,7 +83,7 @@ def error_map(estimate: Tensor, truth: Tensor) -> Tensor:
 
 def enlarged(picture: Tensor) -> Tensor:
     """Return a picture with its pixels repeated to squares."""
-    return F.interpolate(picture[None], scale_factor=float(SCALE), mode="nearest")[0]
+    return torch.nn.functional.interpolate(picture[None], scale_factor=float(SCALE), mode="nearest")[0]
 
 
 def _grid(rows: list[list[Tensor]]) -> Tensor:

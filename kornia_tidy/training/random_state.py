@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 
 def keyed_seed(*keys: int | str) -> int:
@@ -76,4 +75,3 @@ def seeded(seed: int) -> Generator[None]:
         torch.set_rng_state(before[0])
         np.random.set_state(before[1])  # noqa: NPY002
         random.setstate(before[2])
-

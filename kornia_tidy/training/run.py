@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
 
@@ -101,7 +102,7 @@ def train(
         "log_every_n_steps": 10,
         **trainer_options,
     }
-    with _quiet_lightning():
+    with _contained():
         trainer = pl.Trainer(
             plugins=[SafetensorsIO()],
             callbacks=callbacks,
@@ -153,10 +154,11 @@ def _prepare(folder: Path, settings: TrainingSettings, resume: bool) -> Path | N
 
 
 @contextmanager
-def _quiet_lightning() -> Generator[None]:
-    """Spare the user advertisements, advice about workers, and what Lightning uses of torch that is to go."""
+def _contained() -> Generator[None]:
+    """Keep Lightning's doings in a block: determinism for all of torch, advertisements, advice, old uses of torch."""
     logger = logging.getLogger("lightning.pytorch")
     level = logger.level
+    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
@@ -167,3 +169,4 @@ def _quiet_lightning() -> Generator[None]:
             yield
     finally:
         logger.setLevel(level)
+        torch.use_deterministic_algorithms(before[0], warn_only=before[1])

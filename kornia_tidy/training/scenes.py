@@ -102,7 +102,7 @@ class EpochBatches(Sampler):
             length, batch, seed, shuffle, rank, world,
         )  # fmt: skip
         self.epoch = self.first = 0
-        if length < batch * world and shuffle or length < world:
+        if (length < batch * world and shuffle) or length < world:
             raise ValueError(f"{length} scenes do not fill a batch of {batch} for each of {world} processes")
 
     @property
@@ -111,8 +111,8 @@ class EpochBatches(Sampler):
         return self
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch, from its beginning if it is another."""
-        if epoch != self.epoch:
+        """Choose the epoch, from its beginning if it is another. Without shuffling all are the same, noise included."""
+        if self.shuffle and epoch != self.epoch:
             self.start(epoch, 0)
 
     def start(self, epoch: int, first: int) -> None:

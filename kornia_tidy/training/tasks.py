@@ -75,9 +75,7 @@ def task_loss(
     loss: Loss, estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor], mask: Tensor, weights: Mapping[str, float]
 ) -> Tensor:
     """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known."""
-    terms = [
-        weights[name] * loss(estimate[name], truth[name], mask if name == "depth" else None) for name in estimate
-    ]
+    terms = [weights[name] * loss(estimate[name], truth[name], mask if name == "depth" else None) for name in estimate]
     return sum(terms[1:], terms[0])
 
 

@@ -37,7 +37,7 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
         >>> build_optics(TrainingSettings(masks=2, window=23)).window
         23
     """
-    lens = {"focal_length": settings.focal_length, "pixel_pitch": settings.pixel_pitch}
+    lens: dict[str, Any] = {"focal_length": settings.focal_length, "pixel_pitch": settings.pixel_pitch}
     near_far = settings.depth_range
     camera = ThinLensCamera(**lens) if near_far is None else ThinLensCamera.for_scene(near_far, **lens)
     noise = torch.Generator().manual_seed(settings.seed)

@@ -60,21 +60,26 @@ def main(folder: Path, kills: int) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DeprecationWarning)  # of fork in a process that has threads
     heads.HEADS["dropout"] = "__main__:DropoutHead"
-    start = time.perf_counter()
     assert wait(child(folder / "whole")) == 0
-    seconds = time.perf_counter() - start
-    chance = random.Random(time.time_ns())
-    steps, moments = [], []
-    for _ in range(kills):
-        moments.append(chance.uniform(0.15, 0.6) * seconds)
+    chance, killed_at = random.Random(time.time_ns()), []
+    for kill in range(kills):
+        done, room = reached(folder), 19 // kills
         process = child(folder / "killed")
-        time.sleep(moments[-1])
+        target = min(done + chance.randrange(1, room), 20)
+        while reached(folder) < target:
+            time.sleep(0.001)
+        time.sleep(chance.uniform(0, 0.05))  # into a later step, a save of it, or validation
         os.kill(process, signal.SIGKILL)
-        assert wait(process) in {0, -signal.SIGKILL}
-        last = folder / "killed" / "last.safetensors"
-        steps.append(read_state(last)["global_step"] if last.exists() else 0)
+        assert wait(process) in {0, -signal.SIGKILL}, f"kill {kill} came too late for a run that failed"
+        killed_at.append(reached(folder))
     assert wait(child(folder / "killed")) == 0
-    print(json.dumps({"steps": steps, "moments": moments, "seconds": seconds}))
+    print(json.dumps(killed_at))
+
+
+def reached(folder: Path) -> int:
+    """The step of the last checkpoint of the run that is killed."""
+    last = folder / "killed" / "last.safetensors"
+    return read_state(last)["global_step"] if last.exists() else 0
 
 
 if __name__ == "__main__":
