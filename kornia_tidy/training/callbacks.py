@@ -11,6 +11,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 
 from kornia_tidy.training.pictures import draw_pictures
 from kornia_tidy.training.random_state import random_state, set_random_state
@@ -43,13 +44,13 @@ class SaveCheckpoints(pl.Callback):
         self._saved_step = trainer.global_step
         self._stop_if_old(trainer)
 
-    def on_train_batch_start(self, *args: Any) -> None:
+    def on_train_batch_start(self, *args: Any, **kwargs: Any) -> None:
         """Put the generators where they were: only here is all done that may draw from them on the way."""
         if self._pending is not None:
             set_random_state(self._pending)
             self._pending = None
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any) -> None:
+    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any, **kwargs: Any) -> None:
         """Save within an epoch. Its last step is saved when the epoch has been validated."""
         step = trainer.global_step
         last = trainer.fit_loop.epoch_loop.batch_progress.current.ready == trainer.num_training_batches
@@ -108,7 +109,7 @@ class WriteLog(pl.Callback):
             for name in ("training.csv", "validation.csv"):
                 drop_rows_after(self.folder / name, trainer.global_step)
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any) -> None:
+    def on_train_batch_end(self, trainer: pl.Trainer, *args: Any, **kwargs: Any) -> None:
         """Add a line for a step."""
         step = trainer.global_step
         if step == self._step or step % self.every:
@@ -158,7 +159,7 @@ class DrawPictures(pl.Callback):
             return
         pictures = draw_pictures(pl_module.optics, pl_module.see(self._batch), self.folder, trainer.current_epoch)
         for logger in trainer.loggers:
-            if isinstance(logger, pl.loggers.TensorBoardLogger):
+            if isinstance(logger, TensorBoardLogger):
                 for name, picture in pictures.items():
                     logger.experiment.add_image(name, picture, trainer.global_step)
         self._batch = None

@@ -92,7 +92,7 @@ def train(
     ]
     if progress:
         callbacks.append(pl.callbacks.TQDMProgressBar(leave=False))
-    options = {
+    options: dict[str, Any] = {
         "max_epochs": settings.epochs,
         "accumulate_grad_batches": settings.accumulate,
         "precision": settings.precision,

@@ -67,7 +67,8 @@ def main(folder: Path, kills: int) -> None:
         process = child(folder / "killed")
         target = min(done + chance.randrange(1, room), 20)
         while reached(folder) < target:
-            time.sleep(0.001)
+            time.sleep(0.005)
+            assert not os.waitid(os.P_PID, process, os.WEXITED | os.WNOHANG | os.WNOWAIT), "it ended by itself"
         time.sleep(chance.uniform(0, 0.05))  # into a later step, a save of it, or validation
         os.kill(process, signal.SIGKILL)
         assert wait(process) in {0, -signal.SIGKILL}, f"kill {kill} came too late for a run that failed"
