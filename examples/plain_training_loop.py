@@ -15,23 +15,22 @@ from kornia_tidy.training.tasks import mean_square, nearness
 
 def main(arguments: list[str] | None = None) -> list[float]:
     """Train, and return the loss of every step."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=100, help="steps (default: 100)")
-    options = parser.parse_args(arguments)
+    scenes = DeadLeavesScenes(4 * parser.parse_args(arguments).steps, size=64)
     torch.manual_seed(0)
-    loader = torch.utils.data.DataLoader(DeadLeavesScenes(4 * options.steps, size=64), batch_size=4)
-    network = PlainHead(out_channels=1)
-    optics = TiDyOptics()  # line 1: the camera
-    groups = optics.parameter_groups(lr_metres=1e-8)  # line 2: its masks, in metres of height
-    optimizer = torch.optim.Adam([*groups, {"params": network.parameters()}], lr=1e-3, betas=(0.99, 0.999))
+    loader = torch.utils.data.DataLoader(scenes, batch_size=4)
+    network, optics = PlainHead(out_channels=1), TiDyOptics()  # line 1: the camera
+    groups = [*optics.parameter_groups(lr_metres=1e-8), {"params": network.parameters()}]  # line 2: its masks
+    optimizer = torch.optim.Adam(groups, lr=1e-3, betas=(0.99, 0.999))
     losses = []
     for batch in loader:
         coded = optics(batch["image"], batch["depth"])  # line 3: the network sees captures, not images
         loss = mean_square(network(coded), nearness(optics.camera, batch["depth"]), batch["mask"])
-        optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(float(loss.detach()))
+        optimizer.zero_grad()
+        losses.append(loss.item())
     print(f"loss {losses[0]:.4f} at first, {losses[-1]:.4f} at last")
     return losses
 
