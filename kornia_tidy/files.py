@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
@@ -34,6 +35,18 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
         FileNotFoundError: if the folder does not exist.
         ValueError: if the path is a folder.
     """
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
+    """Give another name in the same folder to write to; what is written there takes the file's place, if all went well.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+        ValueError: if the path is a folder.
+    """
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
@@ -41,7 +54,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
         raise ValueError(f"cannot write {path}: it is a folder")
     temporary = path.with_name(f".{uuid4().hex}.tmp")
     try:
-        temporary.write_bytes(data)
+        yield temporary
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -173,3 +173,24 @@ class TestMotionBlur(BaseTester):
         assert one < 1e-6
         assert min(random, learnt) > 1e-3
         assert picture(tmp_path / "motion_blur.png").float().std() > 20
+
+
+@pytest.mark.parametrize("example", ["plain_training_loop"], indirect=True)
+class TestPlainTrainingLoop(BaseTester):
+    def test_feature_the_loss_falls_in_under_forty_lines(self, example, capsys):
+        losses = example.main(["--steps", "30"])
+        assert len(losses) == 30
+        assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+        assert "at first" in capsys.readouterr().out
+        assert len(Path(example.__file__).read_text().splitlines()) < 40
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")
+@pytest.mark.filterwarnings("ignore:.*smaller than the logging interval")
+@pytest.mark.parametrize("example", ["lightning_training"], indirect=True)
+class TestLightningTraining(BaseTester):
+    def test_feature_a_network_of_ones_own_is_trained_saved_and_used(self, example, tmp_path):
+        pytest.importorskip("lightning.pytorch")
+        error = example.main(["--epochs", "2", "--scenes", "8", "--size", "48", "--output", str(tmp_path)])
+        assert 0 < error < 0.3
+        assert {"best.safetensors", "last.safetensors"} == {path.name for path in tmp_path.iterdir()}

@@ -1,0 +1,39 @@
+"""Put a learnable camera in front of an ordinary PyTorch training loop, here for depth.
+
+python examples/plain_training_loop.py --steps 200
+"""
+
+import argparse
+
+import torch
+
+from kornia_tidy import TiDyOptics
+from kornia_tidy.training.heads import PlainHead
+from kornia_tidy.training.scenes import DeadLeavesScenes
+from kornia_tidy.training.tasks import mean_square, nearness
+
+
+def main(arguments: list[str] | None = None) -> list[float]:
+    """Train, and return the loss of every step."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=100, help="steps (default: 100)")
+    scenes = DeadLeavesScenes(4 * parser.parse_args(arguments).steps, size=64)
+    torch.manual_seed(0)
+    loader = torch.utils.data.DataLoader(scenes, batch_size=4)
+    network, optics = PlainHead(out_channels=1), TiDyOptics()  # line 1: the camera
+    groups = [*optics.parameter_groups(lr_metres=1e-8), {"params": network.parameters()}]  # line 2: its masks
+    optimizer = torch.optim.Adam(groups, lr=1e-3, betas=(0.99, 0.999))
+    losses = []
+    for batch in loader:
+        coded = optics(batch["image"], batch["depth"])  # line 3: the network sees captures, not images
+        loss = mean_square(network(coded), nearness(optics.camera, batch["depth"]), batch["mask"])
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(loss.item())
+    print(f"loss {losses[0]:.4f} at first, {losses[-1]:.4f} at last")
+    return losses
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""`kornia-tidy train`: learn masks and network together."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from kornia_tidy.commands.options import seed
+from kornia_tidy.commands.report import tell
+from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.scene.compositing import COMPOSITING
+from kornia_tidy.training.heads import HEADS
+from kornia_tidy.training.lightning_extra import require_lightning
+from kornia_tidy.training.scenes import SCENES
+from kornia_tidy.training.settings import PRECISIONS, TrainingSettings
+from kornia_tidy.training.tasks import MAPS
+
+DESCRIPTION = """\
+Learn the phase masks of a camera together with the network that reads its captures:
+an all-in-focus image (edof), a depth map (depth), or both (joint).
+"""
+
+EPILOG = """\
+FOLDER gets settings.json, last.safetensors (to go on from), best.safetensors (weights of
+the best epoch), training.csv, validation.csv, pictures of masks, PSFs and estimates in
+pictures/, and a log for `tensorboard --logdir FOLDER`. Stop with Ctrl-C, or lose power:
+--resume goes on, with the stored settings, and ends with the same weights as a run that
+was never stopped (to the bit on one CPU process).
+
+examples:
+  The paper's extended depth of field, on scenes made here:
+    kornia-tidy train --task edof --masks 5 --pretrain-epochs 300 -o outputs/edof
+  A first look, in minutes:
+    kornia-tidy train --task depth --size 96 --scenes 64 --batch 4 --epochs 5 -o outputs/look
+  Goes on after an interruption; a longer run may be asked for:
+    kornia-tidy train --resume --epochs 400 -o outputs/edof
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the command to argparse."""
+    parser = subparsers.add_parser(
+        "train",
+        help="learn masks and network together",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument(
+        "-o", "--output", default="outputs/train", metavar="FOLDER", help="made if missing (default: outputs/train)"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on with the run in FOLDER, if there is one")
+    parser.add_argument("--head-from", metavar="CHECKPOINT", help="begin with the network of another run")
+
+    system = parser.add_argument_group("what is learnt")
+    _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
+    _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
+    _setting(system, "head", choices=tuple(HEADS), help="network")
+    _setting(system, "width", type=int, metavar="C", help="channels of its first level")
+    _setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
+    _setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
+
+    data = parser.add_argument_group("scenes")
+    add_scene_options(data)
+    _setting(data, "scenes", type=int, metavar="N", help="number for training, of scenes made here")
+    _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation")
+
+    camera = parser.add_argument_group("camera")
+    _setting(
+        camera,
+        "depth_range",
+        type=float,
+        nargs=2,
+        metavar=("NEAR", "FAR"),
+        help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
+    )
+    _setting(camera, "focal_length", type=float, metavar="M", help="metres")
+    _setting(camera, "pixel_pitch", type=float, metavar="M", help="metres")
+    _setting(camera, "sigma", type=float, metavar="S", help="read noise, of full scale")
+    _setting(camera, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
+    _setting(camera, "compositing", choices=tuple(COMPOSITING), help="of depths")
+    _setting(camera, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
+
+    learning = parser.add_argument_group("learning")
+    _setting(learning, "epochs", type=int, metavar="N", help="passes over the scenes")
+    _setting(learning, "pretrain_epochs", type=int, metavar="N", help="before, with a fixed Fresnel lens")
+    _setting(learning, "batch", type=int, metavar="B", help="scenes in a batch")
+    _setting(learning, "accumulate", type=int, metavar="N", help="batches in a step")
+    _setting(learning, "lr", type=float, metavar="LR", help="learning rate of the network")
+    _setting(learning, "lr_metres", type=float, metavar="LR", help="learning rate of the masks, metres of height")
+    _setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
+    _setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
+    _setting(learning, "precision", choices=PRECISIONS, help="of the network; optics stay in float32")
+    _setting(learning, "seed", type=seed, metavar="N", help="everything random follows from it")
+
+    machine = parser.add_argument_group("machine")
+    machine.add_argument("--accelerator", choices=("cpu", "gpu"), default="cpu", help="(default: cpu)")
+    machine.add_argument("--devices", type=int, default=1, metavar="N", help="processes (default: 1)")
+    machine.add_argument("--workers", type=int, default=0, metavar="N", help="processes that load scenes (default: 0)")
+    machine.add_argument(
+        "--save-every", type=int, default=100, metavar="N", help="steps between checkpoints in an epoch (default: 100)"
+    )
+
+
+def add_scene_options(group: Any) -> None:
+    """Add which scenes, to a command that takes its defaults from settings."""
+    _setting(group, "data", choices=tuple(SCENES), help="where scenes come from")
+    _setting(group, "root", metavar="FOLDER", help="folder of the data, where they need one")
+    _setting(group, "size", type=int, metavar="PX", help="side of the scenes")
+
+
+def given_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings that were given, and no defaults."""
+    return {field.name: getattr(args, field.name) for field in fields(TrainingSettings) if field.name in args}
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train."""
+    require_lightning()
+    from kornia_tidy.training.callbacks import BEST, LAST  # noqa: PLC0415 (lightning takes seconds)
+    from kornia_tidy.training.run import SETTINGS, train  # noqa: PLC0415
+
+    for name in ("devices", "save_every"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be 1 or more, got {getattr(args, name)}")
+    folder = Path(args.output)
+    stored = args.resume and (folder / SETTINGS).exists()
+    settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()
+    settings = settings.replace(**given_settings(args))
+    many = {"strategy": "ddp"} if args.devices > 1 else {}
+    tell("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
+    goes_on = args.resume and (folder / LAST).exists()
+    tell("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
+    try:
+        module = train(
+            settings,
+            folder,
+            resume=args.resume,
+            head_from=args.head_from,
+            save_every=args.save_every,
+            workers=args.workers,
+            progress=sys.stderr.isatty(),
+            accelerator=args.accelerator,
+            devices=args.devices,
+            **many,
+        )
+    except KeyboardInterrupt:
+        tell("stopped", f"--resume -o {folder} goes on from the last checkpoint")
+        raise
+    tell("camera", module.optics.extra_repr())
+    tell("wrote", f"{folder / BEST}: evaluate this one")
+    for name in (LAST, SETTINGS, "training.csv", "validation.csv", "pictures"):
+        tell("", str(folder / name))
+
+
+def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)
+    """Add an option for a setting. One that is not given does not appear, and leaves its place to stored settings."""
+    default = next(field.default for field in fields(TrainingSettings) if field.name == name)
+    told = help if default is None else f"{help} (default: {default})"
+    group.add_argument(f"--{name.replace('_', '-')}", dest=name, default=argparse.SUPPRESS, help=told, **options)

@@ -1,0 +1,50 @@
+"""Training and validation scenes for Lightning's trainer, shared out among its processes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning.pytorch as pl
+from torch.utils.data import Dataset
+
+from kornia_tidy.training.scenes import SceneLoader
+
+
+class SceneData(pl.LightningDataModule):
+    """Loads scenes so that a run can be repeated and resumed; see :class:`~kornia_tidy.training.scenes.SceneLoader`.
+
+    Use it with ``Trainer(use_distributed_sampler=False)``: it shares the scenes out itself.
+
+    Args:
+        train: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
+        validation: another.
+        batch: scenes in a batch.
+        seed: of order, augmentation and noise.
+        augment: flip training scenes and vary their brightness.
+        workers: processes that load.
+    """
+
+    def __init__(
+        self,
+        train: Dataset,
+        validation: Dataset,
+        batch: int = 32,
+        seed: int = 0,
+        augment: bool = False,
+        workers: int = 0,
+    ) -> None:
+        super().__init__()
+        self.train, self.validation = train, validation
+        self.batch, self.seed, self.augment, self.workers = batch, seed, augment, workers
+
+    def train_dataloader(self) -> SceneLoader:
+        """Return this process's share of the training scenes, in a new order each epoch."""
+        return SceneLoader(self.train, self.batch, augment=self.augment, **self._shared())
+
+    def val_dataloader(self) -> SceneLoader:
+        """Return this process's share of the validation scenes, always the same."""
+        return SceneLoader(self.validation, self.batch, train=False, **self._shared())
+
+    def _shared(self) -> dict[str, Any]:
+        rank, world = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+        return {"seed": self.seed, "workers": self.workers, "rank": rank, "world": world}

@@ -1,0 +1,97 @@
+"""Pictures of a run: its masks, its PSFs over depth, and what the network makes of captures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.data.image_files import write_image
+from kornia_tidy.tidy_optics import TiDyOptics
+
+SCALE, GAP = 4, 2  # pixels of a picture for one of a mask or PSF; between pictures
+DEPTHS, SCENES = 7, 4  # shown
+ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
+
+
+class SeenLike(Protocol):
+    """What is drawn of a batch; see :class:`kornia_tidy.training.module.Seen`."""
+
+    @property
+    def coded(self) -> Tensor: ...  # noqa: D102
+    @property
+    def estimate(self) -> dict[str, Tensor]: ...  # noqa: D102
+    @property
+    def truth(self) -> dict[str, Tensor]: ...  # noqa: D102
+
+
+def draw_pictures(optics: TiDyOptics, seen: SeenLike, folder: Path, epoch: int) -> dict[str, Tensor]:
+    """Write masks, PSFs and estimates to PNG files named by the epoch, and return the pictures, (3, H, W)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = {"masks": masks_picture(optics), "psfs": psfs_picture(optics), "estimates": estimates_picture(seen)}
+    for name, picture in pictures.items():
+        write_image(folder / f"epoch_{epoch:04d}_{name}.png", picture)
+    return pictures
+
+
+@torch.no_grad()
+def masks_picture(optics: TiDyOptics) -> Tensor:
+    """Return the masks side by side, phase from 0 (black) to 2 pi (white).
+
+    Example:
+        >>> from kornia_tidy import FresnelLens
+        >>> masks_picture(TiDyOptics(FresnelLens())).shape
+        torch.Size([3, 92, 92])
+    """
+    phase = optics.masks.phase.detach().float().cpu().remainder(2 * math.pi) / (2 * math.pi)
+    return _grid([[enlarged(mask[None]) for mask in phase]])
+
+
+@torch.no_grad()
+def psfs_picture(optics: TiDyOptics) -> Tensor:
+    """Return PSFs from the near (left) to the far end of the range, each the square root of its light, to its peak."""
+    psfs = optics.psf_bank().psfs.detach().float().cpu()
+    nodes = torch.linspace(len(psfs) - 1, 0, DEPTHS).round().long().tolist()
+    light = [psfs[node] if psfs.shape[1] == 3 else psfs[node, :1] for node in nodes]
+    return _grid([[enlarged((psf / psf.max().clamp(min=1e-30)).clamp(min=0).sqrt()) for psf in light]])
+
+
+def estimates_picture(seen: SeenLike) -> Tensor:
+    """Return a row a scene: the capture, then for each map the estimate, the truth, and their distance times 3."""
+    rows = []
+    for i in range(min(SCENES, len(seen.coded))):
+        row = [seen.coded[i]]
+        for name, maps in seen.estimate.items():
+            truth = seen.truth[name][i]
+            row += [maps[i], truth, error_map(maps[i], truth)]
+        rows.append([part.detach().float().cpu() for part in row])
+    return _grid(rows)
+
+
+def error_map(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Return the distance of two maps, times 3 and at most 1.
+
+    Example:
+        >>> error_map(torch.tensor([0.5]), torch.tensor([0.25]))
+        tensor([0.7500])
+    """
+    return ((estimate - truth).abs() * ERROR_SCALE).clamp(max=1)
+
+
+def enlarged(picture: Tensor) -> Tensor:
+    """Return a picture with its pixels repeated to squares."""
+    return torch.nn.functional.interpolate(picture[None], scale_factor=float(SCALE), mode="nearest")[0]
+
+
+def _grid(rows: list[list[Tensor]]) -> Tensor:
+    """Put pictures of one size beside and below each other, white between them."""
+    height, width = rows[0][0].shape[-2:]
+    canvas = torch.ones(3, len(rows) * (height + GAP) - GAP, len(rows[0]) * (width + GAP) - GAP)
+    for y, row in enumerate(rows):
+        for x, part in enumerate(row):
+            top, left = y * (height + GAP), x * (width + GAP)
+            canvas[:, top : top + height, left : left + width] = part.nan_to_num().clamp(0, 1)
+    return canvas

@@ -1,0 +1,172 @@
+"""A whole training run in a folder: settings, checkpoints, log and pictures; stopped anywhere, it goes on."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.warnings import PossibleUserWarning
+
+from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
+from kornia_tidy.training.checkpoint import SafetensorsIO
+from kornia_tidy.training.data_module import SceneData
+from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.random_state import keyed_seed
+from kornia_tidy.training.scenes import make_scenes
+from kornia_tidy.training.settings import TrainingSettings, differences
+from kornia_tidy.training.trained import load_weights
+
+SETTINGS = "settings.json"
+MAY_CHANGE = ("epochs", "patience")  # of a run that goes on
+
+
+def train(
+    settings: TrainingSettings,
+    folder: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    head_from: str | os.PathLike[str] | None = None,
+    save_every: int = 100,
+    workers: int = 0,
+    progress: bool = False,
+    **trainer_options: Any,
+) -> TidyTraining:
+    """Train in a folder, from the start or from where the run in it stopped.
+
+    Args:
+        settings: what is trained, and how.
+        folder: made if missing. It gets ``settings.json``, ``last.safetensors`` (to go on from), ``best.safetensors``
+            (weights of the best epoch), ``training.csv``, ``validation.csv``, ``pictures/`` and a TensorBoard log;
+            with ``pretrain_epochs`` the same of that stage in ``pretrain/``.
+        resume: go on with the run in the folder, if there is one.
+        head_from: checkpoint whose network is taken to begin with, such as one trained with a fixed Fresnel lens.
+        save_every: steps between checkpoints within an epoch.
+        workers: processes that load scenes.
+        progress: show a progress bar.
+        **trainer_options: passed on to Lightning's ``Trainer``, such as ``accelerator="gpu"`` or ``devices=2``.
+
+    Returns:
+        The trained module.
+
+    Raises:
+        ValueError: if the folder holds another run, or a checkpoint or the data cannot be used.
+        OSError: if the disk is full; the last checkpoint is then intact.
+    """
+    folder = Path(folder)
+    checkpoint = _prepare(folder, settings, resume)
+    if settings.pretrain_epochs and checkpoint is None:
+        first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
+        stage = {"head_from": head_from, "save_every": save_every, "workers": workers, "progress": progress}
+        train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
+        head_from = folder / "pretrain" / LAST
+    pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
+    module = TidyTraining.from_settings(settings)
+    assert module.settings is not None
+    if head_from is not None and checkpoint is None:
+        load_weights(head_from, head=module.head)
+        if module.average is not None:
+            module.average.network.load_state_dict(module.head.state_dict())
+    module.settings.write(folder / SETTINGS)
+    data = SceneData(
+        make_scenes(settings, "train"),
+        make_scenes(settings, "validation"),
+        settings.batch,
+        settings.seed,
+        settings.augment,
+        workers,
+    )
+    callbacks: list[pl.Callback] = [
+        SaveCheckpoints(folder, save_every, patience=settings.patience),
+        WriteLog(folder),
+        DrawPictures(folder / "pictures"),
+    ]
+    if progress:
+        callbacks.append(pl.callbacks.TQDMProgressBar(leave=False))
+    options: dict[str, Any] = {
+        "max_epochs": settings.epochs,
+        "accumulate_grad_batches": settings.accumulate,
+        "precision": settings.precision,
+        "deterministic": "warn",
+        "accelerator": "cpu",
+        "devices": 1,
+        "log_every_n_steps": 10,
+        **trainer_options,
+    }
+    with _contained():
+        trainer = pl.Trainer(
+            plugins=[SafetensorsIO()],
+            callbacks=callbacks,
+            logger=TensorBoardLogger(folder, name="tensorboard", version=""),
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
+            enable_checkpointing=False,
+            enable_progress_bar=progress,
+            enable_model_summary=False,
+            **options,
+        )
+        _fit(trainer, module, data, checkpoint)
+    return module
+
+
+def _fit(trainer: pl.Trainer, module: TidyTraining, data: SceneData, checkpoint: Path | None) -> None:
+    """Fit, and let Ctrl-C be what it is elsewhere: Lightning ignores further ones and leaves the interpreter."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        trainer.fit(module, data, ckpt_path=checkpoint)
+    except SystemExit:
+        if not trainer.interrupted:
+            raise
+        raise KeyboardInterrupt from None
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGINT, handler)
+
+
+def _prepare(folder: Path, settings: TrainingSettings, resume: bool) -> Path | None:
+    """Make the folder; return the checkpoint to go on from, if there is one."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"cannot write into {folder}: it is not a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    path, last = folder / SETTINGS, folder / LAST
+    if not resume:
+        if last.exists():
+            raise ValueError(f"{folder} holds a run already: resume it, or choose another folder")
+        settings.write(path)
+        return None
+    if path.exists():
+        stored = TrainingSettings.read(path)
+        allowed = {name: getattr(settings, name) for name in MAY_CHANGE}
+        window = {"window": stored.window} if settings.window is None else {}  # measured when the run began
+        if other := differences(stored.replace(**allowed).as_dict(), settings.replace(**window).as_dict()):
+            raise ValueError(f"the run in {folder} has other settings (stored / asked for): {'; '.join(other)}")
+    return last if last.exists() else None
+
+
+@contextmanager
+def _contained() -> Generator[None]:
+    """Keep Lightning's doings in a block: determinism for all of torch, advertisements, advice, old uses of torch."""
+    logger = logging.getLogger("lightning.pytorch")
+    level = logger.level
+    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PossibleUserWarning)
+            warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)
+            # Rendering puts each pixel of a tile to a place of its own, in whatever order.
+            warnings.filterwarnings("ignore", message="put_ does not have a deterministic implementation")
+            yield
+    finally:
+        logger.setLevel(level)
+        torch.use_deterministic_algorithms(before[0], warn_only=before[1])

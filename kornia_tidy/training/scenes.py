@@ -1,0 +1,274 @@
+"""Scenes to train on: data sets by name, the order they are seen in, and batches of them that can be repeated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.training.random_state import keyed_seed, seeded
+from kornia_tidy.training.settings import TrainingSettings
+
+PIXELS_A_LEAF = 25  # in small scenes, whose leaves else would be specks
+GAIN = (0.8, 1.1)  # range of the brightness that augmentation varies
+
+
+class DeadLeavesScenes(Dataset):
+    """Scenes painted on demand, the same each time: item i follows from the seed and i.
+
+    Args:
+        count: number of scenes.
+        size: side in pixels.
+        depth_range: nearest and farthest depth in metres.
+        seed: data sets of different seeds share no scene.
+
+    Example:
+        >>> sorted(DeadLeavesScenes(2, 32)[0])
+        ['depth', 'image', 'index', 'mask']
+    """
+
+    def __init__(
+        self, count: int, size: int = 278, depth_range: tuple[float, float] = (0.3, float("inf")), seed: int = 0
+    ) -> None:
+        self.count, self.size, self.depth_range, self.seed = count, size, depth_range, seed
+
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+        return self.count
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """Return one scene."""
+        if not 0 <= index < self.count:
+            raise IndexError(f"the scenes are 0 to {self.count - 1}, got {index}")
+        seed = keyed_seed(self.seed, "scene", index)
+        leaves = min(3000, max(1, self.size**2 // PIXELS_A_LEAF))
+        image, depth = dead_leaves(self.size, self.size, depth_range=self.depth_range, num_leaves=leaves, seed=seed)
+        return {"image": image, "depth": depth, "mask": torch.ones_like(depth, dtype=torch.bool), "index": index}
+
+
+def _dead_leaves(settings: TrainingSettings, split: str) -> Dataset:
+    count = settings.scenes if split == "train" else settings.validation_scenes
+    depths = settings.depth_range or (0.3, float("inf"))
+    return DeadLeavesScenes(count, settings.size, depths, keyed_seed(settings.seed, split))
+
+
+# From settings and split ("train" or "validation") to a map-style data set of {"image", "depth", "mask", "index"}.
+SCENES: dict[str, Callable[[TrainingSettings, str], Dataset]] = {"dead-leaves": _dead_leaves}
+
+
+def make_scenes(settings: TrainingSettings, split: str) -> Dataset:
+    """Return the data set that settings name, of a split: ``"train"`` or ``"validation"``."""
+    check_choice("data", settings.data, tuple(SCENES))
+    return SCENES[settings.data](settings, split)
+
+
+# ---------------------------------------------------------------------- order
+
+
+class EpochBatches(Sampler):
+    """The batches of each epoch: an order that follows from seed and epoch, shared out among processes by turns.
+
+    Two processes with batches of b see in a step what one process sees that accumulates two batches of b.
+
+    Args:
+        length: number of scenes.
+        batch: scenes in a batch.
+        seed: of the order.
+        shuffle: False keeps the order, and the last scenes even where they do not fill a batch.
+        rank: of this process.
+        world: number of processes.
+
+    Raises:
+        ValueError: if the scenes do not fill one batch for each process.
+
+    Example:
+        >>> batches = EpochBatches(5, 2, shuffle=False)
+        >>> list(batches)
+        [[(0, 0), (0, 1)], [(0, 2), (0, 3)], [(0, 4)]]
+        >>> batches.start(epoch=1, first=2)
+        >>> list(batches)
+        [[(1, 4)]]
+    """
+
+    def __init__(
+        self, length: int, batch: int, *, seed: int = 0, shuffle: bool = True, rank: int = 0, world: int = 1
+    ) -> None:
+        self.length, self.batch, self.seed, self.shuffle, self.rank, self.world = (
+            length, batch, seed, shuffle, rank, world,
+        )  # fmt: skip
+        self.epoch = self.first = 0
+        if (length < batch * world and shuffle) or length < world:
+            raise ValueError(f"{length} scenes do not fill a batch of {batch} for each of {world} processes")
+
+    @property
+    def sampler(self) -> EpochBatches:
+        """This object: where Lightning looks for what to tell the epoch."""
+        return self
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, from its beginning if it is another. Without shuffling all are the same, noise included."""
+        if self.shuffle and epoch != self.epoch:
+            self.start(epoch, 0)
+
+    def start(self, epoch: int, first: int) -> None:
+        """Begin with a batch in the middle of an epoch."""
+        self.epoch, self.first = epoch, first
+
+    def __len__(self) -> int:
+        """Return the number of batches of a whole epoch."""
+        batches = self.length // self.batch if self.shuffle else -(-self.length // self.batch)
+        return batches // self.world
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        """Yield batches of (epoch, index)."""
+        order = range(self.length)
+        if self.shuffle:
+            generator = torch.Generator().manual_seed(keyed_seed(self.seed, "order", self.epoch))
+            order = torch.randperm(self.length, generator=generator).tolist()
+        for turn in range(self.first, len(self)):
+            start = (turn * self.world + self.rank) * self.batch
+            yield [(self.epoch, index) for index in order[start : start + self.batch]]
+
+
+# ---------------------------------------------------------------------- batches
+
+
+class Broken(NamedTuple):
+    """What a batch becomes that cannot be had: a worker's exception would come back as its whole traceback."""
+
+    reason: str
+
+
+class RepeatableScenes(Dataset):
+    """A data set whose item follows from (epoch, index) alone, whoever loads it and in whatever order.
+
+    Args:
+        scenes: a map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
+        seed: of what is random in them, and of the augmentation.
+        augment: flip scenes and vary their brightness.
+    """
+
+    def __init__(self, scenes: Dataset, seed: int = 0, augment: bool = False) -> None:
+        self.scenes, self.seed, self.augment = scenes, seed, augment
+
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+        return len(cast("Any", self.scenes))
+
+    def __getitem__(self, index: Any) -> dict[str, Any] | Broken:
+        """Return a scene by epoch and index, or why there is none."""
+        epoch, index = index
+        try:
+            with seeded(keyed_seed(self.seed, "item", epoch, index)):
+                sample = self.scenes[index]
+                image, depth = sample["image"], sample["depth"]
+                mask = sample.get("mask")
+                mask = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
+                if self.augment:
+                    image, depth, mask = augmented(image, depth, mask)
+        except (KeyError, OSError, ValueError) as error:
+            return Broken(f"scene {index} of the data cannot be used: {error}")
+        return {"image": image, "depth": depth, "mask": mask, "index": index, "epoch": epoch}
+
+
+def augmented(image: Tensor, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Flip a scene at random and vary its brightness, from torch's global generator.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019), which varies brightness batch by batch.
+
+    Example:
+        >>> image, depth = torch.ones(3, 2, 2), torch.ones(1, 2, 2)
+        >>> bright, _, _ = augmented(image, depth, depth > 0)
+        >>> 0.8 <= float(bright.max()) <= 1.0
+        True
+    """
+    across, down, gain = torch.rand(3).tolist()
+    axes = [axis for axis, toss in ((-1, across), (-2, down)) if toss < 0.5]
+    image = (image * (GAIN[0] + (GAIN[1] - GAIN[0]) * gain)).clamp(max=1)
+    return image.flip(axes), depth.flip(axes), mask.flip(axes)
+
+
+class _Collate:
+    """Make a batch, with a seed for its noise that follows from the scenes in it."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def __call__(self, samples: Sequence[dict[str, Any] | Broken]) -> dict[str, Any] | Broken:
+        scenes: list[Mapping[str, Any]] = []
+        for sample in samples:
+            if isinstance(sample, Broken):
+                return sample
+            scenes.append(sample)
+        sizes = {tuple(scene["image"].shape) for scene in scenes}
+        if len(sizes) > 1:
+            return Broken(f"the scenes of a batch must have one size, got {sorted(sizes)}")
+        keys = [key for scene in scenes for key in (scene["epoch"], scene["index"])]
+        tensors = [{name: scene[name] for name in ("image", "depth", "mask", "index")} for scene in scenes]
+        return {**default_collate(tensors), "noise_seed": keyed_seed(self.seed, "noise", *keys)}
+
+
+class SceneLoader(DataLoader):
+    """Loads batches that follow from seed and epoch alone, and knows where it is in an epoch, so as to go on there.
+
+    It draws nothing from the global generators. Its state is what Lightning asks a resumable loader for.
+
+    Args:
+        scenes: as for :class:`RepeatableScenes`.
+        batch: scenes in a batch.
+        seed: of everything random in the batches.
+        train: shuffle and, if asked to, augment; False for validation: always the same.
+        augment: see :class:`RepeatableScenes`.
+        workers: processes that load.
+        rank: of this process.
+        world: number of processes that share the scenes.
+
+    Example:
+        >>> loader = SceneLoader(DeadLeavesScenes(4, 32), batch=2)
+        >>> batch = next(iter(loader))
+        >>> batch["image"].shape, loader.state_dict()
+        (torch.Size([2, 3, 32, 32]), {'epoch': 0, 'batches': 1})
+    """
+
+    def __init__(
+        self,
+        scenes: Dataset,
+        batch: int,
+        *,
+        seed: int = 0,
+        train: bool = True,
+        augment: bool = False,
+        workers: int = 0,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
+        items = RepeatableScenes(scenes, seed, augment and train)
+        self._batches = EpochBatches(len(items), batch, seed=seed, shuffle=train, rank=rank, world=world)
+        self._handed = 0
+        super().__init__(
+            items,
+            batch_sampler=self._batches,
+            num_workers=workers,
+            collate_fn=_Collate(seed),
+            generator=torch.Generator().manual_seed(seed % 2**63),  # or each pass would draw from the global one
+        )
+
+    def __iter__(self) -> Any:
+        """Yield batches; nothing is loaded before the first is asked for."""
+        self._handed = self._batches.first
+        for batch in super().__iter__():
+            self._handed += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        """Return the epoch and how many of its batches have been handed out."""
+        return {"epoch": self._batches.epoch, "batches": self._handed}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Go on after the batches that a state tells of."""
+        self._batches.start(state["epoch"], state["batches"])

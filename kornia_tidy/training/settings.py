@@ -1,0 +1,168 @@
+"""Everything that decides a training run, as plain values that a JSON file holds."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.scene.compositing import COMPOSITING
+from kornia_tidy.scene.convolution import BORDERS
+from kornia_tidy.training.tasks import MAPS
+
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """A training run. The defaults are the paper's, with our camera; see :func:`kornia_tidy.training.run.train`.
+
+    Args:
+        task: ``"edof"`` (all-in-focus image), ``"depth"`` or ``"joint"``.
+        masks: number K of learnable masks, of uniform noise at first; 0 is a fixed Fresnel lens.
+        focal_length: of the lens in metres.
+        pixel_pitch: of the sensor in metres.
+        depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default
+            lens, from 0.298 m to infinity.
+        sigma: read noise of the sensor, of full scale.
+        fidelity: the preset that PSFs are computed at.
+        window: side of the PSFs in pixels. None: measured when the run begins, then fixed.
+        compositing: see :class:`~kornia_tidy.TiDyOptics`.
+        color_space: see there. None: its default.
+        border: see there.
+        head: name of the network, see :data:`kornia_tidy.training.heads.HEADS`.
+        width: channels of its first level. None: its default.
+        data: name of the data, see :data:`kornia_tidy.training.scenes.SCENES`.
+        root: folder of the data, where it needs one.
+        size: side of the scenes in pixels.
+        scenes: number of training scenes, where the data have no number of their own.
+        validation_scenes: number of scenes that tell how training goes.
+        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does.
+        lr: learning rate of the network.
+        lr_metres: learning rate of the masks in metres of height.
+        batch: scenes in a batch.
+        accumulate: batches in a step of the optimiser.
+        epochs: passes over the data.
+        pretrain_epochs: passes before these in which the network alone learns, behind a fixed Fresnel lens. The paper
+            takes 300 for the tasks edof and joint.
+        patience: stop after so many epochs without improvement. None: never.
+        ema: decay of the moving average of the network. 0: none.
+        depth_weight: of the depth loss in the joint task.
+        image_weight: of the image loss in the joint task.
+        precision: of the network.
+        seed: everything random follows from it.
+
+    Raises:
+        ValueError: if a value is not allowed.
+
+    Example:
+        >>> TrainingSettings(task="depth", masks=5).lr_metres
+        1e-08
+    """
+
+    task: str = "edof"
+    masks: int = 5
+    focal_length: float = 50e-3
+    pixel_pitch: float = 8e-6
+    depth_range: tuple[float, float] | None = None
+    sigma: float = 0.01
+    fidelity: str = "balanced"
+    window: int | None = None
+    compositing: str = "gather"
+    color_space: str | None = None
+    border: str = "reflect"
+    head: str = "plain"
+    width: int | None = None
+    data: str = "dead-leaves"
+    root: str | None = None
+    size: int = 278
+    scenes: int = 5077
+    validation_scenes: int = 64
+    augment: bool = True
+    lr: float = 1e-4
+    lr_metres: float = 1e-8
+    batch: int = 32
+    accumulate: int = 1
+    epochs: int = 300
+    pretrain_epochs: int = 0
+    patience: int | None = None
+    ema: float = 0.999
+    depth_weight: float = 1.0
+    image_weight: float = 1.0
+    precision: str = "32-true"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_choice("task", self.task, tuple(MAPS))
+        check_choice("precision", self.precision, PRECISIONS)
+        check_choice("compositing", self.compositing, tuple(COMPOSITING))
+        check_choice("border", self.border, BORDERS)
+        Fidelity.preset(self.fidelity)
+        for name in ("focal_length", "pixel_pitch", "lr", "lr_metres"):
+            check_positive(name, getattr(self, name))
+        least = {"masks": 0, "size": 1, "scenes": 1, "validation_scenes": 1, "batch": 1, "accumulate": 1, "epochs": 1}
+        for name, lowest in {**least, "pretrain_epochs": 0, "seed": 0}.items():
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < lowest:
+                raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
+        if self.patience is not None and self.patience < 1:
+            raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
+        if not 0 <= self.ema < 1:
+            raise ValueError(f"ema must be in [0, 1), got {self.ema}")
+        if self.depth_range is not None:
+            object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some values changed."""
+        return replace(self, **changes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as a dictionary of plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Return the settings of a dictionary.
+
+        Raises:
+            ValueError: if a name is unknown or a value is not allowed.
+        """
+        known = {field.name for field in fields(cls)}
+        if unknown := sorted(set(values) - known):
+            raise ValueError(f"settings hold unknown names: {', '.join(unknown)}")
+        return cls(**values)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the settings as JSON."""
+        write_bytes(path, (json.dumps(self.as_dict(), indent=2) + "\n").encode())
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read settings written as JSON.
+
+        Raises:
+            FileNotFoundError: if there is no file.
+            ValueError: if it is not JSON of settings.
+        """
+        try:
+            values = json.loads(read_bytes(Path(path)))
+            return cls.from_dict(values)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the entries in which two descriptions differ, each as ``name (one / other)``.
+
+    Example:
+        >>> differences({"masks": 5, "task": "edof"}, {"masks": 3, "task": "edof"})
+        ['masks (5 / 3)']
+    """
+    names = dict.fromkeys([*one, *other])
+    return [f"{n} ({one.get(n)} / {other.get(n)})" for n in names if one.get(n) != other.get(n)]

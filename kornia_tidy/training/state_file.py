@@ -1,0 +1,105 @@
+"""Nested states in one safetensors file: tensors as tensors, all else as JSON in its header. Nothing is pickled."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from kornia_tidy.files import replacing
+
+FORMAT = "kornia_tidy state 1"
+_PLAIN = (str, bool, int, float, type(None))
+_TENSOR, _TUPLE, _PAIRS = "$tensor", "$tuple", "$pairs"  # what JSON has no word for
+
+
+def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
+    """Write a nested state, whole or not at all: an earlier file stays until the new one is complete on the disk.
+
+    Args:
+        path: where to; an existing file is replaced.
+        state: dictionaries, lists and tuples of tensors, numbers, strings, booleans and None, nested at will.
+
+    Raises:
+        OSError: if it cannot be written, the disk being full for one.
+        TypeError: if it holds anything else, which is named by its place.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_state(f"{folder}/a.safetensors", {"step": 3, "masks": [torch.ones(2)]})
+        ...     read_state(f"{folder}/a.safetensors")
+        {'step': 3, 'masks': [tensor([1., 1.])]}
+    """
+    tensors: dict[str, Tensor] = {}
+    text = json.dumps(_encode(state, "", tensors))
+    try:
+        with replacing(path) as temporary:
+            save_file(tensors, temporary, {"format": FORMAT, "state": text})
+            with temporary.open("rb") as written:
+                os.fsync(written.fileno())  # or a power cut could leave the new name on data never stored
+    except (OSError, SafetensorError) as error:
+        kept = "; the one written before is intact" if Path(path).is_file() else ""
+        raise OSError(f"cannot write {path}: {error}{kept}") from error
+
+
+def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read what :func:`write_state` wrote, on the CPU. No code from the file is run.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is damaged, or none of these files.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    try:
+        with safe_open(path, framework="pt") as stored:
+            header = stored.metadata() or {}
+            if header.get("format") != FORMAT:
+                raise ValueError(f"its format is {header.get('format')!r}, not {FORMAT!r}")
+            # Copies: nobody should train in memory that is mapped from a file about to be replaced.
+            tensors = {name: stored.get_tensor(name).clone() for name in stored.keys()}  # noqa: SIM118 (no mapping)
+        return _decode(json.loads(header["state"]), tensors)
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"cannot read {path}: it is no checkpoint of kornia_tidy or is damaged: {error}") from error
+
+
+def _encode(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        name = place or "tensor"
+        # A copy, as safetensors refuses tensors that share memory, such as a view of another's.
+        tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        return {_TENSOR: name}
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, Mapping):
+        items = {key: _encode(entry, f"{place}/{key}", tensors) for key, entry in value.items()}
+        if all(isinstance(key, str) and not key.startswith("$") for key in items):
+            return items
+        return {_PAIRS: [[_encode(key, f"a key of {place}", {}), entry] for key, entry in items.items()]}
+    if isinstance(value, (list, tuple)):
+        items = [_encode(entry, f"{place}/{i}", tensors) for i, entry in enumerate(value)]
+        return {_TUPLE: items} if isinstance(value, tuple) else items
+    raise TypeError(f"a state holds tensors, numbers, strings, None and containers of them: {place} is {type(value)}")
+
+
+def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    if isinstance(value, list):
+        return [_decode(entry, tensors) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    if _TENSOR in value:
+        return tensors[value[_TENSOR]]
+    if _TUPLE in value:
+        return tuple(_decode(entry, tensors) for entry in value[_TUPLE])
+    if _PAIRS in value:
+        return {key: _decode(entry, tensors) for key, entry in value[_PAIRS]}
+    return {key: _decode(entry, tensors) for key, entry in value.items()}

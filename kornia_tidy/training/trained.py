@@ -1,0 +1,156 @@
+"""From settings to camera and network, and from a checkpoint back to both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.phase_masks import FresnelLens, PixelwiseMask
+from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.training.heads import make_head
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.state_file import read_state
+from kornia_tidy.training.tasks import channels_of
+
+
+class TrainedSystem(NamedTuple):
+    """A camera and the network that reads its captures."""
+
+    optics: TiDyOptics
+    head: nn.Module
+    settings: TrainingSettings
+    step: int
+    """Steps of the optimiser that it was trained for."""
+
+
+def build_optics(settings: TrainingSettings) -> TiDyOptics:
+    """Return the camera that settings describe, its masks as they are before training, its PSF window fixed.
+
+    Example:
+        >>> build_optics(TrainingSettings(masks=2, window=23)).window
+        23
+    """
+    lens: dict[str, Any] = {"focal_length": settings.focal_length, "pixel_pitch": settings.pixel_pitch}
+    near_far = settings.depth_range
+    camera = ThinLensCamera(**lens) if near_far is None else ThinLensCamera.for_scene(near_far, **lens)
+    noise = torch.Generator().manual_seed(settings.seed)
+    optics = TiDyOptics(
+        PixelwiseMask(settings.masks, generator=noise) if settings.masks else FresnelLens(),
+        camera,
+        sensor=SensorNoise(settings.sigma),
+        fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
+        compositing=settings.compositing,
+        color_space=settings.color_space,
+        border=settings.border,
+    )
+    return fix_window(optics)
+
+
+def fix_window(optics: TiDyOptics) -> TiDyOptics:
+    """Fix a camera's PSF window where it is, in place: masks in training would else change it when they are loaded."""
+    optics.fidelity = optics.fidelity.replace(window=optics.window)
+    return optics
+
+
+def build_head(settings: TrainingSettings) -> nn.Module:
+    """Return the network that settings describe, its weights drawn from the global generator."""
+    return make_head(settings.head, channels_of(settings.task), settings.width)
+
+
+def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
+    """Return camera and network of a checkpoint; of the network the moving average, where it has one.
+
+    Args:
+        path: a checkpoint that ``kornia-tidy train`` wrote.
+
+    Returns:
+        The system in eval mode, on the CPU. The sensor keeps its noise.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is no checkpoint, or weights and settings do not fit; the difference is named.
+    """
+    state = read_state(path)
+    if state.get("settings") is None:
+        raise ValueError(
+            f"{path} does not say how its camera and network were made, as they were given as objects: make them anew "
+            f"and use load_weights"
+        )
+    settings = TrainingSettings.from_dict(state["settings"])
+    optics, head = build_optics(settings), build_head(settings)
+    load_weights(state, optics, head, str(path))
+    return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]))
+
+
+def load_weights(
+    checkpoint: str | os.PathLike[str] | Mapping[str, Any],
+    optics: nn.Module | None = None,
+    head: nn.Module | None = None,
+    name: str | None = None,
+) -> None:
+    """Load a checkpoint's weights into a camera, a network, or both; of the network the moving average if there is one.
+
+    Args:
+        checkpoint: a path, or a state that was read.
+        optics: the camera. None: its weights are left.
+        head: the network. None: its weights are left.
+        name: how messages call the checkpoint.
+
+    Raises:
+        ValueError: if a weight is missing, unknown or of another shape; nothing is loaded then.
+    """
+    state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
+    name = name or str(checkpoint)
+    weights: dict[str, Tensor] = state["state_dict"]
+    averaged = any(key.startswith("average.") for key in weights)
+    parts = [(optics, "optics."), (head, "average.network." if averaged else "head.")]
+    wanted = [(part, below(weights, prefix), prefix) for part, prefix in parts if part is not None]
+    for part, own, prefix in wanted:
+        check_weights(part, own, f"{name}, {prefix.removesuffix('.')}")
+    for part, own, _ in wanted:
+        part.load_state_dict(own)
+
+
+def below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Return the weights whose names begin with a prefix, without it."""
+    return {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
+
+
+def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -> None:
+    """Raise ``ValueError`` unless weights fit a module, naming what does not.
+
+    Example:
+        >>> check_weights(nn.Linear(2, 1), {"weight": torch.ones(1, 3)}, "a.safetensors")
+        Traceback (most recent call last):
+        ...
+        ValueError: a.safetensors does not fit: missing bias; weight is (1, 3), wanted (1, 2)
+    """
+    own = module.state_dict()
+    missing, unknown = [key for key in own if key not in weights], [key for key in weights if key not in own]
+    faults = [f"{word} {_some(keys)}" for word, keys in (("missing", missing), ("unknown", unknown)) if keys]
+    faults += [
+        f"{key} is {tuple(weights[key].shape)}, wanted {tuple(value.shape)}"
+        for key, value in own.items()
+        if key in weights and weights[key].shape != value.shape
+    ]
+    if faults:
+        raise ValueError(f"{name} does not fit: {'; '.join(faults[:4])}{' ...' if len(faults) > 4 else ''}")
+
+
+def describe(optics: TiDyOptics, head: nn.Module) -> dict[str, str]:
+    """Return in words what no weight tells: which lens, sensor and network these are."""
+    parts = {name: repr(getattr(optics, name)) for name in ("camera", "sensor", "fidelity")}
+    parts |= {name: str(getattr(optics, name)) for name in ("compositing", "color_space", "border")}
+    parts |= {name: type(getattr(optics, name)).__name__ for name in ("masks", "modulator")}
+    return {**parts, "head": type(head).__name__}
+
+
+def _some(keys: list[str]) -> str:
+    return ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")

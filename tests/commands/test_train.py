@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from kornia_tidy.cli import main
+from kornia_tidy.data.image_files import read_image
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.trained import load_trained
+from tests.base import BaseTester
+
+pytest.importorskip("lightning.pytorch")
+
+SMALL = ["--masks", "1", "--size", "40", "--scenes", "4", "--validation-scenes", "1", "--batch", "2", "--width", "4"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    options = ["--task", "joint", "--epochs", "1", "--pretrain-epochs", "1", "--lr", "0.001", "--seed", "3"]
+    assert main(["train", *SMALL, *options, "-o", str(folder)]) == 0
+    return folder
+
+
+class TestTrain(BaseTester):
+    def test_feature_the_options_are_the_settings(self, run):
+        settings = TrainingSettings.read(run / "settings.json")
+        expected = TrainingSettings(
+            task="joint", masks=1, size=40, scenes=4, validation_scenes=1, batch=2, width=4, epochs=1,
+            pretrain_epochs=1, lr=1e-3, seed=3, window=settings.window,
+        )  # fmt: skip
+        assert settings == expected
+        assert load_trained(run / "best.safetensors").settings == settings
+        assert (run / "pretrain" / "last.safetensors").exists()
+
+    def test_feature_resume_goes_on_and_refuses_other_settings(self, run, capsys):
+        assert main(["train", "--resume", "--epochs", "2", "-o", str(run)]) == 0
+        assert "goes on, 2 epochs" in capsys.readouterr().out
+        assert load_trained(run / "last.safetensors").step == 4
+        assert main(["train", "--resume", "--lr", "1", "-o", str(run)]) == 2
+        assert "other settings (stored / asked for): lr (0.001 / 1.0)" in capsys.readouterr().err
+        assert main(["train", "-o", str(run)]) == 2
+        assert "holds a run already" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            (["--masks", "-1"], "masks must be a whole number of at least 0, got -1"),
+            (["--depth-range", "2", "1"], "depth_range"),
+            (["--batch", "8"], "4 scenes do not fill a batch of 8"),
+            (["--head-from", "none.safetensors"], "cannot read none.safetensors: there is no such file"),
+            (["--save-every", "0"], "--save-every must be 1 or more, got 0"),
+        ],
+    )
+    def test_exception_is_one_sentence(self, options, sentence, tmp_path, capsys):
+        assert main(["train", *SMALL, *options, "-o", str(tmp_path / "run")]) == 2
+        assert sentence in capsys.readouterr().err
+
+    def test_exception_without_lightning_is_one_sentence_before_any_work(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.setitem(sys.modules, "lightning.pytorch", None)
+        assert main(["train", "-o", str(tmp_path / "run")]) == 2
+        assert "pip install 'kornia-tidy[train]'" in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
+
+    def test_feature_the_command_imports_lightning_only_to_train(self, run):
+        code = (
+            "import sys; from kornia_tidy.cli import main; "
+            f"main(['evaluate', {str(run / 'best.safetensors')!r}, '--scenes', '1', '-o', {str(run / 'e')!r}]); "
+            "print('loaded', [n for n in ('lightning', 'tensorboard') if n in sys.modules])"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == "loaded []"
+
+
+class TestEvaluate(BaseTester):
+    def test_feature_a_line_a_scene_means_and_pictures(self, run, tmp_path, capsys):
+        out = tmp_path / "out"
+        command = ["evaluate", str(run / "best.safetensors"), "-o", str(out), "--scenes", "3", "--pictures", "1"]
+        assert main(command) == 0
+        assert "3 scenes" in capsys.readouterr().out
+        with (out / "results.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        summary = json.loads((out / "summary.json").read_text())
+        assert [row["scene"] for row in rows] == ["0", "1", "2"]
+        for name in ("depth_rmse", "image_rmse", "image_psnr"):
+            mean = sum(float(row[name]) for row in rows) / 3
+            assert summary["mean"][name] == pytest.approx(mean)
+        assert summary["settings"]["task"] == "joint"
+        estimate, truth, error = (
+            read_image(out / f"scene_0000_image{suffix}.png") for suffix in ("", "_truth", "_error_x3")
+        )
+        # Estimates beyond [0, 1] are clipped in their picture, not in the error's.
+        inside = (estimate > 0) & (estimate < 1)
+        expected = (3 * (estimate - truth).abs()).clamp(max=1)
+        assert inside.any()
+        self.assert_close(error[inside], expected[inside], rtol=0, atol=4.1 / 255)
+        assert not list(out.glob("scene_0001*"))
+
+    def test_feature_it_repeats(self, run, tmp_path):
+        texts = []
+        for name in "ab":
+            command = ["evaluate", str(run / "best.safetensors"), "--scenes", "2", "-o", str(tmp_path / name)]
+            assert main(command) == 0
+            texts.append((tmp_path / name / "results.csv").read_text())
+        assert texts[0] == texts[1]
+
+    def test_exception_is_one_sentence(self, tmp_path, capsys):
+        torch.save({}, tmp_path / "a.ckpt")
+        assert main(["evaluate", str(tmp_path / "a.ckpt")]) == 2
+        assert "it is no checkpoint of kornia_tidy" in capsys.readouterr().err
+        assert main(["evaluate", str(tmp_path / "b.ckpt")]) == 2
+        assert "there is no such file" in capsys.readouterr().err

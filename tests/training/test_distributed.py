@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kornia_tidy.training.state_file import read_state
+from tests.base import BaseTester
+
+pytest.importorskip("lightning.pytorch")
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.slow
+class TestTwoProcesses(BaseTester):
+    def test_feature_two_processes_are_one_that_accumulates_two_batches(self, tmp_path):
+        """After 20 steps, masks included; the network has no batch normalisation, whose statistics would differ."""
+        states = []
+        for processes in (1, 2):
+            folder = tmp_path / str(processes)
+            script = ROOT / "tests" / "training" / "two_processes.py"
+            done = subprocess.run(
+                [sys.executable, str(script), str(folder), str(processes)],
+                capture_output=True,
+                text=True,
+                cwd=ROOT,
+                check=False,
+            )
+            assert done.returncode == 0, done.stderr
+            assert ("MEMBER: 2/2" in done.stderr) == (processes == 2)
+            states.append(read_state(folder / "last.safetensors"))
+        one, two = states
+        assert one["global_step"] == two["global_step"] == 20
+        start = (tmp_path / "1" / "training.csv").read_text()
+        assert start != (tmp_path / "2" / "training.csv").read_text()  # the first process sees its own batches only
+        for name, weight in one["state_dict"].items():
+            self.assert_close(weight, two["state_dict"][name], rtol=0, atol=1e-5)

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.training.scenes import Broken, DeadLeavesScenes, SceneLoader
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.trained import build_optics, check_weights, load_trained, load_weights
+from tests.base import BaseTester
+
+pl = pytest.importorskip("lightning.pytorch")
+
+from kornia_tidy.training.checkpoint import SafetensorsIO  # noqa: E402
+from kornia_tidy.training.module import TidyTraining  # noqa: E402
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning"),
+    pytest.mark.filterwarnings("ignore::lightning.pytorch.utilities.warnings.PossibleUserWarning"),
+]
+SETTINGS = TrainingSettings(task="joint", masks=2, width=4, size=48, window=23, lr=1e-3)
+
+
+def made(**changes):
+    torch.manual_seed(0)
+    return TidyTraining.from_settings(SETTINGS.replace(**changes))
+
+
+def batch(count=2):
+    return next(iter(SceneLoader(DeadLeavesScenes(count, 48), count)))
+
+
+def trainer(folder, steps=2, **options):
+    return pl.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        plugins=[SafetensorsIO()],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+        **options,
+    )
+
+
+class TestTidyTraining(BaseTester):
+    @pytest.mark.parametrize("task", ["edof", "depth", "joint"])
+    def test_cardinality_every_task_sees_its_maps(self, task):
+        module = made(task=task)
+        seen = module.see(batch())
+        wanted = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}[task]
+        assert {name: maps.shape for name, maps in seen.estimate.items()} == {
+            name: (2, channels, 48, 48) for name, channels in wanted.items()
+        }
+        assert all(seen.truth[name].shape == maps.shape for name, maps in seen.estimate.items())
+
+    def test_feature_the_loss_reaches_masks_and_network(self, monkeypatch):
+        module = made()
+        monkeypatch.setattr(module, "log", lambda *args, **options: None)
+        module.training_step(batch(), 0).backward()
+        assert module.optics.masks.phase.grad.abs().max() > 0
+        assert all(p.grad.abs().max() > 0 for p in module.head.parameters())
+
+    def test_feature_rates_are_those_of_masks_and_network(self):
+        """One Adam step moves every mask pixel under the aperture by 1e-8 m, and every weight by lr."""
+        module = made(lr=1e-4)
+        optimizer = module.configure_optimizers()
+        heights, weight = module.optics.masks.heights().detach().clone(), module.head.layers[0].weight.detach().clone()
+        seen = module.see(batch())
+        (seen.estimate["image"] - seen.truth["image"]).square().mean().backward()
+        optimizer.step()
+        moved = (module.optics.masks.heights() - heights).detach().abs()[module.optics.masks.phase.grad != 0]
+        self.assert_close(moved, torch.full_like(moved, 1e-8), rtol=2e-3, atol=1e-12)
+        moved = (module.head.layers[0].weight - weight).detach().abs()
+        self.assert_close(moved.median(), torch.tensor(1e-4), rtol=1e-2)
+        assert {group["betas"] for group in optimizer.param_groups} == {(0.99, 0.999)}
+
+    def test_feature_a_fixed_lens_trains_the_network_alone(self):
+        module = made(masks=0)
+        assert not list(module.optics.parameters())
+        assert len(module.configure_optimizers().param_groups) == 1
+
+    def test_feature_the_window_stays_when_masks_change(self):
+        module = TidyTraining(TiDyOptics(PixelwiseMask(1, initial="flat")), nn.Identity())
+        before = module.optics.window
+        assert before < 65
+        state = {**module.state_dict(), "optics.masks.phase": 3 * torch.randn(1, 23, 23)}
+        module.load_state_dict(state)
+        assert module.optics.window == before
+
+    @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+    def test_feature_optics_stay_in_float32_and_the_network_has_its_precision(self, precision, tmp_path):
+        module, types = made(), []
+        module.optics.register_forward_hook(lambda m, i, o: types.append(o["image"].dtype))
+        module.head.layers[0].register_forward_hook(lambda m, i, o: types.append(o.dtype))
+        trainer(tmp_path, 1, precision=precision).fit(module, SceneLoader(DeadLeavesScenes(2, 48), 2))
+        assert types == [torch.float32, torch.float32 if precision == "32-true" else torch.bfloat16]
+        assert module.optics.masks.phase.dtype == torch.float32
+
+    def test_feature_the_average_is_what_validation_sees(self):
+        module = made()
+        with torch.no_grad():
+            module.head.layers[-1].bias += 1
+        coded = torch.rand(1, 3, 48, 48)
+        difference = module(coded) - module.eval()(coded)
+        self.assert_close(difference, torch.ones_like(difference))
+
+    def test_feature_a_valid_border_crops_truth_and_mask_alike(self):
+        module, sample = made(border="valid"), batch()
+        sample["mask"][..., 11, 11], sample["mask"][..., 0, 0] = False, False
+        seen = module.see(sample)
+        assert seen.coded.shape[-1] == seen.truth["depth"].shape[-1] == seen.mask.shape[-1] == 26
+        assert torch.equal(seen.truth["image"], sample["image"][..., 11:-11, 11:-11])
+        assert (~seen.mask).nonzero()[:, 2:].tolist() == [[0, 0], [0, 0]]
+
+    def test_feature_noise_follows_from_the_batch(self):
+        module, sample = made(), batch()
+        torch.manual_seed(1)
+        one = module.see(sample).coded
+        assert torch.equal(one, module.see(sample).coded)
+        assert not torch.equal(one, module.see({**sample, "noise_seed": 1}).coded)
+        plain = {name: sample[name] for name in ("image", "depth")}
+        assert not torch.equal(module.see(plain).coded, module.see(plain).coded)
+
+    def test_exception_a_broken_batch_tells_why(self):
+        with pytest.raises(ValueError, match="scene 3 is gone"):
+            made().see(Broken("scene 3 is gone"))
+
+    def test_exception_unknown_task(self):
+        with pytest.raises(ValueError, match="task must be one of"):
+            TidyTraining(build_optics(SETTINGS), nn.Identity(), task="all")
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    module, run = made(), trainer(folder)
+    run.fit(module, SceneLoader(DeadLeavesScenes(2, 48), 1))
+    run.save_checkpoint(folder / "a.safetensors")
+    return module, folder / "a.safetensors"
+
+
+class TestCheckpoint(BaseTester):
+    def test_feature_a_trained_system_takes_the_same_pictures_and_sees_the_same(self, saved):
+        module, path = saved
+        system = load_trained(path)
+        sample = batch()
+        module.eval()
+        noise = torch.Generator().manual_seed(1)
+        coded = system.optics(sample["image"], sample["depth"], generator=noise)
+        assert torch.equal(coded, module.optics(sample["image"], sample["depth"], generator=noise.manual_seed(1)))
+        assert torch.equal(system.head(coded), module(coded))
+        assert system.settings == module.settings
+        assert system.step == 2
+
+    def test_feature_weights_go_into_objects_of_ones_own(self, saved):
+        module, path = saved
+        optics, head = TiDyOptics(PixelwiseMask(2)), made().head
+        load_weights(path, optics, head)
+        assert torch.equal(optics.masks.phase, module.optics.masks.phase)
+        assert torch.equal(head.layers[0].weight, module.average.network.layers[0].weight)
+
+    def test_exception_other_weights_are_refused_before_anything_is_loaded(self, saved):
+        optics, head = TiDyOptics(PixelwiseMask(3)), made().head
+        before = head.layers[0].weight.detach().clone()
+        with pytest.raises(
+            ValueError, match=r"optics does not fit: masks.phase is \(2, 23, 23\), wanted \(3, 23, 23\)"
+        ):
+            load_weights(saved[1], optics, head)
+        assert torch.equal(head.layers[0].weight, before)
+
+    @pytest.mark.parametrize(
+        ("changes", "sentence"),
+        [
+            ({"task": "edof"}, r"task \(joint / edof\)"),
+            ({"focal_length": 0.06}, r"camera \(ThinLensCamera.*/ ThinLensCamera"),
+            ({"sigma": 0.02}, r"sensor \(SensorNoise\(read noise 0.01.*/ SensorNoise\(read noise 0.02"),
+            ({"border": "zero"}, r"border \(reflect / zero\)"),
+            ({"width": 5}, r"head.layers.0.weight is \(4, 3, 3, 3\), wanted \(5, 3, 3, 3\)"),
+            ({"ema": 0.0}, "unknown average.steps"),
+        ],
+    )
+    def test_exception_a_run_that_differs_is_not_resumed_from_it(self, changes, sentence, saved, tmp_path):
+        module = made(**changes)
+        with pytest.raises(ValueError, match=sentence):
+            trainer(tmp_path).fit(module, SceneLoader(DeadLeavesScenes(2, 48), 1), ckpt_path=saved[1])
+
+    def test_exception_objects_of_ones_own_cannot_be_made_from_a_file(self, tmp_path):
+        module, run = TidyTraining(build_optics(SETTINGS), made().head, task="joint"), trainer(tmp_path, 1)
+        run.fit(module, SceneLoader(DeadLeavesScenes(1, 48), 1))
+        run.save_checkpoint(tmp_path / "b.safetensors")
+        with pytest.raises(ValueError, match="were given as objects"):
+            load_trained(tmp_path / "b.safetensors")
+
+    def test_exception_names_of_missing_and_unknown_weights(self):
+        with pytest.raises(ValueError, match="x does not fit: missing weight, bias; unknown other"):
+            check_weights(nn.Linear(1, 1), {"other": torch.ones(1)}, "x")

@@ -1,0 +1,162 @@
+"""Random states, moving average, tasks, settings, heads: the small parts of training."""
+
+from __future__ import annotations
+
+import copy
+import random
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from kornia_tidy import DefocusRange, ThinLensCamera
+from kornia_tidy.training.average import MovingAverage
+from kornia_tidy.training.heads import make_head
+from kornia_tidy.training.random_state import keyed_seed, random_state, seeded, set_random_state
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.state_file import read_state, write_state
+from kornia_tidy.training.tasks import centre_crop, image_rmse, mean_square, nearness, split_maps, task_loss
+from tests.base import BaseTester
+
+
+def draws():
+    return torch.rand(3).tolist(), torch.randn(1).item(), np.random.rand(), np.random.randn(), random.gauss(0, 1)  # noqa: NPY002
+
+
+class TestRandomState(BaseTester):
+    def test_feature_generators_go_on_from_a_file_where_they_were(self, tmp_path):
+        draws()  # leaves half a pair of normal numbers in NumPy's and Python's generators
+        write_state(tmp_path / "a", random_state())
+        expected = draws()
+        draws()
+        set_random_state(read_state(tmp_path / "a"))
+        assert draws() == expected
+
+    def test_feature_a_seeded_block_repeats_and_leaves_no_trace(self):
+        set_random_state(before := random_state())
+        expected = draws()
+        set_random_state(before)
+        with seeded(5):
+            one = draws()
+        with seeded(5):
+            assert draws() == one
+        assert draws() == expected
+
+    def test_feature_keys_do_not_run_together(self):
+        seeds = {keyed_seed(*keys) for keys in ((1, 2), (12,), (2, 1), ("1", "", "2"), (1,), (0, 1, 2))}
+        assert len(seeds) == 6
+        assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+class TestMovingAverage(BaseTester):
+    def test_feature_it_is_the_weighted_sum_of_all_weights_that_were(self):
+        network, decay = nn.Linear(2, 1, bias=False), 0.6
+        average = MovingAverage(network, decay)
+        expected = network.weight.detach().double()
+        for step in range(8):
+            with torch.no_grad():
+                network.weight.copy_(torch.randn(1, 2))
+            average.update(network)
+            weight = min(decay, (1 + step) / (10 + step))
+            expected = weight * expected + (1 - weight) * network.weight.detach().double()
+        self.assert_close(average.network.weight, expected, rtol=1e-6, atol=1e-6)
+        assert not any(p.requires_grad for p in average.parameters())
+
+    def test_feature_statistics_are_copied(self):
+        network = nn.BatchNorm1d(2)
+        average = MovingAverage(network)
+        network(torch.randn(8, 2) + 3)
+        average.update(network)
+        assert torch.equal(average.network.running_mean, network.running_mean)
+
+    @pytest.mark.parametrize("decay", [-0.1, 1.0])
+    def test_exception_decay(self, decay):
+        with pytest.raises(ValueError, match="must be in"):
+            MovingAverage(nn.Linear(1, 1), decay)
+
+
+class TestTasks(BaseTester):
+    def test_feature_nearness_is_linear_in_inverse_depth(self):
+        depth = torch.tensor([0.3, 0.4, 0.8, 3.0, float("inf")])
+        camera = ThinLensCamera(depth_range=(0.3, float("inf")))
+        self.assert_close(nearness(camera, depth), 0.3 / depth, atol=1e-6)
+        assert nearness(camera, torch.tensor([0.1]))[0] == 1
+        self.assert_close(nearness(DefocusRange(), torch.tensor([0.25])), torch.tensor([0.25]))
+
+    def test_feature_masked_pixels_have_no_part_in_loss_and_gradient(self):
+        prediction = torch.rand(2, 1, 4, 4, requires_grad=True)
+        target = torch.rand(2, 1, 4, 4)
+        mask = torch.rand(2, 1, 4, 4) > 0.5
+        target[~mask] = float("nan")
+        loss = mean_square(prediction, target, mask)
+        loss.backward()
+        expected = (prediction.detach()[mask] - target[mask]).square().mean()
+        self.assert_close(loss.detach(), expected)
+        assert (prediction.grad[~mask] == 0).all()
+        errors = image_rmse(prediction.detach(), target, mask)
+        self.assert_close(errors[0], (prediction.detach()[0][mask[0]] - target[0][mask[0]]).square().mean().sqrt())
+
+    def test_feature_the_joint_loss_weighs_both_and_masks_depth_only(self):
+        output, truth = torch.rand(1, 4, 2, 2), {"depth": torch.rand(1, 1, 2, 2), "image": torch.rand(1, 3, 2, 2)}
+        mask = torch.tensor([[[[True, False], [False, False]]]])
+        estimate = split_maps("joint", output)
+        loss = task_loss(mean_square, estimate, truth, mask, {"depth": 2.0, "image": 3.0})
+        depth = (output[0, 0, 0, 0] - truth["depth"][0, 0, 0, 0]) ** 2
+        self.assert_close(loss, 2 * depth + 3 * (output[:, 1:] - truth["image"]).square().mean())
+
+    def test_exception_a_head_of_other_channels_is_refused(self):
+        with pytest.raises(ValueError, match=r"must return \(B, 1, H, W\)"):
+            split_maps("depth", torch.rand(1, 3, 2, 2))
+
+    def test_feature_the_middle_is_cropped(self):
+        assert centre_crop(torch.arange(25).view(1, 5, 5), 3, 1).flatten().tolist() == [7, 12, 17]
+
+
+class TestSettings(BaseTester):
+    def test_feature_json_brings_back_what_was_written(self, tmp_path):
+        settings = TrainingSettings(task="joint", depth_range=(0.5, float("inf")), patience=3, width=8)
+        settings.write(tmp_path / "a.json")
+        assert TrainingSettings.read(tmp_path / "a.json") == settings
+
+    def test_convention_defaults_are_the_papers(self):
+        settings = TrainingSettings()
+        assert (settings.lr, settings.lr_metres, settings.batch, settings.masks) == (1e-4, 1e-8, 32, 5)
+        assert (settings.depth_weight, settings.image_weight, settings.size) == (1, 1, 278)
+
+    @pytest.mark.parametrize(
+        ("change", "sentence"),
+        [
+            ({"task": "video"}, "task must be one of 'edof', 'depth', 'joint', got 'video'"),
+            ({"masks": -1}, "masks must be a whole number of at least 0, got -1"),
+            ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
+            ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
+            ({"precision": "64"}, "precision must be one of"),
+            ({"fidelity": "best"}, "fidelity must be one of"),
+            ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
+        ],
+    )
+    def test_exception(self, change, sentence):
+        with pytest.raises(ValueError, match=sentence):
+            TrainingSettings(**change)
+
+    @pytest.mark.parametrize("text", ["{", '{"maskz": 5}', "[1]", '{"masks": "five"}'])
+    def test_exception_a_file_that_holds_no_settings_is_named(self, text, tmp_path):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(ValueError, match=r"cannot read .*a\.json"):
+            TrainingSettings.read(tmp_path / "a.json")
+
+
+class TestPlainHead(BaseTester):
+    def test_feature_a_pixel_sees_63_pixels(self):
+        image = torch.rand(1, 3, 97, 97, requires_grad=True)
+        make_head("plain", 1, 4)(image)[0, 0, 48, 48].backward()
+        seen = image.grad.abs().sum((0, 1)).nonzero()
+        assert (seen.amin().item(), seen.amax().item()) == (48 - 31, 48 + 31)
+
+    def test_exception_unknown_name(self):
+        with pytest.raises(ValueError, match="head must be one of 'plain'"):
+            make_head("plane", 3)
+
+    def test_smoke_copies(self):
+        copy.deepcopy(make_head("plain", 3))

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import csv
+import errno
+import json
+import os
+
+import pytest
+import torch
+
+from kornia_tidy.training import scenes, state_file
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.state_file import read_state
+from tests.base import BaseTester
+
+pl = pytest.importorskip("lightning.pytorch")
+
+from kornia_tidy.training.callbacks import drop_rows_after  # noqa: E402
+from kornia_tidy.training.run import train  # noqa: E402
+
+SETTINGS = TrainingSettings(
+    task="depth", masks=1, width=4, size=32, scenes=4, validation_scenes=1, batch=2, epochs=2, window=9, lr=1e-2
+)
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+class TestTrain(BaseTester):
+    def test_feature_a_run_writes_what_people_open(self, tmp_path):
+        train(SETTINGS, tmp_path)
+        log = rows(tmp_path / "training.csv")
+        assert [row["step"] for row in log] == ["1", "2", "3", "4"]
+        scores = rows(tmp_path / "validation.csv")
+        assert [row["epoch"] for row in scores] == ["0", "1"]
+        best = min(float(row["val_loss"]) for row in scores)
+        assert read_state(tmp_path / "last.safetensors")["callbacks"]["SaveCheckpoints"]["best"] == pytest.approx(best)
+        assert json.loads((tmp_path / "settings.json").read_text())["window"] == 9
+        names = {path.name for path in (tmp_path / "pictures").iterdir()}
+        assert {"epoch_0001_masks.png", "epoch_0001_psfs.png", "epoch_0001_estimates.png"} <= names
+        assert list((tmp_path / "tensorboard").glob("events.*"))
+
+    def test_feature_learning_lowers_the_loss(self, tmp_path):
+        train(SETTINGS.replace(epochs=12, augment=False, ema=0.0), tmp_path)
+        losses = [float(row["val_loss"]) for row in rows(tmp_path / "validation.csv")]
+        assert losses[-1] < 0.8 * losses[0]
+
+    @pytest.mark.parametrize("masks", [1, 0])
+    def test_feature_more_epochs_go_on_as_if_asked_for_at_first(self, masks, tmp_path):
+        settings = SETTINGS.replace(masks=masks)
+        whole = train(settings, tmp_path / "a").state_dict()
+        train(settings.replace(epochs=1), tmp_path / "b")
+        parts = train(settings, tmp_path / "b", resume=True).state_dict()
+        assert all(torch.equal(whole[name], parts[name]) for name in whole)
+        assert rows(tmp_path / "a" / "validation.csv") == rows(tmp_path / "b" / "validation.csv")
+
+    def test_feature_the_network_is_trained_first_behind_a_fixed_lens(self, tmp_path):
+        module = train(SETTINGS.replace(pretrain_epochs=1, epochs=1, lr=1e-12, ema=0.5), tmp_path)
+        first = read_state(tmp_path / "pretrain" / "last.safetensors")
+        assert first["settings"]["masks"] == 0
+        assert "optics.masks.phase" in first["state_dict"]  # fixed, and stored
+        weights = first["state_dict"]["average.network.layers.0.weight"]
+        self.assert_close(module.head.layers[0].weight.detach(), weights, rtol=0, atol=1e-9)
+
+    def test_feature_it_stops_when_nothing_improves_and_stays_stopped(self, tmp_path):
+        still = SETTINGS.replace(lr=1e-30, lr_metres=1e-30, ema=0.0, patience=2, epochs=9)
+        train(still, tmp_path)
+        assert len(rows(tmp_path / "validation.csv")) == 3  # one to set the mark, two without improvement
+        train(still, tmp_path, resume=True)
+        assert len(rows(tmp_path / "validation.csv")) == 3
+
+    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+    @pytest.mark.parametrize("workers", [0, 1])
+    def test_exception_a_broken_scene_stops_by_name_and_the_run_goes_on_once_it_is_mended(
+        self, workers, tmp_path, monkeypatch
+    ):
+        class Breaking(scenes.DeadLeavesScenes):
+            def __getitem__(self, index):
+                if broken and index == broken[0]:
+                    raise ValueError("cannot read /data/2.png: the file is cut short")
+                return super().__getitem__(index)
+
+        make = {"dead-leaves": lambda settings, split: Breaking(4 if split == "train" else 1, 32)}
+        monkeypatch.setattr(scenes, "SCENES", make)
+        order = [index for batch in scenes.EpochBatches(4, 1) for _, index in batch]
+        broken = [order[2]]
+        settings = SETTINGS.replace(batch=1, epochs=1)
+        with pytest.raises(ValueError, match=f"scene {order[2]} of the data cannot be used: cannot read /data/2.png"):
+            train(settings, tmp_path / "a", save_every=1, workers=workers)
+        assert read_state(tmp_path / "a" / "last.safetensors")["global_step"] == 2
+        broken.clear()
+        mended = train(settings, tmp_path / "a", resume=True, workers=workers).state_dict()
+        whole = train(settings, tmp_path / "b").state_dict()
+        assert all(torch.equal(whole[name], mended[name]) for name in whole)
+
+    def test_exception_a_full_disk_stops_the_run_and_keeps_the_last_checkpoint(self, tmp_path, monkeypatch):
+        save, saves = state_file.save_file, []
+
+        def full_after_two(tensors, path, metadata):
+            saves.append(path)
+            save(tensors, path, metadata)
+            if len(saves) > 2:
+                path.write_bytes(path.read_bytes()[:100])
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(state_file, "save_file", full_after_two)
+        with pytest.raises(OSError, match=r"cannot write .*last.safetensors: .*No space left.*; the one written"):
+            train(SETTINGS.replace(scenes=20), tmp_path, save_every=1)
+        assert read_state(tmp_path / "last.safetensors")["global_step"] == 2
+        assert not list(tmp_path.glob(".*"))
+
+    def test_exception_another_run_is_not_overwritten_nor_mixed_with(self, tmp_path):
+        train(SETTINGS.replace(epochs=1), tmp_path)
+        with pytest.raises(ValueError, match="holds a run already"):
+            train(SETTINGS, tmp_path)
+        with pytest.raises(ValueError, match=r"other settings \(stored / asked for\): lr \(0.01 / 0.1\)$"):
+            train(SETTINGS.replace(lr=0.1), tmp_path, resume=True)
+
+    def test_feature_ctrl_c_is_a_keyboard_interrupt(self, tmp_path, monkeypatch):
+        def interrupt(*_):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("kornia_tidy.training.callbacks.WriteLog.on_validation_end", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(SETTINGS, tmp_path)
+
+    def test_feature_lines_of_steps_to_be_taken_again_are_dropped(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("epoch,step,loss\n0,1,0.5\n0,2,0.4\n0,3,0.3\n0,")
+        drop_rows_after(path, 2)
+        assert path.read_text().split() == ["epoch,step,loss", "0,1,0.5", "0,2,0.4"]
