@@ -26,6 +26,7 @@ def make_head(name: str, out_channels: int, width: int | None = None) -> nn.Modu
         width: channels of its first level. None: its default.
 
     Example:
+        >>> import torch
         >>> make_head("plain", 3, width=4)(torch.rand(1, 3, 20, 30)).shape
         torch.Size([1, 3, 20, 30])
     """
