@@ -132,7 +132,10 @@ class TestFillHoles(BaseTester):
     @settings(max_examples=40, deadline=None)
     @given(st.integers(0, 2**31), st.floats(0.002, 0.9), st.integers(1, 40), st.integers(1, 40))
     def test_property_a_hole_takes_the_value_of_its_nearest_neighbour(self, seed, share, height, width):
-        """Against brute force: the pixel it takes its value from is at most 3 % farther than the nearest."""
+        """Against brute force: the pixel it takes its value from is at most 3.8 % farther than the nearest.
+
+        OpenCV measures by steps of 1, 1.4 and 2.1969, which are 0.9825 to 1.0192 times the distance.
+        """
         rng = np.random.default_rng(seed)
         known = rng.random((height, width)) < share
         known[rng.integers(height), rng.integers(width)] = True
@@ -145,7 +148,7 @@ class TestFillHoles(BaseTester):
         taken = np.linalg.norm(here - place[filled.astype(int).ravel() - 1], axis=1)
         nearest = np.linalg.norm(here[:, None] - here[known.ravel()][None], axis=2).min(1)
         assert np.isin(filled, values[known]).all()
-        assert (taken <= 1.03 * nearest + 1e-9).all()
+        assert (taken <= 1.0192 / 0.9824 * nearest + 1e-9).all()
 
     def test_feature_infinity_fills_too(self):
         known = np.array([[True, False, False, True]])
