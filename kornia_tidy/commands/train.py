@@ -15,7 +15,7 @@ from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.training.heads import HEADS
 from kornia_tidy.training.lightning_extra import require_lightning
 from kornia_tidy.training.scenes import SCENES
-from kornia_tidy.training.settings import PRECISIONS, TrainingSettings
+from kornia_tidy.training.settings import PRECISIONS, SCHEDULES, TrainingSettings
 from kornia_tidy.training.tasks import MAPS
 
 DESCRIPTION = """\
@@ -61,6 +61,9 @@ def add_parser(subparsers: Any) -> None:
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
     _setting(system, "head", choices=tuple(HEADS), help="network")
     _setting(system, "width", type=int, metavar="C", help="channels of its first level")
+    _setting(
+        system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
+    )
     _setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
     _setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
 
@@ -92,6 +95,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(learning, "accumulate", type=int, metavar="N", help="batches in a step")
     _setting(learning, "lr", type=float, metavar="LR", help="learning rate of the network")
     _setting(learning, "lr_metres", type=float, metavar="LR", help="learning rate of the masks, metres of height")
+    _setting(learning, "schedule", choices=SCHEDULES, help="of both rates; cosine: up, then down to zero")
     _setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
     _setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
     _setting(learning, "precision", choices=PRECISIONS, help="of the network; optics stay in float32")

@@ -5,6 +5,7 @@ from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
 from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
+from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "PhaseCam3DUNet",
     "Preconditioned",
     "ReconstructionHead",
+    "Residual",
     "Tikhonov",
     "TikhonovLayers",
     "load_midas_small",

@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.training.random_state import keyed_seed, seeded
 from kornia_tidy.training.settings import TrainingSettings
 
@@ -54,7 +55,7 @@ class DeadLeavesScenes(Dataset):
 def _dead_leaves(settings: TrainingSettings, split: str) -> Dataset:
     count = settings.scenes if split == "train" else settings.validation_scenes
     depths = settings.depth_range or (0.3, float("inf"))
-    return DeadLeavesScenes(count, settings.size, depths, keyed_seed(settings.seed, split))
+    return Remembered(DeadLeavesScenes(count, settings.size, depths, keyed_seed(settings.seed, split)))
 
 
 # From settings and split ("train" or "validation") to a map-style data set of {"image", "depth", "mask", "index"}.
