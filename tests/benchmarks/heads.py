@@ -15,7 +15,7 @@ from kornia_tidy.training.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(
     head="attention-unet", width=8, residual=True, size=128, scenes=480, validation_scenes=24, batch=6, lr=2e-3,
-    lr_metres=3e-8, schedule="cosine", epochs=12, ema=0.99, precision="bf16-mixed",
+    lr_metres=6e-8, schedule="cosine", epochs=8, ema=0.99, precision="bf16-mixed",
 )  # fmt: skip
 TASKS = ("edof", "joint")
 MASKS = (5, 1, 0)  # 0: a fixed Fresnel lens
