@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch.utils.data import Dataset, Subset
@@ -23,7 +23,7 @@ from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.tasks import metres
 
 SPLITS = ("train", "validation", "test", "all")
-PUBLISHED = {"train": "train", "validation": "val", "test": "test"}  # as FlyingThings3D and its patches call them
+PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}
 SHARE = 10  # one in so many scenes is for validation, and one for testing where nothing else is published
 TESTED = 32  # scenes made here, unless asked for more
 

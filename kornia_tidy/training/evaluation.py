@@ -165,7 +165,8 @@ def table(rows: Sequence[Row]) -> list[str]:
     """Return the lines of a table of scores: their mean and their range over the scenes that have them.
 
     Example:
-        >>> print("\\n".join(table([{"scene": 0, "depth_rmse": 0.25}, {"scene": 1, "depth_rmse": 0.75}])))
+        >>> for line in table([{"scene": 0, "depth_rmse": 0.25}, {"scene": 1, "depth_rmse": 0.75}]):
+        ...     print(line)
         score                      mean    lowest   highest
         depth_rmse               0.5000    0.2500    0.7500
     """
