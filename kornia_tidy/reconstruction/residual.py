@@ -9,8 +9,8 @@ from torch import Tensor, nn
 class Residual(nn.Module):
     """Add the capture to a network's last maps, its estimate of the all-in-focus image.
 
-    It begins as the identity, whatever the network's weights: the weights that make the image's maps start at zero. So
-    training starts from the capture's error, and short trainings improve on the capture instead of learning to copy it.
+    It begins as the identity, whatever the network's weights: the last convolution starts at zero. So training starts
+    from the capture's error, and short trainings improve on the capture instead of learning to copy it.
 
     Args:
         network: any that ends in a convolution; its last maps are the image.
@@ -32,7 +32,7 @@ class Residual(nn.Module):
         >>> capture = torch.rand(1, 3, 20, 30)
         >>> depth, image = head(capture).split([1, 3], 1)
         >>> bool((image == capture).all()), bool((depth == 0).all())
-        (True, False)
+        (True, True)
     """
 
     def __init__(self, network: nn.Module, channels: int = 3) -> None:
@@ -46,7 +46,7 @@ class Residual(nn.Module):
         self.network, self.channels = network, channels
         with torch.no_grad():
             for parameter in last.parameters():
-                parameter[-channels:] = 0
+                parameter.zero_()
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the maps, the capture added to the last ones."""
