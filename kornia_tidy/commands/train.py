@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -160,10 +161,11 @@ def run(args: argparse.Namespace) -> None:
     stored = args.resume and (folder / SETTINGS).exists()
     settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()
     settings = settings.replace(**given_settings(args))
+    say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # one of the processes speaks for all
     many = {"strategy": "ddp"} if args.devices > 1 else {}
-    tell("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
+    say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
     goes_on = args.resume and (folder / LAST).exists()
-    tell("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
+    say("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
     try:
         module = train(
             settings,
@@ -178,12 +180,16 @@ def run(args: argparse.Namespace) -> None:
             **many,
         )
     except KeyboardInterrupt:
-        tell("stopped", f"--resume -o {folder} goes on from the last checkpoint")
+        say("stopped", f"--resume -o {folder} goes on from the last checkpoint")
         raise
-    tell("camera", module.optics.extra_repr())
-    tell("wrote", f"{folder / BEST}: evaluate this one")
+    say("camera", module.optics.extra_repr())
+    say("wrote", f"{folder / BEST}: evaluate this one")
     for name in (LAST, SETTINGS, "training.csv", "validation.csv", "pictures"):
-        tell("", str(folder / name))
+        say("", str(folder / name))
+
+
+def _nothing(*_: str) -> None:
+    """Say nothing."""
 
 
 def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)
