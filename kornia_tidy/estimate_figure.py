@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.figures import ACCENT, DEPTH_COLORS, FAINT, LABEL, TITLE, require_matplotlib
-from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
+from kornia_tidy.reconstruction.metrics import psnr, ssim
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
 COLUMN, MARGIN = 2.3, 0.3  # inches
-HEADINGS = ("the scene", "capture", "all-in-focus estimate", "its error, x3", "depth estimate", "its error, x3")
+HEADINGS = ("the scene", "capture", "its error, x3", "all-in-focus estimate", "its error, x3")
 
 
 class Estimate(NamedTuple):
@@ -26,32 +26,28 @@ class Estimate(NamedTuple):
     name: str
     capture: Tensor
     image: Tensor
-    nearness: Tensor
-    """(1, H, W), 0 at the far and 1 at the near end of the camera's range."""
 
-    def scores(self, image: Tensor, nearness: Tensor, valid: Tensor) -> dict[str, float]:
-        """Return PSNR (dB) of capture and image, SSIM of the image, and the RMSE of nearness where it is known."""
-        truth, known = image[None], valid[None]
+    def scores(self, image: Tensor) -> dict[str, float]:
+        """Return PSNR (dB) of capture and image, and SSIM of the image, against the scene."""
+        truth = image[None]
         return {
             "capture_psnr": float(psnr(self.capture[None], truth)),
             "image_psnr": float(psnr(self.image[None].clamp(0, 1), truth)),
             "image_ssim": float(ssim(self.image[None].clamp(0, 1), truth)),
-            "depth_rmse": float(rmse(self.nearness[None].clamp(0, 1), nearness[None], known)),
         }
 
 
-def draw_estimates(image: Tensor, nearness: Tensor, valid: Tensor, estimates: Sequence[Estimate]) -> Figure:
-    """Draw a row for each camera: capture, all-in-focus image and depth as estimated, and where they err.
+def draw_estimates(image: Tensor, nearness: Tensor, estimates: Sequence[Estimate]) -> Figure:
+    """Draw a row for each camera: the capture, the all-in-focus image that a network makes of it, and where they err.
 
     Args:
         image: the scene in focus, (3, H, W) in [0, 1].
         nearness: its depth, (1, H, W), 0 at the far and 1 at the near end of the cameras' range.
-        valid: bool (1, H, W), False where depth is not known; errors are not drawn there.
         estimates: of two cameras or more, from top to bottom; beside the first stands the scene, beside the second
             its depth.
 
     Returns:
-        A figure; ``figure.savefig(path, dpi=150)`` makes it some 2200 pixels wide.
+        A figure; ``figure.savefig(path, dpi=150)`` makes it some 1800 pixels wide.
 
     Raises:
         ImportError: if matplotlib is missing.
@@ -67,17 +63,14 @@ def draw_estimates(image: Tensor, nearness: Tensor, valid: Tensor, estimates: Se
     figure = Figure(figsize=(len(HEADINGS) * COLUMN + 2 * MARGIN, height), facecolor="white")
     axes = figure.subplots(len(estimates), len(HEADINGS), squeeze=False)
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
-    figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus, and depth", fontsize=14)
+    figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus", fontsize=14)
     for y, estimate in enumerate(estimates):
-        scores = estimate.scores(image, nearness, valid)
-        wrong = (estimate.image - image).abs() * ERROR_SCALE
-        far_off = (estimate.nearness - nearness).abs().where(valid, 0) * ERROR_SCALE
+        scores = estimate.scores(image)
         pictures = [
             (estimate.capture, f"{scores['capture_psnr']:.1f} dB"),
+            ((estimate.capture - image).abs() * ERROR_SCALE, ""),
             (estimate.image, f"{scores['image_psnr']:.1f} dB, SSIM {scores['image_ssim']:.2f}"),
-            (wrong, ""),
-            (_in_colors(estimate.nearness), f"RMSE {100 * scores['depth_rmse']:.1f} % of the range"),
-            (far_off.expand(3, -1, -1), ""),
+            ((estimate.image - image).abs() * ERROR_SCALE, ""),
         ]
         for x, (picture, words) in enumerate(pictures, start=1):
             _show(axes[y][x], picture, words, HEADINGS[x] if y == 0 else "")

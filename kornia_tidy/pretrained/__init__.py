@@ -15,8 +15,8 @@ from kornia_tidy.training.state_file import read_state, write_state
 from kornia_tidy.training.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
-PRETRAINED = ("edof-5", "edof-1", "joint-5", "joint-1")
-"""Task and number of masks. The joint systems estimate depth and the all-in-focus image."""
+PRETRAINED = ("edof-5", "edof-1", "edof-0")
+"""Task and number of masks; 0 is a plain lens, for comparison."""
 
 
 def load_pretrained(name: str) -> TrainedSystem:
@@ -35,12 +35,12 @@ def load_pretrained(name: str) -> TrainedSystem:
 
     Example:
         >>> import torch
-        >>> system = load_pretrained("joint-5")
+        >>> system = load_pretrained("edof-5")
         >>> image, depth = torch.rand(1, 3, 64, 64), torch.full((1, 1, 64, 64), 1.0)
         >>> with torch.no_grad():
         ...     estimate = system.head(system.optics(image, depth))
-        >>> estimate.shape  # depth, then the image
-        torch.Size([1, 4, 64, 64])
+        >>> estimate.shape
+        torch.Size([1, 3, 64, 64])
     """
     check_choice("name", name, PRETRAINED)
     return load_trained(FOLDER / f"{name}.safetensors")
