@@ -12,17 +12,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.candidates import LAYER_SPACINGS, PIXEL_TOLERANCES, REFERENCE, window_ladder
 from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.psf_bank import PSFBank
-from kornia_tidy.planning import (
-    LAYER_SPACINGS,
-    PIXEL_TOLERANCES,
-    REFERENCE,
-    PlannedScene,
-    Planner,
-    window_ladder,
-)
+from kornia_tidy.planning import PlannedScene, Planner
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import largest_window
 from tests.base import BaseTester, needs_data
@@ -136,7 +130,7 @@ class TestTolerance(BaseTester):
     @pytest.fixture
     def narrow(self, monkeypatch):
         """A reference of 65 pixels at most: a tenth of the time, and all that is predicted is there."""
-        monkeypatch.setattr("kornia_tidy.planning.REFERENCE", REFERENCE.replace(name="reference", max_window=65))
+        monkeypatch.setattr("kornia_tidy.camera_survey.REFERENCE", REFERENCE.replace(name="reference", max_window=65))
 
     @pytest.mark.usefixtures("narrow")
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])

@@ -20,6 +20,7 @@ from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank
 from kornia_tidy.optics.exact import exact_psf_bank
+from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
@@ -238,7 +239,8 @@ class CodedLens(nn.Module):
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states, weights = self._states(torch.float32)
-        return self._build(states, weights, self.spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
+        spectrum = self._spectrum(len(self.spectrum.weights))
+        return self._build(states, weights, spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
@@ -352,7 +354,8 @@ class CodedLens(nn.Module):
 
     def _spectrum(self, channels: int) -> Spectrum:
         if channels == len(self.spectrum.weights):
-            return self.spectrum
+            most = self.fidelity.wavelengths
+            return self.spectrum if most is None else fewer_wavelengths(self.spectrum, most)
         if channels == 1:
             return Spectrum.monochrome()
         raise ValueError(
