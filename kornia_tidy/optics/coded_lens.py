@@ -239,11 +239,15 @@ class CodedLens(nn.Module):
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states, weights = self._states(torch.float32)
-        spectrum = self._spectrum(len(self.spectrum.weights))
-        return self._build(states, weights, spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
+        return self._build(states, weights, self._seen.flat(), self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
+        """Set an attribute; a part that shapes the PSFs makes wavelengths, window and pupil to be found anew."""
+        if name in ("spectrum", "fidelity"):
+            both = {**self.__dict__, name: value}
+            if "spectrum" in both and "fidelity" in both:
+                spectrum, most = both["spectrum"], both["fidelity"].wavelengths
+                self.__dict__["_seen"] = spectrum if most is None else fewer_wavelengths(spectrum, most)
         super().__setattr__(name, value)
         if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
             self.__dict__.update(_window=None, _pupil=None)
@@ -354,8 +358,7 @@ class CodedLens(nn.Module):
 
     def _spectrum(self, channels: int) -> Spectrum:
         if channels == len(self.spectrum.weights):
-            most = self.fidelity.wavelengths
-            return self.spectrum if most is None else fewer_wavelengths(self.spectrum, most)
+            return self._seen
         if channels == 1:
             return Spectrum.monochrome()
         raise ValueError(

@@ -68,7 +68,7 @@ def fewer_wavelengths(spectrum: Spectrum, count: int) -> Spectrum:
 
 def _slices(place: np.ndarray, light: np.ndarray, count: int) -> list[int]:
     """Return where the slices start that are together the least spread, by dynamic programming over their ends."""
-    place = (place - place.mean()) / np.ptp(place) if len(place) > 1 else place
+    place = (place - place.mean()) / max(np.ptp(place), np.finfo(float).tiny)
     total, first, second = (np.concatenate([[0.0], np.cumsum(light * place**power)]) for power in range(3))
     amount, moment = total - total[:, None], first - first[:, None]  # from a slice's start to its end
     longer = np.triu(np.ones_like(amount, dtype=bool), 1)
@@ -83,7 +83,3 @@ def _slices(place: np.ndarray, light: np.ndarray, count: int) -> list[int]:
     for cut in reversed(cuts):
         starts.insert(0, int(cut[starts[0]]))
     return [0, *starts[:-1]]
-
-
-# What torch.compiler.assume_constant_result does, without the compiler it imports: NumPy is not traced through.
-fewer_wavelengths._dynamo_marked_constant = True
