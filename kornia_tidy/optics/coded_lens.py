@@ -54,6 +54,8 @@ class CodedLens(nn.Module):
 
     _state: int | None = None  # the one state looked through, if not all
 
+    _seen: Spectrum  # what PSFs are computed at: the spectrum, at no more wavelengths than the fidelity allows
+
     def __init__(
         self,
         masks: PhaseMasks | None = None,
