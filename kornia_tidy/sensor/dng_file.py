@@ -133,9 +133,7 @@ def _xyz_to_camera(raw: RawCapture, planes: list[int]) -> Tensor | None:
 
 
 def _camera(info: RawInfo) -> list[Field]:
-    make, model = info.make or "", info.model or ""
-    name = model if model.lower().startswith(make.lower()) else f"{make} {model}"
-    fields: list[Field] = [(50708, ASCII, _text(name.strip() or "kornia_tidy"))]
+    fields: list[Field] = [(50708, ASCII, _text(info.camera or "kornia_tidy"))]
     fields += [(tag, ASCII, _text(text)) for tag, text in ((271, info.make), (272, info.model)) if text]
     return fields + ([(306, ASCII, _time(info.timestamp))] if info.timestamp else [])
 

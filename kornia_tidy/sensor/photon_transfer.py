@@ -155,7 +155,7 @@ def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] 
             channels[name] = fit
     level = float(black_planes(first, black).mean())
     method = "single" if single else "flats"
-    return PhotonTransfer(_name(first), first.info.iso, method, level, first.white, line, channels, tuple(points))
+    return PhotonTransfer(first.info.camera, first.info.iso, method, level, first.white, line, channels, tuple(points))
 
 
 def fit_line(points: Sequence[CurvePoint], fixed_pattern: bool = False) -> TransferLine:
@@ -290,7 +290,7 @@ def _check_alike(captures: Sequence[RawCapture]) -> None:
     """Refuse captures that do not share what a calibration is of."""
     first = captures[0]
     kinds: dict[str, Any] = {
-        "camera": _name,
+        "camera": lambda raw: raw.info.camera,
         "ISO": lambda raw: raw.info.iso,
         "size": lambda raw: tuple(raw.counts.shape),
         "pattern": lambda raw: raw.pattern,
@@ -344,12 +344,6 @@ def _exposures(captures: Sequence[RawCapture], black: Tensor | None) -> list[lis
             f"no other within {SAME_LEVEL:.0%}"
         )
     return groups
-
-
-def _name(raw: RawCapture) -> str:
-    """Make and model, the make once."""
-    make, model = (raw.info.make or "").strip(), (raw.info.model or "").strip()
-    return model if model.lower().startswith(make.lower()) else f"{make} {model}".strip()
 
 
 def _numbers(kind: type, entry: dict[str, Any]) -> Any:

@@ -1,7 +1,7 @@
 """Points of the photon-transfer curve: the variance of counts over their level, where nothing but noise varies.
 
-A picture, or the difference of two of the same thing, is cut into small blocks. Each place of the filter array's tile is
-a plane of its own, so nothing is interpolated. A block's residuals r about a fitted plane are noise alone unless the
+A picture, or the difference of two of the same thing, is cut into small blocks. Each place of the filter array's tile
+is a plane of its own, so nothing is interpolated. A block's residuals r about a fitted plane are noise alone unless the
 scene has texture there, and texture shows in what noise cannot have: neighbours that are alike, within a plane and from
 one plane to the next. Blocks are judged by such correlations of r / |r| only. For Gaussian noise r / |r| and |r|² are
 independent (Basu's theorem), so that what is left out leaves the variance of what is kept unbiased.
@@ -193,7 +193,7 @@ def _intervals(level: Tensor, variance: Tensor, side: int) -> Tensor:
 
 
 def _variance_and_whiteness(noise: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Variance (P, blocks) about a plane fitted to each block, and whether a site's blocks look like noise (blocks,)."""
+    """Variance (P, blocks) about a plane fitted to each block, and whether those of a place look like noise (blocks,)."""
     ramp = torch.arange(side, dtype=noise.dtype) - (side - 1) / 2
     ones = torch.ones_like(ramp)
     basis = torch.stack([torch.outer(a, b).flatten() for a, b in ((ones, ones), (ones, ramp), (ramp, ones))])
