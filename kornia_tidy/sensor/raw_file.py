@@ -250,6 +250,11 @@ class RawCapture:
         """Rows and columns after which the filter array repeats; (1, 1) without one."""
         return (1, 1) if self.pattern is None else (len(self.pattern), len(self.pattern[0]))
 
+    @property
+    def pattern_letters(self) -> str | None:
+        """Colours of the filter array's tile, by rows, such as ``"RGGB"``; None without one."""
+        return None if self.pattern is None else "".join(self.colors[index] for row in self.pattern for index in row)
+
     def mosaic(self) -> Tensor:
         r"""Return linear light, :math:`(n - n_{black}) / (n_{white} - n_{black})`, (C, H, W) float32.
 
