@@ -128,7 +128,7 @@ def run(args: argparse.Namespace) -> None:
             )
     tell("clamped", clamped_in_words(optics, scene.depth))
     saturated = float((raw.counts >= int(raw.white)).float().mean())
-    letters = "".join(raw.colors[index] for row in raw.pattern for index in row) if raw.pattern else "no"
+    letters = raw.pattern_letters or "no"
     tell("sensor", f"{letters} filter array, white {raw.white:g}, {saturated:.2%} of the pixels there; {noise}")
     with stages("write"):
         write_dng(output, raw)

@@ -193,7 +193,7 @@ def _intervals(level: Tensor, variance: Tensor, side: int) -> Tensor:
 
 
 def _variance_and_whiteness(noise: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Variance (P, blocks) about a plane fitted to each block, and whether those of a place look like noise (blocks,)."""
+    """Variance (P, blocks) about a plane fitted to each block, and which places look like noise (blocks,)."""
     ramp = torch.arange(side, dtype=noise.dtype) - (side - 1) / 2
     ones = torch.ones_like(ramp)
     basis = torch.stack([torch.outer(a, b).flatten() for a, b in ((ones, ones), (ones, ramp), (ramp, ones))])
