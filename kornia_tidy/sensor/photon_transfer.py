@@ -27,7 +27,10 @@ FORMAT = "kornia_tidy.photon_transfer/1"
 ROUNDING = 1 / 12  # variance that rounding to whole counts adds
 RESOLVED = 0.24  # EMVA 1288: variance in counts squared below which rounding hides the read noise
 SAME_LEVEL = 0.02  # captures whose levels differ by less, and by less than a count more, are of one exposure
-LEAST_POINTS = 3
+LEAST_POINTS, LEAST_POINTS_SINGLE = (
+    3,
+    8,
+)  # flats say exactly what noise is; a picture's errors show in their number only
 WORST_R_SQUARED, WORST_GAIN_ERROR = 0.9, 0.25  # beyond these the pictures are said not to allow a calibration
 _BISQUARE = 4.685  # Tukey's constant: 95 % efficient for Gaussian noise
 
@@ -117,7 +120,8 @@ def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] 
 
     Convention:
         - Fixed pattern, scene and drift of the light cancel in flats. In a single picture fixed pattern shows, and is
-          fitted with the line.
+          fitted with the line; texture too fine or too faint to be told from noise makes the gain a few percent small,
+          which the error does not hold.
         - Whether the file's black is right cannot be seen without ``darks``: one count too many makes the read noise
           squared too small by one count's electrons.
         - Where the read noise is below 0.4 counts its value is uncertain, as the error says.
@@ -151,7 +155,10 @@ def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] 
     channels = {}
     for name in dict.fromkeys(point.channel for point in points):
         own = [point for point in points if point.channel == name and point.variance >= RESOLVED]
-        if len(own) >= LEAST_POINTS and (fit := _fit(own, fixed_pattern=single)) is not None:
+        if (
+            len(own) >= (LEAST_POINTS_SINGLE if single else LEAST_POINTS)
+            and (fit := _fit(own, fixed_pattern=single)) is not None
+        ):
             channels[name] = fit
     level = float(black_planes(first, black).mean())
     method = "single" if single else "flats"
@@ -162,12 +169,12 @@ def fit_line(points: Sequence[CurvePoint], fixed_pattern: bool = False) -> Trans
     """Fit the line of photon transfer: weighted by what is known of each point, and deaf to outliers.
 
     Args:
-        points: level, variance and degrees of freedom; three or more.
-        fixed_pattern: whether there may be a part that grows as the square of the level; it is kept where it is seen
-            with three standard errors.
+        points: level, variance and degrees of freedom; three or more, eight with a fixed pattern.
+        fixed_pattern: whether there may be a part that grows as the square of the level, as in a single picture; it is
+            kept where it is seen with three standard errors.
 
     Raises:
-        ValueError: if there are fewer than three points, or variance does not grow with level.
+        ValueError: if there are fewer points, or variance does not grow with level.
 
     Convention:
         - Points of less than 0.24 counts squared are left out: what rounding adds to them is not 1/12.
@@ -181,10 +188,11 @@ def fit_line(points: Sequence[CurvePoint], fixed_pattern: bool = False) -> Trans
         (2.0, 6.0, 1.0)
     """
     clear = [point for point in points if point.variance >= RESOLVED]
-    if len(clear) < LEAST_POINTS:
+    least = LEAST_POINTS_SINGLE if fixed_pattern else LEAST_POINTS
+    if len(clear) < least:
         raise ValueError(
-            f"the pictures do not allow a photon-transfer fit: {len(clear)} levels with measurable noise, "
-            f"{LEAST_POINTS} or more are needed (smooth, unsaturated areas of different brightness)"
+            f"the pictures do not allow a photon-transfer fit: {len(clear)} levels with measurable noise, {least} or "
+            f"more are needed (smooth, unsaturated areas of different brightness)"
         )
     line = _fit(clear, fixed_pattern)
     if line is None:
@@ -237,7 +245,7 @@ def _fit(points: Sequence[CurvePoint], fixed_pattern: bool) -> TransferLine | No
     samples = torch.tensor([point.samples for point in points], dtype=torch.float64)
     scale = max(float(level.abs().max()), 1e-9)  # the columns are then of one size
     powers = torch.stack([torch.ones_like(level), level / scale, (level / scale) ** 2], dim=-1)
-    use = 3 if fixed_pattern and len(points) > LEAST_POINTS else 2
+    use = 3 if fixed_pattern else 2
     terms, covariance = _robust(powers[:, :use], variance, samples)
     if use == 3 and terms[2] < 3 * covariance[2, 2].sqrt():
         terms, covariance = _robust(powers[:, :2], variance, samples)
