@@ -244,6 +244,8 @@ def _fit(points: Sequence[CurvePoint], fixed_pattern: bool) -> TransferLine | No
     variance = torch.tensor([point.variance for point in points], dtype=torch.float64)
     samples = torch.tensor([point.samples for point in points], dtype=torch.float64)
     scale = max(float(level.abs().max()), 1e-9)  # the columns are then of one size
+    if float(level.max() - level.min()) < 1e-3 * scale:
+        return None
     powers = torch.stack([torch.ones_like(level), level / scale, (level / scale) ** 2], dim=-1)
     use = 3 if fixed_pattern else 2
     terms, covariance = _robust(powers[:, :use], variance, samples)
@@ -287,7 +289,9 @@ def _robust(design: Tensor, values: Tensor, samples: Tensor) -> tuple[Tensor, Te
         off = (values - design @ terms) / (fitted * (2 / samples).sqrt())
         scatter = max(1.0, 1.4826 * float(off.abs().median()))
         if step > 3:  # the weights have settled
-            trust = (1 - (off / (_BISQUARE * scatter)).square()).clamp(min=0).square()
+            before, trust = trust, (1 - (off / (_BISQUARE * scatter)).square()).clamp(min=0).square()
+            if torch.allclose(before, trust, rtol=0, atol=1e-7):
+                break
     return terms, torch.linalg.pinv(normal) * scatter**2
 
 

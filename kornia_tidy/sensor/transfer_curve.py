@@ -22,8 +22,8 @@ FEWEST_BLOCKS = 30  # in an interval, whose variance is then known to 4 %
 CLIPPED_BLOCKS = 0.02  # share of an interval's blocks from which on all of it is left out: the rest is a selection
 LEAST_SHARE = 0.1  # of an interval's blocks without texture; where there are fewer, these have some that was not seen
 # Correlations of white noise in four planes of 8 x 8: 0.00 ± 0.053 between planes, -0.08 ± 0.08 to the neighbours right
-# and below. One block of white noise in ten is left out.
-MOST_ALIKE_PLANES, MOST_ALIKE_NEIGHBORS = 0.08, 0.06
+# and below. Scenes are mostly alike, fine weaves may be the opposite. One block of white noise in eight is left out.
+BETWEEN_PLANES, TO_NEIGHBORS = (-0.13, 0.08), (-0.25, 0.06)
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _side(raw: RawCapture) -> int:
 def _blocks(planes: Tensor, side: int) -> Tensor:
     """(P, H, W) to (P, blocks, side * side)."""
     rows, columns = planes.shape[-2] // side, planes.shape[-1] // side
-    whole = planes[:, : rows * side, : columns * side].reshape(-1, rows, side, columns, side)
+    whole = planes[:, : rows * side, : columns * side].reshape(len(planes), rows, side, columns, side)
     return whole.transpose(2, 3).reshape(len(planes), rows * columns, side * side)
 
 
@@ -154,6 +154,8 @@ def _points(
     side = _side(raw)
     freedom = side * side - 3
     levels = _blocks(level, side).mean(-1)
+    if levels.numel() == 0:
+        return []
     judged = [_variance_and_whiteness(noise, side) for noise in noises]
     variance = torch.stack([v for v, _ in judged], dim=-1)  # (P, blocks, noises)
     white = torch.stack([w for _, w in judged], dim=-1)  # (blocks, noises)
@@ -211,7 +213,10 @@ def _variance_and_whiteness(noise: Tensor, side: int) -> tuple[Tensor, Tensor]:
         alike = alike + right + below
     count = len(noise)
     between = (together.square().sum((-2, -1)) - count) / (count * (count - 1))  # mean over pairs of planes
-    return torch.stack(variances), (between < MOST_ALIKE_PLANES) & (alike / count < MOST_ALIKE_NEIGHBORS)
+    white = torch.ones_like(between, dtype=torch.bool)
+    for value, (low, high) in ((between, BETWEEN_PLANES), (alike / count, TO_NEIGHBORS)):
+        white &= (value > low) & (value < high)
+    return torch.stack(variances), white
 
 
 def _median_variance(values: Tensor, freedom: int) -> float:

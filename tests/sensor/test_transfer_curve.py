@@ -40,7 +40,7 @@ class TestSpatialPoints(BaseTester):
         assert abs(variance / (20.0**2 + 1 / 12) - 1) < 4 * 1.26 * error  # a median is 1.25 times as uncertain
         kept = sum(point.samples for point in points) / (61 if len(pattern or "four") == 4 else 13)
         blocks = channels * 512**2 / (64 if len(pattern or "four") == 4 else 16)
-        assert 0.8 < kept / blocks < 0.99
+        assert kept / blocks > 0.8
 
     def test_feature_gradients_do_not_count(self):
         ramp = torch.linspace(0, 2000, 512).round().int() - 1000
