@@ -21,9 +21,9 @@ MOST_LEVELS = 32  # intervals of level, a channel
 FEWEST_BLOCKS = 30  # in an interval, whose variance is then known to 4 %
 CLIPPED_BLOCKS = 0.02  # share of an interval's blocks from which on all of it is left out: the rest is a selection
 LEAST_SHARE = 0.1  # of an interval's blocks without texture; where there are fewer, these have some that was not seen
-# Correlations of white noise in four planes of 8 x 8: 0.00 ± 0.053 between planes, -0.08 ± 0.08 to the neighbours right
-# and below. Scenes are mostly alike, fine weaves may be the opposite. One block of white noise in eight is left out.
-BETWEEN_PLANES, TO_NEIGHBORS = (-0.13, 0.08), (-0.25, 0.06)
+# Correlations, between planes and to the neighbours, in standard deviations from what white noise has. Scenes are mostly
+# alike, fine weaves may be the opposite. One block of white noise in eight is left out.
+LEAST_ALIKE, MOST_ALIKE = -2.3, 1.6
 
 
 @dataclass(frozen=True)
@@ -213,10 +213,33 @@ def _variance_and_whiteness(noise: Tensor, side: int) -> tuple[Tensor, Tensor]:
         alike = alike + right + below
     count = len(noise)
     between = (together.square().sum((-2, -1)) - count) / (count * (count - 1))  # mean over pairs of planes
+    mean, deviation = _neighbors_of_noise(basis)
     white = torch.ones_like(between, dtype=torch.bool)
-    for value, (low, high) in ((between, BETWEEN_PLANES), (alike / count, TO_NEIGHBORS)):
-        white &= (value > low) & (value < high)
+    for off in (
+        between / (2 / ((side * side - 3) * count * (count - 1))) ** 0.5,
+        (alike / count - mean) / (deviation / count**0.5),
+    ):
+        white &= (off > LEAST_ALIKE) & (off < MOST_ALIKE)
     return torch.stack(variances), white
+
+
+def _neighbors_of_noise(basis: Tensor) -> tuple[float, float]:
+    """Mean and standard deviation of white noise's correlation with its neighbours right and below, in a block.
+
+    Of r = x - (its part in the basis), the correlation is r' A r / |r|² with A the pairs of neighbours: a quadratic
+    form on the sphere of k dimensions, of mean tr(A) / k and variance 2 (k tr(A²) - tr(A)²) / (k² (k + 2)).
+    """
+    cells = basis.shape[-1]
+    side = int(cells**0.5)
+    index = torch.arange(cells).reshape(side, side)
+    pairs = torch.zeros(cells, cells, dtype=basis.dtype)
+    for one, other in ((index[:, 1:], index[:, :-1]), (index[1:], index[:-1])):
+        pairs[one.flatten(), other.flatten()] = 0.5
+        pairs[other.flatten(), one.flatten()] = 0.5
+    keep = torch.eye(cells, dtype=basis.dtype) - basis.T @ basis
+    form, k = keep @ pairs @ keep, cells - len(basis)
+    trace, square = float(form.trace()), float(form.square().sum())
+    return trace / k, (2 * (k * square - trace**2) / (k**2 * (k + 2))) ** 0.5
 
 
 def _median_variance(values: Tensor, freedom: int) -> float:

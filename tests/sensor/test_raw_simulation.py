@@ -89,7 +89,7 @@ class TestSensorCounts(BaseTester):
         own = camera("RGGB", 16, white_balance=balance, **changes)
         light = 0.5 + 0.2 * torch.rand(1, 3, 1, 1, device=device).expand(1, 3, 4, 4)
         counts = sensor_counts(light, own)[0, 0].cpu().double()
-        seen = (counts[:2, :2].flatten() - 4096) / (65535 - 4096) * balance
+        seen = (counts[:2, :2].flatten() - 4096) / (65535 - 4096) * balance[[0, 1, 3, 2]]  # by places
         if "xyz_to_camera" in changes:
             from_srgb = np.array([[0.4125, 0.3576, 0.1804], [0.2127, 0.7152, 0.0722], [0.0193, 0.1192, 0.9503]])
             forward = MATRIX.double().numpy() @ from_srgb
