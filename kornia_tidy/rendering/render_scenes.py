@@ -156,13 +156,12 @@ class _Captures(Dataset):
     def __getitem__(self, index: int) -> Files | str:
         try:
             with seeded(item_generator(self.seed, index).initial_seed()):
-                scene = self.scenes[index]
-                depth = scene["depth"]
-                whole = {"mask": torch.ones_like(depth, dtype=torch.bool), "name": item_key(index)}
-                sample = self.transform({**whole, **scene, "index": index})
+                sample = self.transform({"name": item_key(index), **self.scenes[index], "index": index})
+                sample.setdefault("mask", torch.ones_like(sample["depth"]))
                 return encode_item(sample, self.optics.clamped_pixels, self.layout)
         except (KeyError, OSError, TypeError, ValueError) as error:
-            return f"scene {index} of the data cannot be used: {error}"
+            reason = error.args[0] if isinstance(error, KeyError) else error  # which would come in quotes
+            return f"scene {index} of the data cannot be used: {reason}"
 
 
 def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[Capture]:
