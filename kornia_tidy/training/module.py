@@ -9,16 +9,17 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.reconstruction.losses import mse_loss
+from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import TrainingSettings, differences
 from kornia_tidy.training.tasks import (
+    LOSSES,
     MAPS,
     Loss,
     centre_crop,
-    image_rmse,
-    mean_square,
     nearness,
     split_maps,
     task_loss,
@@ -75,7 +76,7 @@ class TidyTraining(pl.LightningModule):
         optics: TiDyOptics,
         head: nn.Module,
         task: str = "edof",
-        loss: Loss = mean_square,
+        loss: Loss = mse_loss,
         *,
         lr: float = 1e-4,
         lr_metres: float = 1e-8,
@@ -97,14 +98,14 @@ class TidyTraining(pl.LightningModule):
         self.weights = {"depth": depth_weight, "image": image_weight}
 
     @classmethod
-    def from_settings(cls, settings: TrainingSettings, loss: Loss = mean_square) -> TidyTraining:
+    def from_settings(cls, settings: TrainingSettings) -> TidyTraining:
         """Return the module that settings describe; the network's weights come from the global generator."""
         optics = build_optics(settings)
         return cls(
             optics,
             build_head(settings),
             settings.task,
-            loss,
+            LOSSES[settings.loss],
             lr=settings.lr,
             lr_metres=settings.lr_metres,
             ema=settings.ema,
@@ -148,7 +149,7 @@ class TidyTraining(pl.LightningModule):
         seen = self.see(batch)
         scores = {"val_loss": task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)}
         for name, maps in seen.estimate.items():
-            errors = image_rmse(maps, seen.truth[name], seen.mask if name == "depth" else None)
+            errors = rmse(maps, seen.truth[name], seen.mask if name == "depth" else None)
             scores[f"val_{name}_rmse"] = errors.nanmean()
         self.log_dict(scores, batch_size=len(seen.coded), sync_dist=True, prog_bar=True)
 

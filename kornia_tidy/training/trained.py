@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.phase_masks import FresnelLens, PixelwiseMask
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tidy_optics import TiDyOptics
@@ -37,13 +36,10 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
         >>> build_optics(TrainingSettings(masks=2, window=23)).window
         23
     """
-    lens: dict[str, Any] = {"focal_length": settings.focal_length, "pixel_pitch": settings.pixel_pitch}
-    near_far = settings.depth_range
-    camera = ThinLensCamera(**lens) if near_far is None else ThinLensCamera.for_scene(near_far, **lens)
     noise = torch.Generator().manual_seed(settings.seed)
     optics = TiDyOptics(
         PixelwiseMask(settings.masks, generator=noise) if settings.masks else FresnelLens(),
-        camera,
+        settings.camera(),
         sensor=SensorNoise(settings.sigma),
         fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
         compositing=settings.compositing,
