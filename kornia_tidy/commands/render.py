@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from kornia_tidy.checks import check_positive
 from kornia_tidy.commands.options import seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
@@ -21,11 +22,10 @@ from kornia_tidy.rendering.render_scenes import render_scenes, shard_items_withi
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.systems import SYSTEMS
 from kornia_tidy.tidy_optics import TiDyOptics
-from kornia_tidy.training.scenes import make_scenes
+from kornia_tidy.training.data_sets import SPLITS, make_scenes
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.trained import build_optics, load_trained
 
-SPLITS = ("train", "validation", "test", "all")
 OF_SCENES = ("data", "root", "size", "scenes", "validation_scenes", "depth_range", "seed")
 OF_CAMERA = (
     "masks", "focal_length", "pixel_pitch", "depth_range", "sigma", "fidelity", "compositing", "border",
@@ -95,8 +95,16 @@ def add_parser(subparsers: Any) -> None:
 
     scenes = parser.add_argument_group("scenes", "With --checkpoint, defaults are those of the training.")
     add_scene_options(scenes)
-    scenes.add_argument("--split", choices=SPLITS, default="train", help="part of the data (default: train)")
-    scenes.add_argument("--scenes", type=int, metavar="N", help="number, of scenes made here (default: the split's)")
+    scenes.add_argument(
+        "--split", choices=SPLITS, default="train", help="part of the data; all: of an rgbd-folder (default: train)"
+    )
+    scenes.add_argument(
+        "--scenes",
+        type=int,
+        metavar="N",
+        help="number of patches and scenes made here; of files at most, but of their train split all "
+        "(default: the split's)",
+    )
 
     camera = parser.add_argument_group("camera", f"With --preset: {', '.join(f'--{name}' for name in OF_PRESET)} only.")
     which = camera.add_mutually_exclusive_group()
@@ -119,9 +127,10 @@ def run(args: argparse.Namespace) -> None:
     """Render, and tell how it went."""
     rank, world = (_environment(name, default) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
     optics, settings, camera_from = _camera(args)
-    scenes = make_scenes(settings, args.split)
+    scenes = make_scenes(settings, args.split, args.scenes)
     layout = Layout(tuple(args.beside), args.float, args.shard_items)
     if args.shard_megabytes is not None:
+        check_positive("--shard-megabytes", args.shard_megabytes)
         size = int(args.shard_megabytes * 1e6)
         items = shard_items_within(optics, scenes, layout, size, args.noise_seed)
         layout = Layout(layout.beside, layout.floats, items)
@@ -168,6 +177,8 @@ def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dic
     if args.checkpoint:
         system = load_trained(args.checkpoint)
         digest = hashlib.sha256(read_bytes(args.checkpoint)).hexdigest()
+        if given.get("data", system.settings.data) != system.settings.data:
+            given = {"root": None, **given}  # the folder was that of the other data
         return system.optics, system.settings.replace(**given), {"checkpoint": str(args.checkpoint), "sha256": digest}
     settings = TrainingSettings().replace(**given)
     if not args.preset:

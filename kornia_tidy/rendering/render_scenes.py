@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from kornia_tidy.dataset_transform import item_generator
 from kornia_tidy.files import remove_leftovers, replacing, write_bytes, write_folder
 from kornia_tidy.rendering.conditions import claim, conditions
 from kornia_tidy.rendering.index import INDEX, encode_index
 from kornia_tidy.rendering.item_files import encode_item
 from kornia_tidy.rendering.layout import Layout, Part, item_key
+from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.random_state import seeded
 
@@ -155,7 +155,7 @@ class _Captures(Dataset):
 
     def __getitem__(self, index: int) -> Files | str:
         try:
-            with seeded(item_generator(self.seed, index).initial_seed()):
+            with seeded(keyed_seed(self.seed, "scene", index)):
                 sample = self.transform({"name": item_key(index), **self.scenes[index], "index": index})
                 sample.setdefault("mask", torch.ones_like(sample["depth"]))
                 return encode_item(sample, self.optics.clamped_pixels, self.layout)

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 class TestResume(BaseTester):
     def test_feature_processes_killed_at_random_moments_end_with_the_bytes_of_one_undisturbed(self, tmp_path):
         """One, two and three processes by turns, with one job or two; and three at once that nobody kills."""
-        command = [sys.executable, "-m", "tests.rendering.killed_renders", str(tmp_path), "6"]
+        command = [sys.executable, "-m", "tests.rendering.killed_renders", str(tmp_path), "3"]
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
         assert done.returncode == 0, done.stderr
         told = json.loads(done.stdout)
