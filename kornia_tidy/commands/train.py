@@ -98,21 +98,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(data, "scenes", type=int, metavar="N", help="number for training, of patches and scenes made here")
     _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation, at most")
 
-    camera = parser.add_argument_group("camera")
-    _setting(
-        camera,
-        "depth_range",
-        type=float,
-        nargs=2,
-        metavar=("NEAR", "FAR"),
-        help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
-    )
-    _setting(camera, "focal_length", type=float, metavar="M", help="metres")
-    _setting(camera, "pixel_pitch", type=float, metavar="M", help="metres")
-    _setting(camera, "sigma", type=float, metavar="S", help="read noise, of full scale")
-    _setting(camera, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
-    _setting(camera, "compositing", choices=tuple(COMPOSITING), help="of depths")
-    _setting(camera, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
+    add_camera_settings(parser.add_argument_group("camera"))
 
     learning = parser.add_argument_group("learning")
     _setting(learning, "epochs", type=int, metavar="N", help="passes over the scenes")
@@ -141,6 +127,24 @@ def add_scene_options(group: Any) -> None:
     _setting(group, "data", choices=tuple(SCENES), help="where scenes come from")
     _setting(group, "root", metavar="FOLDER", help="folder of data that are files; default: data/NAME")
     _setting(group, "size", type=int, metavar="PX", help="side of the scenes; larger ones are cropped")
+
+
+def add_camera_settings(group: Any) -> None:
+    """Add which lens and sensor, to a command that takes its defaults from settings."""
+    _setting(
+        group,
+        "depth_range",
+        type=float,
+        nargs=2,
+        metavar=("NEAR", "FAR"),
+        help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
+    )
+    _setting(group, "focal_length", type=float, metavar="M", help="metres")
+    _setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
+    _setting(group, "sigma", type=float, metavar="S", help="read noise, of full scale")
+    _setting(group, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
+    _setting(group, "compositing", choices=tuple(COMPOSITING), help="of depths")
+    _setting(group, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
 
 
 def given_settings(args: argparse.Namespace) -> dict[str, Any]:
