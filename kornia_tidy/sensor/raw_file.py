@@ -6,11 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.sensor.raw_decoding import Source, decode_raw, source_bytes, source_name
+from kornia_tidy.sensor.raw_plausible import check_plausible
 
 PATTERN_COLORS = {"RGB": "RGBG", "CGMY": "GMCY"}  # LibRaw's order of the channels, by the letters of a filter array
 
@@ -64,7 +68,7 @@ class RawCapture:
         info: camera, lens and exposure.
     """
 
-    counts: Tensor
+    counts: Tensor = field(repr=False)
     pattern: tuple[tuple[int, ...], ...] | None
     colors: str
     black: Tensor
@@ -76,6 +80,87 @@ class RawCapture:
     flip: int = 0
     pixel_aspect: float = 1.0
     info: RawInfo = field(default_factory=RawInfo)
+
+    @classmethod
+    def open(cls, source: Source, *, timeout: float = 60.0, memory_limit: int = 2**31) -> RawCapture:
+        """Read a camera raw file, whatever is in it: a picture comes back, or one sentence.
+
+        LibRaw decodes it in a process of its own, within these limits, so that a file that makes it crash, hang or
+        ask for all memory does no harm here. What it decodes is checked to be a picture.
+
+        Args:
+            source: a path, the bytes of a file, or a binary file.
+            timeout: seconds that decoding may take.
+            memory_limit: bytes of memory that decoding may use.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is empty, damaged, cut short, not a raw file, of a kind that LibRaw does not decode,
+                without a picture, or too much for the limits.
+
+        Warns:
+            UserWarning: if more than one count in a thousand lies above the file's white level.
+
+        Convention:
+            The visible area only, without masked borders; a JPEG-like tone curve, if the file has one, is undone.
+        """
+        header, counts, length = decode_raw(source, timeout, memory_limit)
+        name = source_name(source)
+        try:
+            raw = _from_header(header, counts)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"cannot read {name}: what it says of its sensor makes no sense ({error})") from None
+        check_plausible(name, raw.counts, raw.black, raw.white, length)
+        return raw
+
+    @classmethod
+    def open_dump(
+        cls,
+        source: Source,
+        size: tuple[int, int],
+        pattern: str | None,
+        black: float | Sequence[float],
+        white: float,
+        dtype: str = "uint16",
+        byte_order: str = "little",
+    ) -> RawCapture:
+        """Read a bare dump of a sensor's counts, row by row: a file without a header says nothing of itself.
+
+        Args:
+            source: a path, the bytes of a file, or a binary file.
+            size: rows and columns.
+            pattern: letters of the filter array's tile, by rows, such as ``"RGGB"``; None for a monochrome sensor.
+            black: count without light, one or one for each place of the tile.
+            white: saturation count.
+            dtype: ``"uint8"`` or ``"uint16"``.
+            byte_order: ``"little"`` or ``"big"``.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file's length is not that of these counts, or they are implausible.
+
+        Example:
+            >>> data = bytes([1, 2, 1, 3, 1, 4, 2, 0])
+            >>> RawCapture.open_dump(data, (2, 2), "RGGB", black=256, white=1023, byte_order="big").counts
+            tensor([[[258, 259],
+                     [260, 512]]], dtype=torch.int32)
+        """
+        check_choice("dtype", dtype, ("uint8", "uint16"))
+        check_choice("byte_order", byte_order, ("little", "big"))
+        name, data = source_name(source), source_bytes(source)
+        layout = np.dtype(dtype).newbyteorder("<" if byte_order == "little" else ">")
+        height, width = size
+        if min(size) < 1 or len(data) != height * width * layout.itemsize:
+            raise ValueError(
+                f"cannot read {name}: {width} x {height} counts of {dtype} take {height * width * layout.itemsize} "
+                f"bytes, it has {len(data)}"
+            )
+        if not white <= np.iinfo(dtype).max:
+            raise ValueError(f"white must be at most {np.iinfo(dtype).max}, the largest {dtype}, got {white}")
+        counts = torch.from_numpy(np.frombuffer(data, layout).astype(np.int32).reshape(1, height, width))
+        raw = cls.from_counts(counts, pattern, black, white)
+        check_plausible(name, raw.counts, raw.black, raw.white, len(data))
+        return raw
 
     @classmethod
     def from_counts(
@@ -130,17 +215,25 @@ class RawCapture:
         """Rows and columns after which the filter array repeats; (1, 1) without one."""
         return (1, 1) if self.pattern is None else (len(self.pattern), len(self.pattern[0]))
 
+    @property
+    def pattern_letters(self) -> str | None:
+        """Colours of the filter array's tile, by rows, such as ``"RGGB"``; None without one."""
+        return None if self.pattern is None else "".join(self.colors[index] for row in self.pattern for index in row)
+
     def mosaic(self) -> Tensor:
         r"""Return linear light, :math:`(n - n_{black}) / (n_{white} - n_{black})`, (C, H, W) float32.
 
         Convention:
             Noise around black stays below 0 and counts above white stay above 1: nothing is clamped.
         """
-        height, width = self.counts.shape[-2:]
+        light = self.counts.float()
         rows, columns = self.tile
-        black = self.black.reshape(-1, rows, columns)
-        black = black.repeat(1, -(-height // rows), -(-width // columns))[:, :height, :width]
-        return (self.counts - black) / (self.white - black)
+        for row in range(rows):
+            for column in range(columns):
+                black = self.black[:, None, None] if self.pattern is None else self.black[row, column]
+                place = light[:, row::rows, column::columns]
+                place.sub_(black).div_(self.white - black)
+        return light
 
     def planes(self) -> Tensor:
         """Return the mosaic taken apart by places of the tile, not interpolated: (places, H // rows, W // columns).
@@ -197,3 +290,48 @@ def tile_planes(mosaic: Tensor, tile: tuple[int, int]) -> Tensor:
     whole = mosaic[:, : height * rows, : width * columns]
     places = whole.reshape(channels, height, rows, width, columns).permute(0, 2, 4, 1, 3)
     return places.reshape(channels * rows * columns, height, width)
+
+
+def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
+    """Return the capture that the decoding process describes; a damaged file can make it say anything."""
+    pattern, colors, info = header["pattern"], header["colors"], dict(header["info"])
+    if pattern is not None:
+        pattern = tuple(map(tuple, pattern))
+        if not all(0 <= index < len(colors) for row in pattern for index in row):
+            raise ValueError(f"filter array {pattern} of colours {colors!r}")
+        if counts.shape[1] < len(pattern) or counts.shape[2] < len(pattern[0]):
+            raise ValueError(f"{counts.shape[2]} x {counts.shape[1]} pixels")
+    if not 0.1 < header["pixel_aspect"] < 10:
+        raise ValueError(f"pixel aspect {header['pixel_aspect']}")
+    if "timestamp" in info:
+        info["timestamp"] = datetime.fromisoformat(info["timestamp"])
+    different = len(set(colors))
+    return RawCapture(
+        counts,
+        pattern,
+        colors,
+        torch.tensor(header["black"], dtype=torch.float32),
+        float(header["white"]),
+        xyz_to_camera=_matrix([row[:3] for row in header["xyz_to_camera"][:different]]),
+        camera_to_srgb=_matrix([row[:different] for row in header["camera_to_srgb"]]),
+        white_balance=_balance(header["white_balance"], colors),
+        daylight_balance=_balance(header["daylight_balance"], colors),
+        flip=header["flip"] & 7,
+        pixel_aspect=header["pixel_aspect"],
+        info=RawInfo(**info),
+    )
+
+
+def _matrix(rows: list[list[float]]) -> Tensor | None:
+    """Return a matrix, or None where the file has none: LibRaw then says zeros."""
+    matrix = torch.tensor(rows)
+    return matrix if matrix.numel() and bool(matrix.isfinite().all() & (matrix != 0).any()) else None
+
+
+def _balance(factors: list[float], colors: str) -> Tensor | None:
+    """Return factors with that of the first green as 1, or None if one is unknown."""
+    if "G" not in colors:
+        return None
+    known = [factors[i] or factors[colors.index(letter)] for i, letter in enumerate(colors)]
+    balance = torch.tensor(known) / known[colors.index("G")] if known[colors.index("G")] else torch.zeros(1)
+    return balance if bool(balance.isfinite().all() & (balance > 0).all()) else None
