@@ -25,12 +25,14 @@ class ResolvedPSF:
         band: highest frequency along either axis, in cycles per sample.
         psf: (M, M) samples with the chief ray at the centre, M // 2.
         variance: (M, M) of these.
+        leverage: share of an image's noise that the PSF has taken up, from 0, as in the mean of many, to 1.
     """
 
     spectrum: Tensor
     band: int
     psf: Tensor
     variance: Tensor
+    leverage: float
 
     def seen_from(self, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Return what point images look like, and how they change with the place of the point.
@@ -94,19 +96,21 @@ def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: flo
     noise = variances.mean((1, 2))  # of one pixel, alike at all frequencies
 
     passed = (1 - torch.hypot(frequency[:, None], frequency) / cutoff).clamp(min=0).square()
-    power = spectra.abs().square().mean() - noise.mean() * side**2
-    prior = passed / _folded(passed, side).mean() * power.clamp(min=1e-12 * float(spectra.abs().square().mean()))
+    power = spectra.abs().square().mean()
+    prior = passed / _folded(passed, side).mean() * (power - noise.mean() * side**2).clamp(min=1e-6 * float(power))
 
-    # Of every frequency of the image the aliases' phases: (side, side, N, aliases^2).
+    # For every frequency of the image, in units in which prior and noise are one: (side, side, N, aliases^2).
     rows, columns = (
         torch.exp(-2j * math.pi * frequency * offset[:, None]).unflatten(1, (aliases, side))
         for offset in offsets.unbind(1)
     )
-    phases = torch.einsum("nay,nbx->yxnab", rows, columns).flatten(3)
-    own = prior.unflatten(1, (aliases, side)).unflatten(0, (aliases, side)).permute(1, 3, 0, 2).flatten(2)
-    shared = own[..., None] * phases.mH  # S A^H
-    system = phases @ shared + torch.diag(noise * side**2).to(phases)
-    gains = torch.linalg.solve(system.mH, shared.mH).mH  # S A^H (A S A^H + N)^-1: (side, side, aliases^2, N)
+    noise_scale = noise.clamp(min=1e-30).rsqrt() / side
+    own = prior.sqrt().unflatten(1, (aliases, side)).unflatten(0, (aliases, side)).permute(1, 3, 0, 2).flatten(2)
+    phases = torch.einsum("nay,nbx->yxnab", rows, columns).flatten(3) * own[:, :, None] * noise_scale[:, None]
+    system = phases.mH @ phases + torch.eye(aliases**2).to(phases)
+    gains = torch.linalg.solve(system, phases.mH)
+    leverage = float((phases * gains.mT).sum(-1).real.mean())
+    gains = own[..., None] * gains * noise_scale  # (side, side, aliases^2, N)
 
     solved = (gains @ spectra.permute(1, 2, 0)[..., None])[..., 0]
     spectrum = solved.unflatten(2, (aliases, aliases)).permute(2, 0, 3, 1).reshape(length, length)
@@ -114,7 +118,7 @@ def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: flo
     filters = torch.fft.ifft2(gains.sum(2), dim=(0, 1)).real.permute(2, 0, 1)  # what an image adds to the PSF
     spread = torch.fft.fft2(filters.square()) * torch.fft.fft2(variances)
     variance = torch.fft.ifft2(spread.sum(0)).real
-    return ResolvedPSF(spectrum, band, psf, variance.clamp(min=0))
+    return ResolvedPSF(spectrum, band, psf, variance.clamp(min=0), leverage)
 
 
 def _frequencies(length: int, band: int, device: torch.device) -> Tensor:

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kornia_tidy.checks import check_float_tensor, check_positive
+from kornia_tidy.optics.psf_bank import enclosing_window
 
 
 def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]:
@@ -53,7 +54,10 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
 
 
 def annulus_background(image: Tensor, centre: tuple[float, float], inner: float, outer: float) -> Tensor:
-    """Return the light around a point that is not its own: the median of a ring, which ignores stray points.
+    """Return the light around a point that is not its own: the mean of a ring, without what stands out from it.
+
+    Values further than three standard deviations from the median, itself estimated by the median deviation, are left
+    out. (The median alone would be a whole step of the converter where the background is even.)
 
     Args:
         image: (C, H, W) linear light.
@@ -62,7 +66,7 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
         outer: its outer radius in pixels.
 
     Returns:
-        (C,) median of what lies in the picture.
+        (C,) of what lies in the picture.
 
     Raises:
         ValueError: if fewer than 32 pixels do.
@@ -73,8 +77,8 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
         >>> annulus_background(image, (16, 16), 10, 14)
         tensor([0.1000])
     """
-    rows = torch.arange(image.shape[-2], device=image.device) - centre[0]
-    columns = torch.arange(image.shape[-1], device=image.device) - centre[1]
+    rows = torch.arange(image.shape[-2], dtype=torch.float64, device=image.device) - centre[0]
+    columns = torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - centre[1]
     radius = torch.hypot(rows[:, None], columns)
     ring = image[:, (radius >= inner) & (radius <= outer)]
     if ring.shape[1] < 32:
@@ -82,7 +86,9 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
             f"the background needs 32 pixels between {inner:g} and {outer:g} px of a point at row {centre[0]:.0f}, "
             f"column {centre[1]:.0f}, the picture of {image.shape[-2]}x{image.shape[-1]} has {ring.shape[1]}"
         )
-    return ring.median(1).values
+    deviation = (ring - ring.median(1, keepdim=True).values).abs()
+    kept = deviation <= 3 * 1.4826 * deviation.median(1, keepdim=True).values
+    return (ring * kept).sum(1) / kept.sum(1)
 
 
 def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:
@@ -125,6 +131,51 @@ def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple
             break
         row, column = nearest
     return centre
+
+
+def centre_of_symmetry(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:
+    """Return the centre of light that looks alike from both sides: first moments under a Gaussian that moves along.
+
+    The Gaussian is as wide as the light, so that the noise of a wide window does not count, and unlike a window of
+    whole pixels it is centred on the light itself in the end.
+
+    Args:
+        image: (C, H, W), background taken off.
+        start: row and column near it.
+        window: side in pixels, odd, that holds the light.
+
+    Returns:
+        Row and column.
+
+    Raises:
+        ValueError: if the window leaves the picture or holds no light.
+
+    Source: Bernstein and Jarvis, The Astronomical Journal 123, 583 (2002), for moments weighted by what fits them.
+
+    Example:
+        >>> x = torch.arange(33.0)
+        >>> light = torch.exp(-((x[:, None] - 16.2) ** 2 + (x - 15.7) ** 2) / 8)[None]
+        >>> [round(c, 4) for c in centre_of_symmetry(light, (16, 16), 25)]
+        [16.2, 15.7]
+    """
+    coarse = centre_of_light(image, start, window)
+    nearest = round(coarse[0]), round(coarse[1])
+    light = cut_out(image, nearest, window).double().sum(0)
+    half = enclosing_window((light / light.sum())[None], 0.5) or window
+    steps = torch.arange(window, dtype=torch.float64, device=light.device) - window // 2
+    row, column = coarse[0] - nearest[0], coarse[1] - nearest[1]
+    width = max(1.0, half / 2)
+    for _ in range(50):
+        down, right = (torch.exp(-((steps - at) ** 2) / (2 * width**2)) for at in (row, column))
+        weighted = light * down[:, None] * right
+        total = weighted.sum()
+        # Of light as wide as the Gaussian these moments are half way to its centre.
+        move_down = 2 * float((weighted.sum(1) @ (steps - row)) / total)
+        move_right = 2 * float((weighted.sum(0) @ (steps - column)) / total)
+        row, column = row + move_down, column + move_right
+        if max(abs(move_down), abs(move_right)) < 1e-6:
+            break
+    return nearest[0] + row, nearest[1] + column
 
 
 def cut_out(image: Tensor, centre: tuple[int, int], side: int) -> Tensor:
