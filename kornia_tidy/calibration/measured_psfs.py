@@ -10,13 +10,11 @@ from dataclasses import asdict, dataclass
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.calibration.point_images import MARGIN, PointImage
 from kornia_tidy.calibration.registration import register
 from kornia_tidy.checks import check_depth
-from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.psf_bank import PSFBank
 
@@ -57,6 +55,41 @@ class MeasuredPSFs:
     uncertainty: Tensor
     distances: Tensor
     reports: tuple[PointReport, ...] = ()
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.bank.psfs.shape)
+        if tuple(self.uncertainty.shape) != shape:
+            raise ValueError(f"uncertainty must have the shape of the PSFs, {shape}, got {tuple(self.uncertainty.shape)}")
+        if tuple(self.distances.shape) != shape[:1]:
+            raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it all as safetensors, all or nothing; :meth:`PSFBank.load` reads the bank of it.
+
+        Raises:
+            FileNotFoundError: if the folder does not exist.
+        """
+        measured = {"measured.uncertainty": self.uncertainty, "measured.distances": self.distances}
+        self.bank.save(path, measured, {"reports": json.dumps([asdict(report) for report in self.reports])})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> MeasuredPSFs:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is no PSF bank, or one that was not measured.
+        """
+        bank = PSFBank.load(path, device)
+        with safe_open(path, framework="pt", device=str(device)) as file:
+            names = {"measured.uncertainty", "measured.distances"} & set(file.keys())
+            tensors = {name.removeprefix("measured."): file.get_tensor(name) for name in names}
+            text = (file.metadata() or {}).get("reports", "")
+        try:
+            reports = tuple(PointReport(**report) for report in json.loads(text))
+            return cls(bank, reports=reports, **tensors)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
 
 
 def diffraction_cutoff(camera: ThinLensCamera, wavelength: float) -> float:
