@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +12,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from kornia_tidy.calibration.point_images import MARGIN, PointImage
-from kornia_tidy.calibration.registration import register
+from kornia_tidy.calibration.registration import Registered, register
 from kornia_tidy.checks import check_depth
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.psf_bank import PSFBank
@@ -27,16 +26,16 @@ class PointReport:
         distance: of the point in metres.
         row: where its chief ray fell, in pixels.
         column: as well.
-        brightness: over the mean of those used at this distance.
-        misfit: mean square of its residuals in units of their variance; 1 is noise.
+        brightness: over the mean of those used at this distance; None if it was never used.
+        misfit: mean square of its residuals in units of their variance, 1 is noise; None likewise.
         rejected: why it was not used, or None.
     """
 
     distance: float
     row: float
     column: float
-    brightness: float
-    misfit: float
+    brightness: float | None
+    misfit: float | None
     rejected: str | None
 
 
@@ -130,31 +129,35 @@ def measure_psfs(
     for _, distance in nodes:
         own = list(images[distance])
         good = [image for image in own if image.fault is None]
+        reports += [
+            PointReport(distance, *image.place, None, None, image.fault) for image in own if image.fault is not None
+        ]
         if not good:
             raise ValueError(
                 f"no point image at {distance:g} m can be used: {'; '.join(str(image.fault) for image in own) or 'none'}"
             )
         channels = len(good[0].light)
-        limits = [cutoff] * channels if isinstance(cutoff, (int, float)) else list(cutoff)
-        found = register(good, limits)
+        found = register(good, [cutoff] * channels if isinstance(cutoff, (int, float)) else cutoff)
+        reports += _reports(distance, good, found)
         inside = slice(MARGIN, -MARGIN)
         psf = torch.stack([one.psf[inside, inside] for one in found.psfs])
         total = psf.sum((1, 2))[:, None, None]
         psfs.append((psf / total).clamp(min=0))
         deviations.append(torch.stack([one.variance[inside, inside] for one in found.psfs]).sqrt() / total)
-        place = iter(range(len(good)))
-        for image in own:
-            if image.fault is not None:
-                reports.append(PointReport(distance, *image.place, math.nan, math.nan, image.fault))
-                continue
-            n = next(place)
-            centre = (found.offsets[n] - torch.tensor(image.offset, dtype=torch.float64)).tolist()
-            misfit = float(found.misfit[n])
-            words = None if found.used[n] else f"its residuals are {misfit**0.5:.1f} times the noise"
-            row, column = image.place[0] + centre[0], image.place[1] + centre[1]
-            reports.append(PointReport(distance, row, column, float(found.brightness[n]), misfit, words))
     defocus = torch.tensor([psi for psi, _ in nodes], dtype=torch.float32)
     bank = PSFBank.from_measured(torch.stack(psfs).float(), defocus)
-    return MeasuredPSFs(
-        bank, torch.stack(deviations).float(), torch.tensor([z for _, z in nodes], dtype=torch.float64), tuple(reports)
-    )
+    distances = torch.tensor([distance for _, distance in nodes], dtype=torch.float64)
+    return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports))
+
+
+def _reports(distance: float, images: Sequence[PointImage], found: Registered) -> list[PointReport]:
+    reports = []
+    for n, image in enumerate(images):
+        misfit = float(found.misfit[n])
+        row, column = (
+            place - before + float(after)
+            for place, before, after in zip(image.place, image.offset, found.offsets[n], strict=True)
+        )
+        words = None if found.used[n] else f"its residuals are {misfit**0.5:.1f} times the noise"
+        reports.append(PointReport(distance, row, column, float(found.brightness[n]), misfit, words))
+    return reports

@@ -30,12 +30,14 @@ class PointImage:
         place: row and column in the capture, in pixels, where the chief ray falls as far as is known.
         light: (C, M, M) about the nearest pixel, the background taken off, per unit of exposure.
         variance: (C, M, M).
+        phases: (C, 2) rows and columns by which the pixels of a channel lie off those that ``place`` counts.
         fault: why it is of no use, or None.
     """
 
     place: tuple[float, float]
     light: Tensor
     variance: Tensor
+    phases: Tensor
     fault: str | None = None
 
     @property
@@ -51,6 +53,7 @@ def point_images(
     window: int,
     points: int = 1,
     reference: Tensor | None = None,
+    phases: Tensor | None = None,
     saturation: float = SATURATION,
 ) -> list[PointImage]:
     """Return the images of the points in one capture, a frame or several exposures that nothing moved between.
@@ -63,6 +66,8 @@ def point_images(
         points: how many points there are.
         reference: (C, H, W) of the same points at the same places, nowhere saturated, the modulator flat: then each
             point's place is the centre of that light, which is symmetric. Else it is the centre of the coded light.
+        phases: (C, 2) rows and columns by which the pixels of each channel lie down and right of those of the first,
+            in pixels of a channel: those of the planes of a mosaic. Default: none.
         saturation: values at or above are left out.
 
     Returns:
@@ -81,7 +86,12 @@ def point_images(
             f"reference must have the frames' shape {tuple(frames.shape[1:])}, got {tuple(reference.shape)}"
         )
     found = find_points(frames.clamp(max=saturation).mean((0, 1)), points, window)
-    return [_point_image(frames, exposures, sensor, window, place, reference, saturation) for place in found]
+    own = torch.zeros(frames.shape[1], 2) if phases is None else phases
+    if tuple(own.shape) != (frames.shape[1], 2):
+        raise ValueError(f"phases must have shape {(frames.shape[1], 2)}, a row a channel, got {tuple(own.shape)}")
+    return [
+        _point_image(frames, exposures, sensor, window, place, reference, own.double(), saturation) for place in found
+    ]
 
 
 def _point_image(
@@ -91,6 +101,7 @@ def _point_image(
     window: int,
     start: tuple[int, int],
     reference: Tensor | None,
+    phases: Tensor,
     saturation: float,
 ) -> PointImage:
     side = window + 2 * MARGIN
@@ -103,17 +114,18 @@ def _point_image(
     light, variance = merge_exposures(frames[..., rows, columns], exposures, sensor, saturation)
     try:
         light = light - annulus_background(light, near, window, 1.5 * window)[:, None, None]
-        if reference is None:
-            row, column = centre_of_light(light, near, window)
-        else:
-            clear = reference[..., rows, columns].double()
+        clear, centre = light, centre_of_light
+        if reference is not None:
+            clear, centre = reference[..., rows, columns].double(), centre_of_symmetry
             clear = clear - annulus_background(clear, near, window, 1.5 * window)[:, None, None]
-            row, column = centre_of_symmetry(clear, near, window)
+        places = torch.tensor([centre(channel[None], near, window) for channel in clear], dtype=torch.float64) + phases
+        share = cut_out(clear, near, window).sum((1, 2)).clamp(min=0)
+        row, column = (share @ places / share.sum()).tolist()
         nearest = round(row), round(column)
         light, variance = (cut_out(x, nearest, side) for x in (light, variance))
     except ValueError as error:
         empty = torch.zeros(frames.shape[1], side, side, dtype=torch.float64)
-        return PointImage((float(start[0]), float(start[1])), empty, empty, str(error))
+        return PointImage((float(start[0]), float(start[1])), empty, empty, phases, str(error))
     blind = ~variance.isfinite()
     fault = None
     if bool(blind.any()):
@@ -122,5 +134,5 @@ def _point_image(
         signal = float((light.sum((1, 2)) / variance.sum((1, 2)).sqrt()).min())
         if signal < LEAST_SIGNAL:
             fault = f"its light is {signal:.1f} times its noise, {LEAST_SIGNAL:g} are needed"
-    return PointImage((row + corner[0], column + corner[1]), light, variance, fault)
+    return PointImage((row + corner[0], column + corner[1]), light, variance, phases, fault)
 

@@ -50,6 +50,7 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
     light = torch.stack([image.light for image in images])
     variance = torch.stack([image.variance for image in images])
     offsets = torch.tensor([image.offset for image in images], dtype=torch.float64)
+    phases = images[0].phases
     inside = slice(MARGIN, -MARGIN)
     brightness = light[..., inside, inside].sum((1, 2, 3))
     used = torch.ones(len(images), dtype=torch.bool)
@@ -57,10 +58,11 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
         brightness = brightness / brightness[used].mean()
         for _ in range(ROUNDS):
             scaled, noise = light / brightness.view(-1, 1, 1, 1), variance / brightness.view(-1, 1, 1, 1) ** 2
+            own = offsets - phases[:, None]  # of each channel
             psfs = [
-                resolve_psf(scaled[used, c], offsets[used], noise[used, c], own) for c, own in enumerate(cutoff)
+                resolve_psf(scaled[used, c], own[c, used], noise[used, c], limit) for c, limit in enumerate(cutoff)
             ]
-            step, misfit = _newton_step(scaled[..., inside, inside], noise[..., inside, inside], psfs, offsets)
+            step, misfit = _newton_step(scaled[..., inside, inside], noise[..., inside, inside], psfs, own)
             step[:, 1:] -= step[used, 1:].mean(0)
             brightness = brightness * (1 + step[:, 0])
             offsets = offsets + step[:, 1:].clamp(-0.5, 0.5)
@@ -81,7 +83,7 @@ def _newton_step(
     inside = slice(MARGIN, -MARGIN)
     normal, right, misfit = torch.zeros(len(light), 3, 3).double(), torch.zeros(len(light), 3).double(), 0.0
     for c, psf in enumerate(psfs):
-        image, slopes = psf.seen_from(offsets)
+        image, slopes = psf.seen_from(offsets[c])
         design = torch.cat([image[:, None], slopes], 1)[..., inside, inside].flatten(2)  # (N, 3, pixels)
         residual = (light[:, c] - image[..., inside, inside]).flatten(1)
         weighted = design / variance[:, c].flatten(1)[:, None]

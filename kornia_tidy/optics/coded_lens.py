@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import warnings
-from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
@@ -18,7 +17,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank
+from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
@@ -362,10 +361,10 @@ class CodedLens(nn.Module):
             return self._measured_bank(spectrum, dtype, defocus.device)
         nodes = self.defocus_nodes
         if kind in ("nearest", "linear"):
-            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus), state)
+            bank = self._computed_bank(spectrum, dtype, nodes_around(nodes, defocus), state)
         else:
             spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
-            targets = _around(fine_nodes(nodes), defocus)
+            targets = nodes_around(fine_nodes(nodes), defocus)
             first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
             last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
@@ -397,15 +396,3 @@ class CodedLens(nn.Module):
 
 def _refit_window(lens: CodedLens, _: Any) -> None:
     lens.fit_window()
-
-
-def _around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
-    if torch.compiler.is_compiling():
-        return nodes
-    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-    # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad)
-    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-    return nodes[min(first, last) : last + 1]
