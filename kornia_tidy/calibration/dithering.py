@@ -57,7 +57,7 @@ class ResolvedPSF:
 
 
 def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: float = 1.0) -> ResolvedPSF:
-    r"""Return the PSF that explains point images at several places: least squares for all aliases, frequency by frequency.
+    r"""Return the PSF that explains point images at several places: least squares for all aliases of each frequency.
 
     .. math:: Y_i(f) = \sum_k H(f + k) e^{-2 \pi i (f + k) \cdot \delta_i} + n_i(f)
 
@@ -86,7 +86,7 @@ def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: flo
         >>> bool((found.psf - spot(0, 0)).abs().max() < 1e-4)
         True
     """
-    count, side, _ = patches.shape
+    side = patches.shape[-1]
     band = max(1, math.ceil(cutoff))
     aliases = 2 * band
     length = aliases * side

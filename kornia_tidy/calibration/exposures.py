@@ -71,7 +71,9 @@ def merge_exposures(
         raise ValueError(f"frames must have shape (..., E, C, H, W), got {tuple(frames.shape)}")
     check_float_tensor("frames", frames, frames.ndim, "(..., E, C, H, W)")
     if tuple(exposures.shape) != (frames.shape[-4],) or not bool((exposures > 0).all() & exposures.isfinite().all()):
-        raise ValueError(f"exposures must be {frames.shape[-4]} positive numbers, one a frame, got {exposures.tolist()}")
+        raise ValueError(
+            f"exposures must be {frames.shape[-4]} positive numbers, one a frame, got {exposures.tolist()}"
+        )
     value, time = frames.double(), exposures.double().view(-1, 1, 1, 1).to(frames.device)
     good = (value < saturation).double()
     shortest = int(exposures.argmin())

@@ -58,7 +58,9 @@ class MeasuredPSFs:
     def __post_init__(self) -> None:
         shape = tuple(self.bank.psfs.shape)
         if tuple(self.uncertainty.shape) != shape:
-            raise ValueError(f"uncertainty must have the shape of the PSFs, {shape}, got {tuple(self.uncertainty.shape)}")
+            raise ValueError(
+                f"uncertainty must have the shape of the PSFs, {shape}, got {tuple(self.uncertainty.shape)}"
+            )
         if tuple(self.distances.shape) != shape[:1]:
             raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
 
@@ -109,7 +111,10 @@ def diffraction_cutoff(camera: ThinLensCamera, wavelength: float) -> float:
 
 
 def measure_psfs(
-    images: Mapping[float, Sequence[PointImage]], camera: ThinLensCamera, window: int, cutoff: float | Sequence[float] = 1.0
+    images: Mapping[float, Sequence[PointImage]],
+    camera: ThinLensCamera,
+    window: int,
+    cutoff: float | Sequence[float] = 1.0,
 ) -> MeasuredPSFs:
     """Return the PSFs that point images at known distances show.
 

@@ -135,4 +135,3 @@ def _point_image(
         if signal < LEAST_SIGNAL:
             fault = f"its light is {signal:.1f} times its noise, {LEAST_SIGNAL:g} are needed"
     return PointImage((row + corner[0], column + corner[1]), light, variance, phases, fault)
-

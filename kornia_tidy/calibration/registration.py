@@ -59,9 +59,7 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
         for _ in range(ROUNDS):
             scaled, noise = light / brightness.view(-1, 1, 1, 1), variance / brightness.view(-1, 1, 1, 1) ** 2
             own = offsets - phases[:, None]  # of each channel
-            psfs = [
-                resolve_psf(scaled[used, c], own[c, used], noise[used, c], limit) for c, limit in enumerate(cutoff)
-            ]
+            psfs = [resolve_psf(scaled[used, c], own[c, used], noise[used, c], limit) for c, limit in enumerate(cutoff)]
             step, misfit = _newton_step(scaled[..., inside, inside], noise[..., inside, inside], psfs, own)
             step[:, 1:] -= step[used, 1:].mean(0)
             brightness = brightness * (1 + step[:, 0])

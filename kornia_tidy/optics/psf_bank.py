@@ -92,7 +92,10 @@ class PSFBank:
         return PSFBank(psfs.flatten(1, 2), self.defocus, self.energy)
 
     def save(
-        self, path: str | os.PathLike[str], more: Mapping[str, Tensor] | None = None, notes: Mapping[str, str] | None = None
+        self,
+        path: str | os.PathLike[str],
+        more: Mapping[str, Tensor] | None = None,
+        notes: Mapping[str, str] | None = None,
     ) -> None:
         """Write the bank as safetensors, all or nothing.
 
