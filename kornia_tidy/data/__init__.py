@@ -5,6 +5,7 @@ from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth
 from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
+from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.data.patches import Patches, crop, random_crop
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder
@@ -22,11 +23,13 @@ __all__ = [
     "UnreadableItemError",
     "crop",
     "dead_leaves",
+    "from_opencv",
     "paper_patches",
     "random_crop",
     "read_depth",
     "read_image",
     "read_rgbd",
+    "to_opencv",
     "write_depth",
     "write_image",
 ]

@@ -103,7 +103,7 @@ def _run(
             result = _blank(output, image)
         for part, whole in zip(maps_of(output), maps_of(result), strict=True):
             grid.keep(part, whole, place)
-        del output, part  # or the next tile would be seen beside it
+        del output, part, whole  # or the next tile would be seen beside it
         if progress is not None:
             progress(done + 1, len(tiles))
     return result

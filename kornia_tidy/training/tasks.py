@@ -56,6 +56,27 @@ def nearness(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
     return ((camera.defocus(depth, check_inputs=False) - lo) / (hi - lo)).clamp(0, 1)
 
 
+def depth_of_nearness(camera: ThinLensCamera, near: Tensor) -> Tensor:
+    r"""Return the depth that a nearness means, :func:`nearness` undone.
+
+    .. math:: z = 1 / \left( \frac{1}{z_{far}} + n \left( \frac{1}{z_{near}} - \frac{1}{z_{far}} \right) \right)
+
+    Args:
+        camera: what turns depth into defocus.
+        near: any shape; values outside [0, 1] count as its ends.
+
+    Returns:
+        Metres, same shape: the ends of the camera's range at 0 and 1; infinite at 0 if its far end is.
+
+    Example:
+        >>> import torch
+        >>> depth_of_nearness(ThinLensCamera(), torch.tensor([1.0, 0.5, 0.0]))
+        tensor([0.2975, 0.5950,    inf])
+    """
+    closest, farthest = (1 / end for end in camera.depth_range)
+    return near.clamp(0, 1).mul_(closest - farthest).add_(farthest).reciprocal_()
+
+
 def mean_square(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean squared error over all valid samples of the batch, the paper's loss.
 
