@@ -17,9 +17,9 @@ from kornia_tidy.sensor.mosaic_dng import mosaic_dng
 
 Tile = tuple[tuple[int, ...], ...]
 
-# kornia and OpenCV name a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
-KORNIA = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
-OPENCV = {"bilinear": ("", np.uint16), "edge_aware": ("_EA", np.uint16), "vng": ("_VNG", np.uint8)}
+# kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
+BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
+OPENCV = {"bilinear": ("", 16), "edge_aware": ("_EA", 16), "vng": ("_VNG", 8)}  # suffix and bits
 # LibRaw takes its VNG for four colours and Markesteijn's three passes for X-Trans, whatever it is asked for.
 LIBRAW = {
     "Bayer": ("linear", "vng", "ppg", "ahd", "dcb", "dht"),
@@ -115,33 +115,27 @@ def bilinear(mosaic: Tensor, tile: Tile) -> Tensor:
     reach = next(side for side in range(1, rows + 1) if _holds_all(tile, side, 1))
     values = mosaic if mosaic.dtype == torch.float64 else mosaic.float()
     values = values[:, _beyond(height, rows, reach - 1)][:, :, _beyond(width, columns, reach - 1)]
-    image = values.new_empty(len(mosaic), 1 + max(map(max, tile)), height, width)
-    for y, x in itertools.product(range(rows), range(columns)):
-        for color in range(image.shape[1]):
-            there = image[:, color, y::rows, x::columns]
-            total: Tensor | float = 0.0
-            weights = 0
-            for dy, dx, weight in _tent(tile, y, x, color, reach):
-                top, left = y + dy + reach - 1, x + dx + reach - 1
-                samples = values[
-                    :, top : top + there.shape[1] * rows : rows, left : left + there.shape[2] * columns : columns
-                ]
-                total = total + weight * samples
-                weights += weight
-            there.copy_(total / weights)
+    image = values.new_zeros(len(mosaic), 1 + max(map(max, tile)), height, width)
+    for y, x, color in itertools.product(range(rows), range(columns), range(image.shape[1])):
+        there = image[:, color, y::rows, x::columns]
+        for dy, dx, weight in _tent(tile, y, x, color, reach):
+            samples = values[:, y + dy + reach - 1 :: rows, x + dx + reach - 1 :: columns]
+            there.add_(samples[:, : there.shape[1], : there.shape[2]], alpha=weight)
     return image.to(mosaic.dtype)
 
 
-def _tent(tile: Tile, y: int, x: int, color: int, reach: int) -> list[tuple[int, int, int]]:
+def _tent(tile: Tile, y: int, x: int, color: int, reach: int) -> list[tuple[int, int, float]]:
     """Return rows, columns and weights of a colour's samples around a place of the tile; itself if measured there."""
     if tile[y][x] == color:
-        return [(0, 0, 1)]
+        return [(0, 0, 1.0)]
     steps = range(1 - reach, reach)
-    return [
+    samples = [
         (dy, dx, (reach - abs(dy)) * (reach - abs(dx)))
         for dy, dx in itertools.product(steps, steps)
         if tile[(y + dy) % len(tile)][(x + dx) % len(tile[0])] == color
     ]
+    total = sum(weight for _, _, weight in samples)
+    return [(dy, dx, weight / total) for dy, dx, weight in samples]
 
 
 def _beyond(length: int, period: int, margin: int) -> Tensor:
@@ -183,24 +177,24 @@ def _holds_all(tile: Tile, side: int, step: int) -> bool:
 
 
 def _kornia(mosaic: Tensor, letters: str) -> Tensor:
-    check_choice("the filter array of demosaicing by kornia", letters, tuple(KORNIA))
+    check_choice("the filter array of demosaicing by kornia", letters, tuple(BAYER))
     if mosaic.shape[-2] % 2 or mosaic.shape[-1] % 2:
         raise ValueError(f"demosaicing by kornia needs even height and width, got {tuple(mosaic.shape[-2:])}")
     values = mosaic if mosaic.dtype == torch.float64 else mosaic.float()
-    return raw_to_rgb(values[:, None], KORNIA[letters]).to(mosaic.dtype)
+    return raw_to_rgb(values[:, None], BAYER[letters]).to(mosaic.dtype)
 
 
 def _opencv(mosaic: Tensor, letters: str, name: str) -> Tensor:
-    check_choice("the filter array of demosaicing by OpenCV", letters, tuple(KORNIA))
-    suffix, whole = OPENCV[name]
+    check_choice("the filter array of demosaicing by OpenCV", letters, tuple(BAYER))
+    suffix, bits = OPENCV[name]
     code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names begin at the corner
-    return _in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), whole)
+    return _in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits)
 
 
 def _libraw(mosaic: Tensor, letters: str, name: str, to_srgb: Tensor | None) -> Tensor:
     import rawpy  # noqa: PLC0415  (only who asks for it loads a C++ library)
 
-    kind = "Bayer" if letters in KORNIA else "four-colour" if len(set(letters)) == 4 else "X-Trans"
+    kind = "Bayer" if letters in BAYER else "four-colour" if len(set(letters)) == 4 else "X-Trans"
     check_choice(f"LibRaw's demosaicing of a {kind} array", name, LIBRAW[kind])
     side = 6 if kind == "X-Trans" else 2
     lacking = LIBRAW_SMALLEST[kind] - min(mosaic.shape[-2:])
@@ -226,17 +220,17 @@ def _libraw(mosaic: Tensor, letters: str, name: str, to_srgb: Tensor | None) -> 
             )
 
     wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
-    image = _in_whole_numbers(wide, postprocess, np.uint16)
+    image = _in_whole_numbers(wide, postprocess, 16)
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 
 
-def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray], whole: type[np.generic]) -> Tensor:
-    """Compute (H, W) -> (H, W, C) in unsigned integers that span the mosaic's range, 0 and 1."""
+def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray], bits: int) -> Tensor:
+    """Compute (H, W) -> (H, W, C) in unsigned integers of 8 or 16 bits that span the mosaic's range, 0 and 1."""
     check_finite("mosaic", mosaic)
     values = mosaic.detach().to("cpu", torch.promote_types(mosaic.dtype, torch.float32))
     low, high = min(0.0, float(values.min())), max(1.0, float(values.max()))
-    step = (high - low) / int(np.iinfo(whole).max)
-    counts = (values - low).div_(step).round_().numpy().astype(whole)
+    step = (high - low) / (2**bits - 1)
+    counts = (values - low).div_(step).round_().numpy().astype(np.uint8 if bits == 8 else np.uint16)
     images = []
     for plane in counts:
         colors = compute(plane)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import torch
 from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
-from torch.nn import functional as F
+from torch.nn.functional import interpolate
 
 from kornia_tidy.checks import check_choice, check_finite
-from kornia_tidy.sensor.demosaic import demosaic
+from kornia_tidy.sensor.demosaic import BAYER, demosaic
 from kornia_tidy.sensor.raw_color import adapted_to_srgb, assumed_camera_to_srgb, camera_to_srgb
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ def develop(
 
     Args:
         raw: the capture.
-        method: of :func:`~kornia_tidy.sensor.demosaic.demosaic`. Default: that of :func:`default_method`.
+        method: of :func:`~kornia_tidy.sensor.demosaic.demosaic`, for captures behind a filter array. Default: that of
+            :func:`default_method`.
         white_balance: ``"as shot"``, ``"daylight"`` or ``"none"``, or factors, one a channel of ``raw.colors`` or one
             a colour. Default: as shot if the file says it, else daylight if it says that, else none.
         highlights: a channel that is multiplied by more saturates higher. ``"clip"`` takes all to the lowest of these
@@ -74,8 +76,8 @@ def develop(
     to_srgb = None
     if raw.colors:
         factors = balance_factors(raw, white_balance)
-        mosaic *= _over_the_sensor(raw, factors / factors.min())
-        to_srgb = _matrix(raw, factors, adaptation, matrix)
+        _balance(mosaic, raw, factors / factors.min())
+        to_srgb = srgb_matrix(raw, factors, adaptation) if matrix is None else _checked(matrix, raw)
     if highlights == "clip":
         mosaic.clamp_(max=1)
     if raw.pattern is None:
@@ -87,14 +89,14 @@ def develop(
     if square_pixels and raw.pixel_aspect != 1:
         image = squared(image, raw.pixel_aspect)
     if encoded:
-        image = linear_rgb_to_rgb(image.expand(3, -1, -1))[: len(image)]
+        image = encode(image)
     return raw.upright(image) if upright else image
 
 
 def default_method(raw: RawCapture) -> str:
     """Return how a capture is demosaiced if nobody says: LibRaw's AHD or, for X-Trans, Markesteijn's; else bilinear."""
-    letters = "" if raw.pattern is None else "".join(raw.colors[index] for row in raw.pattern for index in row)
-    if letters in {"RGGB", "BGGR", "GRBG", "GBRG"}:
+    letters = raw.pattern_letters or ""
+    if letters in BAYER:
         return "libraw_ahd"
     return "libraw_markesteijn" if len(letters) == 36 else "bilinear"
 
@@ -107,7 +109,8 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
         white_balance: as for :func:`develop`.
 
     Raises:
-        ValueError: if the file does not say it, or given factors are not positive or not as many as channels or colours.
+        ValueError: if the file does not say it, or given factors are not positive, or not as many
+            as channels or colours.
     """
     none = torch.ones(len(raw.colors))
     if white_balance is None:
@@ -117,9 +120,7 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
         check_choice("white_balance", white_balance, WHITE_BALANCES)
         factors = {"as shot": raw.white_balance, "daylight": raw.daylight_balance, "none": none}[white_balance]
         if factors is None:
-            raise ValueError(
-                f"the file does not say the white balance {white_balance!r}: choose another or give factors"
-            )
+            raise ValueError(f"the capture has no white balance {white_balance!r}: choose another or give factors")
         return factors
     check_finite("white_balance", white_balance)
     names = "".join(dict.fromkeys(raw.colors))
@@ -132,6 +133,47 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
     return white_balance.to(none)
 
 
+def srgb_matrix(raw: RawCapture, factors: Tensor, adaptation: str | None = None) -> Tensor:
+    """Return the matrix (3, colours) from a capture's balanced colours to linear sRGB.
+
+    Args:
+        raw: the capture.
+        factors: its white balance, as :func:`balance_factors` returns it.
+        adaptation: as for :func:`develop`.
+
+    Raises:
+        ValueError: if the filters are not R, G and B and nothing is known of them.
+    """
+    names = "".join(dict.fromkeys(raw.colors))
+    first = [raw.colors.index(letter) for letter in names]
+    origin = matrix_origin(raw)
+    if origin == "file" and raw.camera_to_srgb is not None:
+        matrix = raw.camera_to_srgb
+        daylight = torch.ones(len(names)) if raw.daylight_balance is None else raw.daylight_balance[first]
+    elif origin == "model" and raw.xyz_to_camera is not None:
+        matrix, daylight = camera_to_srgb(raw.xyz_to_camera)
+    elif names == "RGB":
+        matrix, daylight = assumed_camera_to_srgb()
+    else:
+        raise ValueError(f"nothing is known of the colours of its filters {names}: give a matrix")
+    return matrix if adaptation is None else adapted_to_srgb(matrix, daylight, factors[first], adaptation)
+
+
+def matrix_origin(raw: RawCapture) -> str:
+    """Return whose colour matrix develops a capture: ``"file"``, the camera's ``"model"``, or ``"assumed"``.
+
+    A file's own comes first, as with LibRaw: whoever wrote a DNG knew what was done to its colours.
+    """
+    if raw.camera_to_srgb is not None:
+        return "file"
+    return "assumed" if raw.xyz_to_camera is None else "model"
+
+
+def encode(image: Tensor) -> Tensor:
+    """Return linear light, (3, H, W) or (1, H, W), in sRGB's encoding; not clamped, negative light stays negative."""
+    return linear_rgb_to_rgb(image.expand(3, -1, -1))[: len(image)]
+
+
 def squared(image: Tensor, pixel_aspect: float) -> Tensor:
     """Return (C, H, W) with square pixels: more columns if a pixel is wider than high, else more rows.
 
@@ -141,33 +183,21 @@ def squared(image: Tensor, pixel_aspect: float) -> Tensor:
     """
     height, width = image.shape[-2:]
     size = (height, round(width * pixel_aspect)) if pixel_aspect > 1 else (round(height / pixel_aspect), width)
-    return F.interpolate(image[None], size=size, mode="bilinear", align_corners=False)[0]
+    return interpolate(image[None], size=size, mode="bilinear", align_corners=False)[0]
 
 
-def _over_the_sensor(raw: RawCapture, factors: Tensor) -> Tensor:
-    """Return factors of channels at the pixels that have them, (1, H, W), or (C, 1, 1) without a filter array."""
+def _balance(mosaic: Tensor, raw: RawCapture, factors: Tensor) -> None:
+    """Multiply every channel of a mosaic, in place, by its factor."""
     if raw.pattern is None:
-        return factors[:, None, None]
-    height, width = raw.counts.shape[-2:]
-    tile = factors[torch.tensor(raw.pattern)]
-    return tile.repeat(-(-height // tile.shape[0]), -(-width // tile.shape[1]))[None, :height, :width]
+        mosaic *= factors[:, None, None]
+        return
+    rows, columns = raw.tile
+    for y, x in itertools.product(range(rows), range(columns)):
+        mosaic[:, y::rows, x::columns] *= factors[raw.pattern[y][x]]
 
 
-def _matrix(raw: RawCapture, factors: Tensor, adaptation: str | None, given: Tensor | None) -> Tensor:
-    """Return balanced colours to linear sRGB: as given, the file's own, that of the camera's model, or the assumed."""
-    names = "".join(dict.fromkeys(raw.colors))
-    if given is not None:
-        if given.shape != (3, len(names)):
-            raise ValueError(f"matrix must have shape (3, {len(names)}), got {tuple(given.shape)}")
-        return given
-    first = [raw.colors.index(letter) for letter in names]
-    if raw.camera_to_srgb is not None:
-        matrix = raw.camera_to_srgb
-        daylight = torch.ones(len(names)) if raw.daylight_balance is None else raw.daylight_balance[first]
-    elif raw.xyz_to_camera is not None:
-        matrix, daylight = camera_to_srgb(raw.xyz_to_camera)
-    elif names == "RGB":
-        matrix, daylight = assumed_camera_to_srgb()
-    else:
-        raise ValueError(f"the file has no colour matrix for its filters {names}: give one")
-    return matrix if adaptation is None else adapted_to_srgb(matrix, daylight, factors[first], adaptation)
+def _checked(matrix: Tensor, raw: RawCapture) -> Tensor:
+    colors = len(set(raw.colors))
+    if matrix.shape != (3, colors):
+        raise ValueError(f"matrix must have shape (3, {colors}), got {tuple(matrix.shape)}")
+    return matrix

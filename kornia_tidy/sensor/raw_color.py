@@ -34,8 +34,8 @@ def camera_to_srgb(xyz_to_camera: Tensor) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> matrix, daylight = camera_to_srgb(torch.tensor([[0.9, -0.3, -0.1], [-0.8, 1.6, 0.3], [-0.3, 0.3, 0.8]]))
-        >>> matrix.sum(1), daylight
-        (tensor([1., 1., 1.]), tensor([2.2340, 0.8567, 1.1305]))
+        >>> matrix.sum(1).round(decimals=4), daylight
+        (tensor([1., 1., 1.]), tensor([2.2394, 0.8574, 1.1288]))
     """
     srgb_to_camera = xyz_to_camera.double() @ _srgb_from_xyz().inverse()
     sums = srgb_to_camera.sum(1, keepdim=True)
@@ -51,13 +51,13 @@ def assumed_camera_to_srgb() -> tuple[Tensor, Tensor]:
         The spectral sensitivities of a Nikon D5100 (measured at NPL), and colours like those of the training set of
         the ACES input transforms in daylight (D65), fitted by colour-science. Cameras differ: colours are plausible.
 
-    Source: Darrodi et al., Reference data set for camera spectral sensitivity estimation, JOSA A 2015; AMPAS P-2013-001.
+    Source: Darrodi et al., Reference data set for camera spectral sensitivity estimation, JOSA A 2015, for the
+        sensitivities; AMPAS P-2013-001 for the fit.
     """
     import colour  # noqa: PLC0415  (seconds: only who has such a camera waits for it)
 
-    matrix, daylight = colour.matrix_idt(
-        colour.MSDS_CAMERA_SENSITIVITIES[ASSUMED_CAMERA], colour.SDS_ILLUMINANTS["D65"]
-    )
+    fit = colour.matrix_idt(colour.MSDS_CAMERA_SENSITIVITIES[ASSUMED_CAMERA], colour.SDS_ILLUMINANTS["D65"])
+    matrix, daylight = fit[:2]
     spaces = colour.RGB_COLOURSPACES
     to_srgb = torch.as_tensor(colour.matrix_RGB_to_RGB(spaces["ACES2065-1"], spaces["sRGB"], "Bradford") @ matrix)
     to_srgb = to_srgb / to_srgb.sum(1, keepdim=True)  # colour's white points are rounded: 1e-4

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.sensor.develop import develop
 from kornia_tidy.sensor.raw_decoding import Source, decode_raw, source_bytes, source_name
 from kornia_tidy.sensor.raw_plausible import check_plausible
 
@@ -241,6 +242,10 @@ class RawCapture:
         Without a filter array that is :meth:`mosaic`. Incomplete tiles at the right and the bottom are left out.
         """
         return tile_planes(self.mosaic(), self.tile)
+
+    def to_rgb(self, method: str | None = None, **options: Any) -> Tensor:
+        """Return the capture as a picture, see :func:`~kornia_tidy.sensor.develop.develop`."""
+        return develop(self, method, **options)
 
     def upright(self, image: Tensor) -> Tensor:
         """Return a picture of this capture, (..., H, W), turned as the camera was held."""
