@@ -103,7 +103,9 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
     scale = WIDTH / max(height, width)
     across, up, below = max(width * scale, 3.0), height * scale, 0.45  # inches
     figure = Figure(figsize=(across, up + below), facecolor="white")
-    axes = figure.add_axes(((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below)))
+    axes = figure.add_axes(
+        ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
+    )
     axes.imshow(place, cmap=DEPTH_COLORS, vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
     axes.set_axis_off()
     bar = figure.add_axes((0.06, 0.26 / (up + below), 0.88, 0.1 / (up + below)))

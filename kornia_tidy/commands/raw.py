@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kornia_tidy.commands import raw_develop, raw_info
+from kornia_tidy.commands import raw_develop, raw_info, raw_reconstruct
 
 # Each has add_parser(subparsers), which sets run(args).
-SUBCOMMANDS = (raw_info, raw_develop)
+SUBCOMMANDS = (raw_info, raw_develop, raw_reconstruct)
 
 DESCRIPTION = """\
 Camera raw files: the counts of a sensor, before any camera has made a picture of

@@ -73,8 +73,9 @@ def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
         raise ValueError(f"image must have shape (3, H, W) or (1, H, W), got {tuple(image.shape)}")
     check_finite("image", image)
     picture = np.empty((height, width, channels), dtype)
+    most = 2 ** (8 * picture.itemsize) - 1
     for row in range(0, height, _ROWS):
         band = image[:, row : row + _ROWS].detach().cpu().double()
-        values = band.clamp_(0, 1).mul_(np.iinfo(dtype).max).round_().numpy()
+        values = band.clamp_(0, 1).mul_(most).round_().numpy()
         picture[row : row + _ROWS] = values[::-1].transpose(1, 2, 0)
     return picture if channels == 3 else picture[..., 0]

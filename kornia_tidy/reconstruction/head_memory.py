@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -30,10 +31,11 @@ def head_bytes(head: nn.Module, image: Tensor) -> int:
         >>> head_bytes(nn.Conv2d(3, 8, 1), torch.empty(1, 3, 10, 10))  # twice 3 and 8 channels
         8800
     """
-    weights = {name: value.to("meta") for name, value in (*head.named_parameters(), *head.named_buffers())}
+    without_values: dict[int, Any] = {id(part): part.to("meta") for part in head.buffers()}
+    without_values |= {id(part): nn.Parameter(part.to("meta"), requires_grad=False) for part in head.parameters()}
+    empty = copy.deepcopy(head, without_values)  # in which copies of the weights are these
     with _Living() as living:
-        output = torch.func.functional_call(head, weights, (torch.empty_like(image, device="meta"),))
-        del output
+        empty(torch.empty_like(image, device="meta"))
     return living.most
 
 
