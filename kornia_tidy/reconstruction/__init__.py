@@ -5,8 +5,10 @@ from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
 from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
+from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
+from kornia_tidy.reconstruction.tiled import reconstruct_tiled
 
 __all__ = [
     "AttentionUNet",
@@ -20,4 +22,6 @@ __all__ = [
     "Tikhonov",
     "TikhonovLayers",
     "load_midas_small",
+    "receptive_field",
+    "reconstruct_tiled",
 ]
