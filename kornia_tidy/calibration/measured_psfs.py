@@ -139,7 +139,7 @@ def measure_psfs(
         ]
         if not good:
             raise ValueError(
-                f"no point image at {distance:g} m can be used: {'; '.join(str(image.fault) for image in own) or 'none'}"
+                f"no point image at {distance:g} m is usable: {'; '.join(str(image.fault) for image in own) or 'none'}"
             )
         channels = len(good[0].light)
         found = register(good, [cutoff] * channels if isinstance(cutoff, (int, float)) else cutoff)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -82,8 +83,10 @@ def run(args: argparse.Namespace) -> None:
         with step("scene"):
             systems = {name: load_pretrained(which) for name, which in SYSTEMS.items()}
             optics = systems["K = 5"].optics
-            scene = _scene(args, optics.camera)
-            near = nearness(optics.camera, scene.depth)
+            camera = optics.camera
+            assert isinstance(camera, ThinLensCamera)  # which the systems were trained with
+            scene = _scene(args, camera)
+            near = nearness(camera, scene.depth)
         estimates = []
         for name, system in systems.items():
             with step(name):
@@ -109,15 +112,12 @@ def run(args: argparse.Namespace) -> None:
         "coded_k5.png": best.capture,
         "estimated_scene.png": best.image,
     }
+    files = {"demo.png": explained.getvalue(), "reconstruction.png": reconstructed.getvalue()}
     with stages("write"):
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, image in pictures.items():
-            write_image(folder / name, image.clamp(0, 1))
-        write_bytes(folder / "demo.png", explained.getvalue())
-        write_bytes(folder / "reconstruction.png", reconstructed.getvalue())
+        _write(folder, pictures, files)
 
     tell("scene", scene_in_words(scene))
-    tell("camera", optics.camera.extra_repr())
+    tell("camera", camera.extra_repr())
     tell("masks", f"{optics.masks.extra_repr()}, learnt in {systems['K = 5'].step} steps on dead leaves")
     tell("PSFs", light_in_words(bank, optics))
     tell("clamped", clamped_in_words(optics, scene.depth))
@@ -133,6 +133,14 @@ def run(args: argparse.Namespace) -> None:
     for name in pictures:
         tell("", str(folder / name))
     tell("time", stages.summary())
+
+
+def _write(folder: Path, pictures: Mapping[str, Tensor], files: Mapping[str, bytes]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in pictures.items():
+        write_image(folder / name, image.clamp(0, 1))
+    for name, content in files.items():
+        write_bytes(folder / name, content)
 
 
 def _estimate(name: str, system: TrainedSystem, scene: Scene, noise: int) -> Estimate:

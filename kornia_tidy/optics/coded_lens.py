@@ -243,7 +243,8 @@ class CodedLens(nn.Module):
             The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
         if self._bank is not None:
-            self._window, self._held = self._bank.window, tuple(map(float, torch.aminmax(self._bank.energy)))
+            energy = self._bank.energy
+            self._window, self._held = self._bank.window, (float(energy.min()), float(energy.max()))
             return self._window
         self._check_layers()
         settings, fixed = self.fidelity, self._fixed_window
