@@ -21,8 +21,8 @@ MOST_LEVELS = 32  # intervals of level, a channel
 FEWEST_BLOCKS = 30  # in an interval, whose variance is then known to 4 %
 CLIPPED_BLOCKS = 0.02  # share of an interval's blocks from which on all of it is left out: the rest is a selection
 LEAST_SHARE = 0.1  # of an interval's blocks without texture; where there are fewer, these have some that was not seen
-# Correlations, between planes and to the neighbours, in standard deviations from what white noise has. Scenes are mostly
-# alike, fine weaves may be the opposite. One block of white noise in eight is left out.
+# Correlations, between planes and to the neighbours, in standard deviations from what white noise has. Scenes are
+# mostly alike, fine weaves may be the opposite. One block of white noise in eight is left out.
 LEAST_ALIKE, MOST_ALIKE = -2.3, 1.6
 
 

@@ -217,7 +217,7 @@ class TestPhotonTransfer(BaseTester):
         light = np.kron(np.geomspace(100, 12000, 64).reshape(8, 8), np.ones((64, 64)))
         linear = rng.poisson(light) / 12500
         counts = torch.from_numpy((4095 * linear**0.3).round().astype(np.int32))[None].clamp(max=4095)
-        with pytest.raises(ValueError, match="the pictures? do(es)? not allow a photon-transfer fit"):
+        with pytest.raises(ValueError, match=r"the pictures? do(es)? not allow a photon-transfer fit"):
             photon_transfer([RawCapture.from_counts(counts, "RGGB", 0, 4095)])
 
 
