@@ -120,7 +120,7 @@ def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] 
 
     Convention:
         - Fixed pattern, scene and drift of the light cancel in flats. In a single picture fixed pattern shows, and is
-          fitted with the line; texture too fine or too faint to be told from noise makes the gain a few percent small,
+          fitted with the line; texture too fine or too faint to be told from noise makes the gain some percent small,
           which the error does not hold.
         - Whether the file's black is right cannot be seen without ``darks``: one count too many makes the read noise
           squared too small by one count's electrons.
