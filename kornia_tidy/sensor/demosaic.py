@@ -228,7 +228,8 @@ def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray
     """Compute (H, W) -> (H, W, C) in unsigned integers of 8 or 16 bits that span the mosaic's range, 0 and 1."""
     check_finite("mosaic", mosaic)
     values = mosaic.detach().to("cpu", torch.promote_types(mosaic.dtype, torch.float32))
-    low, high = min(0.0, float(values.min())), max(1.0, float(values.max()))
+    least, most = torch.aminmax(values)
+    low, high = min(0.0, float(least)), max(1.0, float(most))
     step = (high - low) / (2**bits - 1)
     counts = (values - low).div_(step).round_().numpy().astype(np.uint8 if bits == 8 else np.uint16)
     images = []
@@ -237,5 +238,5 @@ def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray
         image = values.new_empty(colors.shape[2], *plane.shape)
         for color in range(len(image)):
             np.multiply(colors[..., color], step, out=image[color].numpy(), casting="same_kind")
-        images.append(image)
-    return torch.stack(images).add_(low).to(mosaic)
+        images.append(image.add_(low) if low else image)
+    return (images[0][None] if len(images) == 1 else torch.stack(images)).to(mosaic)
