@@ -53,17 +53,16 @@ class TileGrid:
         """Return the largest tile not larger than wanted.
 
         Raises:
-            ValueError: if nothing of it would be kept.
+            ValueError: if that is smaller than the smallest tile.
         """
         sides = tuple(
             min(whole, side // self.stride * self.stride) for side, whole in zip(wanted, self.whole, strict=True)
         )
-        for side, whole in zip(sides, self.whole, strict=True):
-            if side < whole and side <= 2 * self.margin:
-                raise ValueError(
-                    f"a tile must have more than the {2 * self.margin} pixels of its overlap, "
-                    f"got {wanted[0]} x {wanted[1]}"
-                )
+        if any(side < least for side, least in zip(sides, self.smallest_sides(), strict=True)):
+            raise ValueError(
+                f"a tile must have at least {' x '.join(map(str, self.smallest_sides()))} pixels for an overlap of "
+                f"{self.margin} at each cut, got {wanted[0]} x {wanted[1]}"
+            )
         return sides  # ty: ignore[invalid-explicit-return]
 
     def cheapest_sides(self, pixels: int) -> tuple[int, int] | None:
@@ -76,8 +75,8 @@ class TileGrid:
         return min(choices)[1] if choices else None
 
     def smallest_sides(self) -> tuple[int, int]:
-        """Return the smallest tile of which something is kept."""
-        least = 2 * self.margin + self.stride
+        """Return the smallest tile: something of it is kept, and it has more of the image than continues it."""
+        least = max(2 * self.margin, self.stride) + self.stride
         return min(least, self.whole[0]), min(least, self.whole[1])
 
     def tiles(self, sides: tuple[int, int]) -> list[tuple[Span, Span]]:

@@ -17,6 +17,7 @@ from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
 
 SEAM = 1e-4  # of the largest output: thirty times what float32 was seen to differ by, and below what is seen
+_COUNTED_ON = 128  # px; sides of the tile on which memory is counted
 
 _seamless: WeakSet[nn.Module] = WeakSet()
 
@@ -126,12 +127,14 @@ def _blank(output: Any, image: Tensor) -> Any:
 
 def _sides_that_fit(head: nn.Module, grid: TileGrid, like: Tensor, memory_budget: int) -> tuple[int, int]:
     """The tile with the least to compute within the memory, whose use grows with the pixels of a tile."""
-    least = grid.smallest_sides()
-    needed = head_bytes(head, like.new_empty((*like.shape[:2], *least), device="meta"))
-    sides = grid.cheapest_sides(int(memory_budget / needed * least[0] * least[1]))
+    side = -(-_COUNTED_ON // grid.stride) * grid.stride
+    each = head_bytes(head, like.new_zeros(*like.shape[:2], side, side)) / side**2
+    sides = grid.cheapest_sides(int(memory_budget / each))
     if sides is None:
+        rows, columns = grid.smallest_sides()
+        needed = each * rows * columns / 2**20
         raise ValueError(
-            f"the smallest tile of this head, {least[0]} x {least[1]} pixels, takes {needed / 2**20:.0f} MiB, "
+            f"the smallest tile of this head, {rows} x {columns} pixels, takes {needed:.0f} MiB, "
             f"memory_budget allows {memory_budget / 2**20:.0f} MiB: allow more, or give an overlap below "
             f"{grid.margin} pixels for a result that is not exact"
         )

@@ -185,7 +185,7 @@ class TestReconstructTiled(BaseTester):
         grid = TileGrid((700, 900), 16, receptive_field(head))
         areas = []
         for budget in (64 << 20, 128 << 20, 256 << 20, 1 << 30):
-            pixels = budget * 256**2 // head_bytes(head, torch.empty(1, 3, 256, 256))
+            pixels = budget * 256**2 // head_bytes(head, torch.rand(1, 3, 256, 256))
             sides = grid.cheapest_sides(pixels)
             assert head_bytes(head, image[..., : sides[0], : sides[1]]) <= 1.01 * budget
             areas.append(sides[0] * sides[1])
@@ -238,7 +238,9 @@ class TestReconstructTiled(BaseTester):
 
     def test_exception_names_what_is_too_small(self):
         head, image = trained("attention"), torch.rand(1, 3, 600, 600)
-        with pytest.raises(ValueError, match="a tile must have more than the 224 pixels of its overlap, got 200 x 200"):
+        with pytest.raises(
+            ValueError, match="a tile must have at least 240 x 240 pixels for an overlap of 112 at each cut, got 200"
+        ):
             reconstruct_tiled(head, image, tile=200)
         with pytest.raises(ValueError, match="the smallest tile of this head, 240 x 240 pixels, takes 31 MiB, memory_"):
             reconstruct_tiled(head, image, memory_budget=1 << 20)
@@ -278,7 +280,7 @@ class TestReceptiveField(BaseTester):
 
 
 class TestTileGrid(BaseTester):
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=100, deadline=None)
     @given(
         st.integers(1, 300),
         st.integers(1, 300),
@@ -324,13 +326,12 @@ class TestTileGrid(BaseTester):
 
 class TestHeadBytes(BaseTester):
     def test_feature_a_chain_holds_two_neighbours(self):
-        """Input, and both sides of the widest convolution, twice as a library may reorder them."""
+        """The input, and both sides of the widest convolution, twice as a library may reorder them."""
         head = nn.Sequential(nn.Conv2d(3, 16, 1), nn.Conv2d(16, 8, 1), nn.Conv2d(8, 1, 1))
-        image = torch.empty(1, 3, 10, 10)
-        assert head_bytes(head, image) == 4 * 100 * (2 * (16 + 8))
+        image = torch.rand(1, 3, 10, 10)
+        assert head_bytes(head, image) == 4 * 100 * (3 + 2 * (16 + 8))
 
     def test_feature_grows_with_pixels_and_type(self):
         head = trained("phasecam3d")
-        small = head_bytes(head, torch.empty(1, 3, 128, 128))
-        assert head_bytes(head, torch.empty(1, 3, 128, 256)) == pytest.approx(2 * small, rel=0.01)
-        assert all(parameter.device.type == "cpu" for parameter in head.parameters())
+        small = head_bytes(head, torch.rand(1, 3, 128, 128))
+        assert head_bytes(head, torch.rand(1, 3, 128, 256)) == pytest.approx(2 * small, rel=0.01)
