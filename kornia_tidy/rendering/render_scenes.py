@@ -11,6 +11,8 @@ import io
 import itertools
 import os
 import tarfile
+import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -171,12 +173,25 @@ def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[C
         batch_size=None,
         sampler=indices,
         num_workers=0 if jobs == 1 else jobs,
+        worker_init_fn=_end_with_parent,
         generator=torch.Generator().manual_seed(0),  # or it would draw from the global one
     )
     for index, files in zip(indices, loader, strict=True):
         if isinstance(files, str):
             raise ValueError(files)
         yield item_key(index), files
+
+
+def _end_with_parent(_: int) -> None:
+    """End this process with the one that writes: if that is killed, it would wait for ever to hand over a capture."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _counted(captures: Iterator[Capture], each: Each, found: int, total: int) -> Iterator[Capture]:

@@ -120,8 +120,7 @@ class TestRender(BaseTester):
         ],
     )
     def test_exception_is_one_sentence(self, options, sentence, tmp_path, capsys):
-        command = ["render", "--size", "40", "--border", "replicate", *options, "-o", str(tmp_path / "out")]
-        assert main(command) == 2
+        assert main(["render", "--size", "64", *options, "-o", str(tmp_path / "out")]) == 2
         errors = capsys.readouterr().err
         assert sentence in errors
         assert errors.count("\n") == 1

@@ -150,7 +150,7 @@ class TestShards(BaseTester):
                 names = [m.name.split(".", 1) for m in members]
                 keys += [name[0] for name in names]
                 assert [n[1] for n in names[:5]] == ["coded.png", "image.png", "depth.npy", "mask.png", "scene.json"]
-                assert shard.extractfile(names[0][0] + ".coded.png").read(4) == b"\x89PNG"
+                assert shard.extractfile(f"{names[0][0]}.coded.png").read(4) == b"\x89PNG"
         assert keys == [f"{i:06d}" for i in range(5) for _ in range(5)]
 
     @pytest.mark.parametrize("room", [1, 60_000, 200_000])
