@@ -12,6 +12,8 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from kornia_tidy.optics.psf_bank import PSFBank
 
