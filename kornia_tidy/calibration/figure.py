@@ -55,15 +55,15 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
     if fit is not None:
         left = (psfs - fit.psfs.cpu()).mean(1) / peak
         rows += [("the fitted mask's", fit.psfs.cpu(), None), ("measured less fitted", left, float(left.abs().max()))]
-    width, height = CELL * (len(columns) + 1.6), CELL * (len(rows) + 0.5) + 2.2
+    width, height = max(7.5, CELL * (len(columns) + 1.6)), CELL * (len(rows) + 0.5) + 2.2
     figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(CELL * (len(rows) + 0.5), 2.2))
     above, below = parts[0], parts[1]
     table = above.subplots(len(rows), len(columns), squeeze=False)
-    for line, (name, values, scale) in zip(table, rows, strict=True):
+    for number, (line, (name, values, scale)) in enumerate(zip(table, rows, strict=True)):
         for axes, d in zip(line, columns, strict=True):
             _cell(axes, values[d], scale)
-            if line is table[0]:
+            if number == 0:
                 title = f"{float(measured.distances[d]):.3g} m\nψ = {float(measured.bank.defocus[d]):+.1f}"
                 axes.set_title(title, fontsize=LABEL, color=INK)
         words = name if scale is None else f"{name}\n(scale {'±' if float(values.min()) < 0 else ''}{scale:.1%})"
@@ -99,7 +99,7 @@ def _noise_chart(axes: Axes, measured: MeasuredPSFs, fit: MaskFit | None) -> Non
         if fit is not None:
             left = 100 * fit.residual[:, c].cpu()
             axes.plot(measured.bank.defocus.cpu(), left, "s:", color=ink, markersize=3, linewidth=1)
-    words = "relative L1 of the PSF, %:\nnoise (solid)" + ("" if fit is None else ", left by the fit (dotted)")
+    words = "relative L1, %: noise (solid)" + ("" if fit is None else ",\nleft by the fit (dotted)")
     axes.set_title(words, fontsize=TITLE, color=INK)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("defocus ψ, rad", fontsize=LABEL)
@@ -113,8 +113,8 @@ def _misfit_chart(axes: Axes, measured: MeasuredPSFs) -> None:
         shown = [(n, report.misfit) for n, report in known if (report.rejected is not None) == rejected]
         axes.plot([n for n, _ in shown], [misfit for _, misfit in shown], ".", color=color, markersize=4)
     used = sum(report.rejected is None for report in measured.reports)
-    axes.set_title(f"misfit of each point image, 1 is noise:\n{used} of {len(measured.reports)} used", fontsize=TITLE)
-    axes.set_yscale("log")
+    axes.set_title(f"misfit of point images, 1 is noise;\n{used} of {len(measured.reports)} used", fontsize=TITLE)
+    axes.set_ylim(bottom=0)
     axes.set_xlabel("point image, far to near", fontsize=LABEL)
     axes.tick_params(labelsize=SMALL)
 
@@ -123,4 +123,4 @@ def _mask(axes: Axes, fit: MaskFit) -> None:
     phase = fit.lens.masks.phase.detach().cpu()[0].remainder(2 * math.pi)
     axes.imshow(phase.numpy(), cmap=PHASE_COLORS, vmin=0, vmax=2 * math.pi, interpolation="nearest")
     axes.set(xticks=[], yticks=[])
-    axes.set_title("mask found:\nphase at 530 nm", fontsize=TITLE)
+    axes.set_title("mask\nfound", fontsize=TITLE)

@@ -138,9 +138,8 @@ def measure_psfs(
             PointReport(distance, *image.place, None, None, image.fault) for image in own if image.fault is not None
         ]
         if not good:
-            raise ValueError(
-                f"no point image at {distance:g} m is usable: {'; '.join(str(image.fault) for image in own) or 'none'}"
-            )
+            faults = "; ".join(str(image.fault) for image in own) or "there is none"
+            raise ValueError(f"no point image at {distance:g} m can be used: {faults}")
         channels = len(good[0].light)
         found = register(good, [cutoff] * channels if isinstance(cutoff, (int, float)) else cutoff)
         reports += _reports(distance, good, found)

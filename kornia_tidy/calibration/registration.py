@@ -1,4 +1,4 @@
-"""Point images of one distance brought together: their places between pixels refined, those that differ left out."""
+"""Point images of one distance brought together: their places between the pixels refined, the odd ones left out."""
 
 from __future__ import annotations
 

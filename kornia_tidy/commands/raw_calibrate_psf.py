@@ -95,6 +95,8 @@ def run(args: argparse.Namespace) -> None:
         used = sum(r.rejected is None for r in measured.reports if r.distance == float(distance))
         words = " ".join(f"{100 * float(x):.2g}" for x in own)
         tell("PSF", f"{float(distance):g} m, psi {float(psi):+.2f} rad: {used} point images, noise {words} % in L1")
+    measured.save(args.output)
+    tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     fit = None
     if args.fit_mask is not None:
         from kornia_tidy.calibration.phase_retrieval import retrieve_mask  # noqa: PLC0415
@@ -107,8 +109,6 @@ def run(args: argparse.Namespace) -> None:
             tell("mask", f"{float(distance):g} m: leaves {words} % in L1")
         write_heights(args.fit_mask, fit.lens.masks.heights().detach())
         tell("wrote", args.fit_mask)
-    measured.save(args.output)
-    tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     if args.picture is not None:
         from kornia_tidy.calibration.figure import draw_measured  # noqa: PLC0415
 
