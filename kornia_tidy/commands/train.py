@@ -12,6 +12,7 @@ from typing import Any
 from kornia_tidy.commands.options import seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.optics.initial_masks import STARTS
 from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.heads import HEADS
@@ -72,6 +73,7 @@ def add_parser(subparsers: Any) -> None:
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
+    _setting(system, "start", choices=STARTS, help="heights of the masks at first; Fisher masks suit depth")
     _setting(
         system,
         "head",
@@ -84,6 +86,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(
         system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
     )
+    _setting(system, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
     _setting(
         system,
         "loss",

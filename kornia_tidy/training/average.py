@@ -13,8 +13,8 @@ class MovingAverage(nn.Module):
 
     .. math:: a \leftarrow d_t a + (1 - d_t) w, \quad d_t = \min(d, (1 + t) / (10 + t))
 
-    The smaller decay at first lets it forget where the network began. Buffers, such as the statistics of batch
-    normalisation, are copied.
+    The smaller decay at first lets it forget where the network began. Saved buffers, such as the statistics of
+    batch normalisation, are copied.
 
     Args:
         network: the original, which is not changed.
@@ -48,10 +48,12 @@ class MovingAverage(nn.Module):
         """Take a step towards the network's weights."""
         steps = int(self.steps)
         decay = min(self.decay, (1 + steps) / (10 + steps))
-        for own, new in zip(self.network.parameters(), network.parameters(), strict=True):
-            own.lerp_(new.detach(), 1 - decay)
-        for own, new in zip(self.network.buffers(), network.buffers(), strict=True):
-            own.copy_(new)
+        learnt = {name for name, _ in network.named_parameters()}
+        for (name, own), new in zip(self.network.state_dict().items(), network.state_dict().values(), strict=True):
+            if name in learnt:
+                own.lerp_(new, 1 - decay)
+            else:
+                own.copy_(new)
         self.steps += 1
 
     def forward(self, *inputs: Tensor) -> Tensor:

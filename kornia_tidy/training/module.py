@@ -25,7 +25,7 @@ from kornia_tidy.training.tasks import (
     split_maps,
     task_loss,
 )
-from kornia_tidy.training.trained import build_head, build_optics, check_weights, describe, fix_window
+from kornia_tidy.training.trained import build_head, build_optics, check_weights, describe, fix_window, look_through
 
 
 class Seen(NamedTuple):
@@ -136,6 +136,7 @@ class TidyTraining(pl.LightningModule):
     def forward(self, coded: Tensor) -> Tensor:
         """Return what the network makes of captures; its moving average, once training is over or looked at."""
         network = self.head if self.training or self.average is None else self.average
+        look_through(network, self.optics)
         return network(coded)
 
     def see(self, batch: dict[str, Any]) -> Seen:

@@ -13,6 +13,7 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.initial_masks import STARTS
 from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.training.tasks import LOSSES, MAPS
@@ -27,7 +28,9 @@ class TrainingSettings:
 
     Args:
         task: ``"edof"`` (all-in-focus image), ``"depth"`` or ``"joint"``.
-        masks: number K of learnable masks, of uniform noise at first; 0 is a fixed Fresnel lens.
+        masks: number K of learnable masks; 0 is a fixed Fresnel lens.
+        start: heights that masks have at first, the first K of those that
+            :func:`~kornia_tidy.optics.initial_masks.initial_heights` knows by this name; of noise as many as wanted.
         focal_length: of the lens in metres.
         pixel_pitch: of the sensor in metres.
         depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default
@@ -41,6 +44,8 @@ class TrainingSettings:
         head: name of the network, see :data:`kornia_tidy.training.heads.HEADS`.
         width: channels of its first level. None: its default; the paper's attention U-Net has 64.
         residual: the network estimates what is to be added to the capture; for tasks with an image.
+        refocus: number of depths that the capture is refocused to before the network sees it, see
+            :class:`~kornia_tidy.reconstruction.Refocused`. 0: the network sees the capture alone.
         data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
         root: folder of the data, where they are files. None: ``data/NAME``.
         size: side of the scenes in pixels; larger ones are cropped, at random for training.
@@ -73,6 +78,7 @@ class TrainingSettings:
 
     task: str = "edof"
     masks: int = 5
+    start: str = "noise"
     focal_length: float = 50e-3
     pixel_pitch: float = 8e-6
     depth_range: tuple[float, float] | None = None
@@ -85,6 +91,7 @@ class TrainingSettings:
     head: str = "attention-unet"
     width: int | None = None
     residual: bool = False
+    refocus: int = 0
     data: str = "dead-leaves"
     root: str | None = None
     size: int = 278
@@ -117,10 +124,13 @@ class TrainingSettings:
         for name in ("focal_length", "pixel_pitch", "lr", "lr_metres"):
             check_positive(name, getattr(self, name))
         least = {"masks": 0, "size": 1, "scenes": 1, "validation_scenes": 1, "batch": 1, "accumulate": 1, "epochs": 1}
-        for name, lowest in {**least, "pretrain_epochs": 0, "seed": 0}.items():
+        for name, lowest in {**least, "pretrain_epochs": 0, "refocus": 0, "seed": 0}.items():
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
+        check_choice("start", self.start, STARTS)
+        if self.start != "noise" and self.masks > 5:
+            raise ValueError(f"start {self.start!r} has five masks, got masks={self.masks}; 'noise' has any number")
         if self.residual and "image" not in MAPS[self.task]:
             raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
         if self.patience is not None and self.patience < 1:

@@ -10,7 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.initial_masks import initial_heights
 from kornia_tidy.optics.phase_masks import FresnelLens, PixelwiseMask
+from kornia_tidy.optics.phase_masks.base import PhaseMasks
+from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tidy_optics import TiDyOptics
@@ -37,9 +40,8 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
         >>> build_optics(TrainingSettings(masks=2, window=23)).window
         23
     """
-    noise = torch.Generator().manual_seed(settings.seed)
     optics = TiDyOptics(
-        PixelwiseMask(settings.masks, generator=noise) if settings.masks else FresnelLens(),
+        _masks(settings),
         settings.camera(),
         sensor=SensorNoise(settings.sigma),
         fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
@@ -50,6 +52,16 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
     return fix_window(optics)
 
 
+def _masks(settings: TrainingSettings) -> PhaseMasks:
+    """Return the masks before training."""
+    if not settings.masks:
+        return FresnelLens()
+    noise = torch.Generator().manual_seed(settings.seed)
+    if settings.start == "noise":
+        return PixelwiseMask(settings.masks, generator=noise)
+    return PixelwiseMask(initial=initial_heights(settings.start, noise)[: settings.masks])
+
+
 def fix_window(optics: TiDyOptics) -> TiDyOptics:
     """Fix a camera's PSF window where it is, in place: masks in training would else change it when they are loaded."""
     optics.fidelity = optics.fidelity.replace(window=optics.window)
@@ -58,8 +70,22 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 
 def build_head(settings: TrainingSettings) -> nn.Module:
     """Return the network that settings describe, its weights drawn from the global generator."""
-    head = make_head(settings.head, channels_of(settings.task), settings.width)
+    head = make_head(settings.head, channels_of(settings.task), settings.width, 3 + settings.refocus)
+    if settings.refocus:
+        head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head
+
+
+def look_through(head: nn.Module, optics: TiDyOptics) -> None:
+    """Give a network the PSFs of its camera as they are now, if it refocuses captures: evenly over all defocus.
+
+    They are those of green light. See :class:`~kornia_tidy.reconstruction.Refocused`.
+    """
+    for module in head.modules():
+        if isinstance(module, Refocused):
+            lo, hi = optics.camera.defocus_range
+            nodes = torch.linspace(lo, hi, module.layers, dtype=torch.float64).tolist()
+            module.look_through(optics.psf_bank(1, defocus=nodes))
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
@@ -84,6 +110,8 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
     settings = TrainingSettings.from_dict(state["settings"])
     optics, head = build_optics(settings), build_head(settings)
     load_weights(state, optics, head, str(path))
+    with torch.no_grad():
+        look_through(head, optics)
     return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]))
 
 

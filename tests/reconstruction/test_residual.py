@@ -24,7 +24,7 @@ class TestResidual(BaseTester):
         assert not output[:, :-3].any()
 
     def test_feature_adds_to_the_image_and_leaves_the_depth(self):
-        head = Residual(PlainHead(4, width=2))
+        head = Residual(PlainHead(3, 4, width=2))
         with torch.no_grad():
             head.network.layers[-1].bias.copy_(torch.tensor([1.0, 0.1, 0.2, 0.3]))
         image = torch.rand(1, 3, 8, 8)
@@ -35,7 +35,7 @@ class TestResidual(BaseTester):
     def test_feature_learns_from_zero(self):
         """The last layer learns at once, and the others as soon as it has."""
         torch.manual_seed(0)
-        head = Residual(PlainHead(3, width=4))
+        head = Residual(PlainHead(width=4))
         optimizer = torch.optim.Adam(head.parameters(), 1e-2)
         image, truth = torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16)
         for _ in range(2):
@@ -45,7 +45,7 @@ class TestResidual(BaseTester):
         assert all(p.grad.abs().max() > 0 for p in head.parameters())
 
     def test_feature_onnx(self):
-        check_onnx(Residual(PlainHead(4, width=2)), torch.rand(1, 3, 13, 16))
+        check_onnx(Residual(PlainHead(3, 4, width=2)), torch.rand(1, 3, 13, 16))
 
     @pytest.mark.parametrize(
         ("network", "sentence"),

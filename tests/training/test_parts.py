@@ -160,6 +160,9 @@ class TestSettings(BaseTester):
             ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', got 'ssim'"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
+            ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
+            ({"start": "fisher, noise", "masks": 6}, "start 'fisher, noise' has five masks, got masks=6; 'noise' has"),
+            ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
         ],
     )

@@ -49,9 +49,9 @@ class TestTrain(BaseTester):
         losses = [float(row["val_loss"]) for row in rows(tmp_path / "validation.csv")]
         assert losses[-1] < 0.8 * losses[0]
 
-    @pytest.mark.parametrize("masks", [1, 0])
-    def test_feature_more_epochs_go_on_as_if_asked_for_at_first(self, masks, tmp_path):
-        settings = SETTINGS.replace(masks=masks)
+    @pytest.mark.parametrize("changes", [{}, {"masks": 0}, {"refocus": 3, "start": "fisher, noise"}])
+    def test_feature_more_epochs_go_on_as_if_asked_for_at_first(self, changes, tmp_path):
+        settings = SETTINGS.replace(**changes)
         whole = train(settings, tmp_path / "a").state_dict()
         train(settings.replace(epochs=1), tmp_path / "b")
         parts = train(settings, tmp_path / "b", resume=True).state_dict()
