@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -117,14 +117,6 @@ class Grid:
         return labels.change(lambda first: (first + column * layers).add_(rows))
 
 
-class Run(NamedTuple):
-    """Pairs of one layer whose blocks follow on one another, all counted from the first of their chunk."""
-
-    pairs: slice
-    blocks: slice
-    layer: int
-
-
 @dataclass(frozen=True)
 class Chunk:
     """Blocks that are worked on together: some images, or some rows of one image, or a part of one row.
@@ -137,7 +129,7 @@ class Chunk:
         x: columns of pixels.
         block: (N,) block of each pair, counted from the chunk's first.
         layer: (N,) layer of each pair, as an index into :attr:`Plan.present`.
-        runs: the same as slices of pairs that share a layer, and whose blocks follow on one another.
+        counts: pairs of each block.
     """
 
     batch: slice
@@ -147,7 +139,7 @@ class Chunk:
     x: slice
     block: Tensor
     layer: Tensor
-    runs: list[Run]
+    counts: list[int]
 
     @property
     def extent(self) -> tuple[int, int, int]:
@@ -197,20 +189,14 @@ def make_plan(labels: Labels, layers: int, psf_size: int, channels: int) -> Plan
     ends[1:] = torch.bincount(block, minlength=grid.blocks).cumsum(0)
     counted = ends.tolist()
     parts = list(_split(grid, counted, limit))
-
-    # Within a chunk the pairs go by layer: neighbours that share it are worked on together.
-    firsts = torch.tensor([first for _, first, _ in parts], device=device)
-    chunk = torch.searchsorted(firsts, block, right=True) - 1
-    order = (chunk * layers + layer).argsort(stable=True)
-    pairs, block, layer = pairs[order], block[order], (used.cumsum(0) - 1)[layer[order]]
+    numbers = (used.cumsum(0) - 1)[layer]
     place = torch.zeros(grid.blocks * layers, dtype=torch.int64, device=device)
-    place[pairs] = (torch.arange(len(pairs), device=device) - ends[firsts][chunk]) * stride
-    runs = _runs(chunk, block - firsts[chunk], layer, len(parts))
-
     chunks = []
-    for (extent, first, last), chunk_runs in zip(parts, runs, strict=True):
+    for extent, first, last in parts:
         own = slice(counted[first], counted[last])
-        chunks.append(_chunk(grid, extent, block[own] - first, layer[own], chunk_runs))
+        place[pairs[own]] = torch.arange(0, (own.stop - own.start) * stride, stride, device=device)
+        counts = [stop - start for start, stop in pairwise(counted[first : last + 1])]
+        chunks.append(_chunk(grid, extent, block[own] - first, numbers[own], counts))
     return Plan(grid, used.nonzero().squeeze(-1), labels, place, chunks)
 
 
@@ -282,22 +268,7 @@ def _split(grid: Grid, ends: list[int], limit: int) -> Iterator[tuple[Extent, in
         stack += [(*extent[:axis], half, *extent[axis + 1 :]) for half in ((middle, stop), (start, middle))]
 
 
-def _runs(chunk: Tensor, block: Tensor, layer: Tensor, chunks: int) -> list[list[Run]]:
-    """Group the pairs of each chunk into runs. Blocks are counted from the chunk's first."""
-    breaks = (chunk.diff() != 0) | (layer.diff() != 0) | (block.diff() != 1)
-    starts = torch.cat([breaks.new_ones(1), breaks]).nonzero().squeeze(-1)
-    table = torch.stack([starts, chunk[starts], block[starts], layer[starts]], dim=1).tolist()
-    ends = [row[0] for row in table[1:]] + [len(block)]
-    runs: list[list[Run]] = [[] for _ in range(chunks)]
-    for (start, number, first_block, own_layer), end in zip(table, ends, strict=True):
-        if not runs[number]:
-            origin = start
-        pairs = slice(start - origin, end - origin)
-        runs[number].append(Run(pairs, slice(first_block, first_block + end - start), own_layer))
-    return runs
-
-
-def _chunk(grid: Grid, extent: Extent, block: Tensor, layer: Tensor, runs: list[Run]) -> Chunk:
+def _chunk(grid: Grid, extent: Extent, block: Tensor, layer: Tensor, counts: list[int]) -> Chunk:
     images, rows, columns = extent
     return Chunk(
         batch=slice(*images),
@@ -307,5 +278,5 @@ def _chunk(grid: Grid, extent: Extent, block: Tensor, layer: Tensor, runs: list[
         x=slice(columns[0] * 2 * grid.tile, min(columns[1] * 2 * grid.tile, grid.width)),
         block=block,
         layer=layer,
-        runs=runs,
+        counts=counts,
     )

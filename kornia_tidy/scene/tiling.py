@@ -214,21 +214,22 @@ class _Work:
 
     def product(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Each pair's light times the spectrum of its layer: (pairs, C, size, size)."""
+        shape = (len(chunk.block), *light.shape[1:])
+        product = torch.index_select(spectra, 0, chunk.layer, out=self._buffer("pairs", shape, light.dtype))
         if not _by_slices(light):
-            return light.index_select(0, chunk.block).mul_(spectra.index_select(0, chunk.layer))
-        product = self._buffer("pairs", (len(chunk.block), *light.shape[1:]), light.dtype)
-        for run in chunk.runs:
-            torch.mul(light[run.blocks], spectra[run.layer], out=product[run.pairs])
+            return product.mul_(light.index_select(0, chunk.block))
+        for own, block in zip(product.split(chunk.counts), light.unbind(), strict=True):
+            own.mul_(block)
         return product
 
     def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Each block's sum over its layers of their light times their spectrum. May write over ``own``."""
-        images, rows, columns = chunk.extent
-        total = self._buffer("windows", (images * rows * columns, *own.shape[1:]), own.dtype).zero_()
+        total = self._buffer("windows", (math.prod(chunk.extent), *own.shape[1:]), own.dtype).zero_()
         if not _by_slices(own):
             return total.index_add_(0, chunk.block, own.mul_(spectra.index_select(0, chunk.layer)))
-        for run in chunk.runs:
-            total[run.blocks].addcmul_(own[run.pairs], spectra[run.layer])
+        sums, pairs, layers = total.unbind(), own.unbind(), spectra.unbind()
+        for block, layer, pair in zip(chunk.block.tolist(), chunk.layer.tolist(), pairs, strict=True):
+            sums[block].addcmul_(pair, layers[layer])
         return total
 
     def places(self, chunk: Chunk) -> list[Tensor]:
@@ -290,15 +291,15 @@ class _Slopes:
             self.fraction[chunk.batch, chunk.y, chunk.x] += (above - below) * factor[chunk.pixels(channel)]
 
     def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk) -> None:
-        """Correlate the layers' own pixels with the light of their windows, which may be written over."""
+        """Correlate the layers' own pixels with the light of their windows."""
         assert self.psfs is not None
         light = torch.conj_physical(light)
         if not _by_slices(light):
             self.psfs.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
             return
-        for run in chunk.runs:
-            for block, pair in zip(light[run.blocks], own[run.pairs], strict=True):
-                self.psfs[run.layer].addcmul_(block, pair)
+        sums, pairs, blocks = self.psfs.unbind(), own.unbind(), light.unbind()
+        for block, layer, pair in zip(chunk.block.tolist(), chunk.layer.tolist(), pairs, strict=True):
+            sums[layer].addcmul_(blocks[block], pair)
 
     def of_psfs(self, psfs: Tensor, *, turned: bool) -> Tensor | None:
         """Left and right tiles correlate with themselves in the real part, with each other in the imaginary part."""

@@ -304,10 +304,10 @@ class TestPlan(BaseTester):
         found = []
         for chunk in plan.chunks:
             first = (chunk.batch.start * rows + chunk.rows.start) * columns + chunk.columns.start
-            for run in chunk.runs:
-                for block in range(run.blocks.start, run.blocks.stop):
-                    image, rest = divmod(first + block, rows * columns)
-                    found.append((image, *divmod(rest, columns), int(plan.present[run.layer])))
+            assert chunk.block.bincount(minlength=len(chunk.counts)).tolist() == chunk.counts
+            for block, layer in zip(chunk.block.tolist(), chunk.layer.tolist(), strict=True):
+                image, rest = divmod(first + block, rows * columns)
+                found.append((image, *divmod(rest, columns), int(plan.present[layer])))
         assert len(found) == len(set(found))
         assert set(found) == expected
 
