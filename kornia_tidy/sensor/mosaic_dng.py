@@ -13,6 +13,7 @@ CODES = {BYTE: "B", SHORT: "H", LONG: "I", RATIONAL: "i"}
 COLOR_CODES = "RGBCMYW"  # a letter's place is its code in CFAPattern and CFAPlaneColor
 DATA_ALIGNMENT = 16
 MATRIX_UNIT = 1_000_000  # denominator of the colour matrix
+LARGEST_FACTOR = 100.0  # from sRGB to any camera: more is no camera, and would not fit a field
 
 
 def mosaic_dng(counts: np.ndarray, letters: str, to_srgb: np.ndarray | None = None) -> bytes:
@@ -21,7 +22,8 @@ def mosaic_dng(counts: np.ndarray, letters: str, to_srgb: np.ndarray | None = No
     Args:
         counts: (H, W) uint16.
         letters: the tile by rows, 4 or 36 letters of R, G, B, C, M, Y.
-        to_srgb: from R, G and B to linear sRGB, (3, 3). Default: they are those of sRGB. Other filters have no matrix.
+        to_srgb: from R, G and B to linear sRGB, (3, 3). Default, and where it is almost singular: they are those of
+            sRGB. Other filters have no matrix.
 
     Source: Adobe, Digital Negative Specification 1.4; TIFF 6.0 for the container.
     """
@@ -44,8 +46,10 @@ def mosaic_dng(counts: np.ndarray, letters: str, to_srgb: np.ndarray | None = No
         (50717, LONG, [65535]),  # white
     ]
     if set(letters) == set("RGB"):
-        from_xyz = np.linalg.inv(np.eye(3) if to_srgb is None else to_srgb) @ np.array(SRGB_FROM_XYZ)
-        values = np.round(from_xyz * MATRIX_UNIT).astype(int).flatten().tolist()
+        from_srgb = np.eye(3) if to_srgb is None else np.linalg.pinv(to_srgb)
+        if np.abs(from_srgb).max() > LARGEST_FACTOR:
+            from_srgb = np.eye(3)
+        values = np.round(from_srgb @ np.array(SRGB_FROM_XYZ) * MATRIX_UNIT).astype(int).flatten().tolist()
         fields.append((50721, RATIONAL, [part for value in values for part in (value, MATRIX_UNIT)]))
     else:  # four colours, in LibRaw's order
         fields.insert(-2, (50710, BYTE, [COLOR_CODES.index(letter) for letter in "GMCY"]))
