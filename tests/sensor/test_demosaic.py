@@ -124,7 +124,9 @@ class TestDemosaic(BaseTester):
                 assert len(samples) == (5 if letter == "G" else 2)
                 assert half[color, top // 3, left // 3].item() == pytest.approx(np.mean(samples), abs=1e-6)
 
-    @given(st.sampled_from([*BAYER, "GMYC", "RGBG", XTRANS]), st.integers(6, 17), st.integers(6, 17), st.integers(0, 99))
+    @given(
+        st.sampled_from([*BAYER, "GMYC", "RGBG", XTRANS]), st.integers(6, 17), st.integers(6, 17), st.integers(0, 99)
+    )
     @settings(max_examples=60, deadline=None)
     def test_feature_measured_values_stay_and_others_lie_between(self, letters, height, width, seed):
         mosaic = torch.randn(1, height, width, generator=torch.Generator().manual_seed(seed))

@@ -71,7 +71,7 @@ class TestAssumedCamera(BaseTester):
     def test_feature_colorchecker_by_spectra(self):
         """The chart in daylight through the measured sensitivities, against the same chart through the eye's.
 
-        Mean difference below 2.5 and the worst below 7 (CIE 2000), about half of the mean without the matrix.
+        Mean difference below 2.5 and the worst below 7 (CIE 2000), where the mean without a matrix is 6.8.
         """
         wavelengths = colour.SpectralShape(400, 700, 10)
         light = colour.SDS_ILLUMINANTS["D65"].copy().align(wavelengths).values
@@ -90,7 +90,6 @@ class TestAssumedCamera(BaseTester):
         true = colour.XYZ_to_Lab(xyz)
         ours = colour.XYZ_to_Lab(balanced @ matrix.double().numpy().T @ inverse.T)
         plain = colour.XYZ_to_Lab(balanced @ inverse.T)
-        print(colour.delta_E(true, plain).mean())
         assert colour.delta_E(true, ours).mean() < 2.5
         assert colour.delta_E(true, ours).max() < 7
         assert colour.delta_E(true, plain).mean() > 6
