@@ -10,12 +10,13 @@ import rawpy
 import torch
 from kornia.color import rgb_to_linear_rgb
 
-from kornia_tidy.sensor.develop import balance_factors, default_method, develop, matrix_origin, srgb_matrix
+from kornia_tidy.sensor.develop import balance_factors, default_method, develop, srgb_matrix
 from kornia_tidy.sensor.raw_color import assumed_camera_to_srgb, camera_to_srgb
 from kornia_tidy.sensor.raw_file import RawCapture
 from tests.base import DATA, BaseTester, needs_data
 from tests.sensor.dng import XTRANS, dng
 from tests.sensor.test_raw_color import G1, G2
+from tests.sensor.test_raw_file import README
 
 LINEAR = {
     "gamma": (1, 1),
@@ -24,28 +25,13 @@ LINEAR = {
     "output_bps": 16,
     "user_flip": 0,
 }
-HALVES = (
-    "raw/thorsted+digicam_corpus/G2_CRW_0305.CRW",
-    "raw/syoyo+tinydng/colorchart.dng",
-    "raw/haraldk+TwelveMonkeys/dng_test.dng",
-    "raw/haraldk+TwelveMonkeys/crw_RAW_CANON_G1.CRW",
-    "raw/imageio+test_images/Blackmagic.dng",
-    "raw/photoprism+photoprism/canon_eos_6d.dng",
-    "raw/colinleroy+a2tools/QKTK_IMAGE01.QTK",
-    "raw/colinleroy+a2tools/QKTK_IMAGE02.QTK",
-    "raw/colinleroy+a2tools/QKTK_Image__1.qtk",
-    "raw/colinleroy+a2tools/QKTK_Image__2.qtk",
-    "raw/colinleroy+a2tools/QKTK_Image__6.qtk",
-    "raw/colinleroy+a2tools/QKTK_Mistigri.qtk",
-    "raw_synthetic/motorcycle_rggb.dng",
-    "raw_synthetic/motorcycle_bggr.dng",
-    "raw_synthetic/motorcycle_grbg.dng",
-    "raw_synthetic/motorcycle_gbrg.dng",
-    "raw_synthetic/motorcycle_linear.dng",
-    "raw_synthetic/motorcycle_mono.dng",
-)
-UNTOLD = ("raw/colinleroy+a2tools/DC50_DC0008L.KDC", "raw/thorsted+digicam_corpus/DC120_P003908.KDC")
-RAW_COLORS = rawpy.ColorSpace.raw
+# Of these LibRaw's half size is of other pixels: it repeats columns, and puts 2x2 squares on a 6x6 tile.
+UNLIKE = ("raw/thorsted+digicam_corpus/DC120_P003908.KDC", "raw_synthetic/aloe_xtrans.dng")
+HALVES = [name for name in README if name not in UNLIKE]
+PICTURES = {  # of whole algorithms
+    "raw/syoyo+tinydng/colorchart.dng": ("linear", "ppg", "dht"),
+    "raw/haraldk+TwelveMonkeys/dng_test.dng": ("linear", "vng", "ahd", "dcb"),
+}
 
 
 def libraw(path, **options):
@@ -78,8 +64,9 @@ class TestDevelop(BaseTester):
     def test_feature_levels_balance_and_matrix_are_those_of_libraw(self, name):
         """On 2x2 planes, LibRaw's at half size, linear: within 1e-4 everywhere, 3e-5 on average for each channel.
 
-        LibRaw takes counts below black for black, which only the second comparison does: without, 1e-4 on average. Where
-        black is the same in three channels and absent in a fourth (linear DNG) LibRaw leaves it in the white level.
+        LibRaw takes counts below black for black, which only the second comparison does: without, 1e-4 on average.
+        Where black is the same in three channels and absent in a fourth (linear DNG) LibRaw leaves it in the white
+        level.
         """
         raw = RawCapture.open(DATA / name)
         options = {"use_camera_wb": True} if raw.white_balance is not None else {}
@@ -96,13 +83,12 @@ class TestDevelop(BaseTester):
         assert difference(never_below_black(raw)).max() < (2e-4 if scale < 1 else 1e-4)
 
     @needs_data
-    @pytest.mark.parametrize("name", UNTOLD)
-    def test_feature_cameras_whose_matrix_libraw_keeps_to_itself(self, name):
-        """In the camera's own colours. Where pixels are wider than high LibRaw repeats columns, step by step."""
-        raw = RawCapture.open(DATA / name)
-        assert matrix_origin(raw) == "assumed"
-        theirs = libraw(DATA / name, half_size=True, output_color=RAW_COLORS)
-        ours = develop(raw, "half", matrix=torch.eye(3), encoded=False, square_pixels=False, upright=False)
+    def test_feature_wide_pixels_are_those_of_libraw(self):
+        """Where pixels are wider than high LibRaw repeats columns, step by step."""
+        path = DATA / UNLIKE[0]
+        raw = RawCapture.open(path)
+        theirs = libraw(path, half_size=True)
+        ours = develop(raw, "half", encoded=False, square_pixels=False, upright=False).clamp(0, 1)
         steps = np.full(round(ours.shape[-1] * raw.pixel_aspect), 1 / raw.pixel_aspect)
         ours = ours[..., np.cumsum([0, *steps[1:]]).astype(int)]
         assert ours.shape == theirs.shape
@@ -111,7 +97,7 @@ class TestDevelop(BaseTester):
     @needs_data
     def test_feature_xtrans_where_two_by_two_pixels_hold_all_colours(self):
         """LibRaw's half size keeps the last sample of each colour in such a square; 1e-4 everywhere."""
-        path = DATA / "raw_synthetic/aloe_xtrans.dng"
+        path = DATA / UNLIKE[1]
         raw = RawCapture.open(path)
         theirs = libraw(path, half_size=True, use_camera_wb=True)
         factors = balance_factors(raw)
@@ -129,8 +115,9 @@ class TestDevelop(BaseTester):
         assert (ours - theirs)[:, whole].abs().max() < 1e-4
 
     @needs_data
-    @pytest.mark.parametrize("method", ["linear", "vng", "ppg", "ahd", "dcb", "dht"])
-    @pytest.mark.parametrize("name", HALVES[1:3])
+    @pytest.mark.parametrize(
+        ("name", "method"), [(name, method) for name, methods in PICTURES.items() for method in methods]
+    )
     def test_feature_demosaiced_as_libraw_does_itself(self, name, method):
         """From our levels and balance: 2e-4 on average; its choices of direction flip where two are as good.
 
