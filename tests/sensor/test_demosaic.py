@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from kornia_tidy.sensor.demosaic import METHODS, bilinear, demosaic
-from kornia_tidy.sensor.raw_file import filter_tile
+from kornia_tidy.sensor.filter_array import filter_tile
 from tests.base import BaseTester
 from tests.sensor.dng import XTRANS
 

@@ -12,7 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.sensor.raw_file import RawCapture, RawInfo, filter_tile, tile_planes
+from kornia_tidy.sensor.filter_array import filter_tile, tile_planes
+from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 from tests.base import DATA, BaseTester, needs_data
 from tests.sensor.dng import XTRANS, dng
 
