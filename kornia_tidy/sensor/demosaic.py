@@ -247,9 +247,13 @@ def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray
         counts[:, rows] = (values[:, rows] - low).div_(step).round_().numpy()
     images = []
     for plane in counts:
-        colors = compute(plane)
-        image = values.new_empty(colors.shape[2], *plane.shape)
-        for color in range(len(image)):
-            np.multiply(colors[..., color], step, out=image[color].numpy(), casting="same_kind")
-        images.append(image.add_(low) if low else image)
+        colors = compute(plane).transpose(2, 0, 1)
+        image = np.empty(colors.shape, values.numpy().dtype)  # NumPy's large pages are touched in half the time
+        for top in range(0, image.shape[1], ROWS_AT_ONCE):
+            rows = slice(top, top + ROWS_AT_ONCE)
+            for color, own in zip(colors[:, rows], image[:, rows], strict=True):
+                np.multiply(color, step, out=own, casting="same_kind")
+        if low:
+            image += low
+        images.append(torch.from_numpy(image))
     return (images[0][None] if len(images) == 1 else torch.stack(images)).to(mosaic)
