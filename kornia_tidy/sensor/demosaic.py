@@ -15,7 +15,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
 from kornia_tidy.sensor.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
 from kornia_tidy.sensor.filter_array import Tile
-from kornia_tidy.sensor.raw_color import SRGB_FROM_XYZ
+from kornia_tidy.sensor.raw_color import srgb_from_xyz
 
 # kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
 BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
@@ -100,6 +100,8 @@ def demosaic(
         image = _libraw(flat, letters, names, name, to_srgb)
     else:
         image = _kornia(flat, letters) if library == "kornia" else _opencv(flat, letters, name)
+        if names != "RGB":
+            image = image[:, ["RGB".index(letter) for letter in names]]
     return image.reshape(*mosaic.shape[:-3], *image.shape[-3:])
 
 
@@ -230,7 +232,7 @@ def _matrix_fields(to_srgb: Tensor | None) -> list[Field]:
     inverse = matrix.pinverse()
     if float(inverse.abs().max()) > LARGEST_FACTOR:
         inverse = torch.eye(3, dtype=torch.float64)
-    from_xyz = inverse @ torch.tensor(SRGB_FROM_XYZ, dtype=torch.float64)
+    from_xyz = inverse @ srgb_from_xyz()
     return [(50721, SRATIONAL, from_xyz.flatten().tolist()), (50778, SHORT, [D65])]
 
 

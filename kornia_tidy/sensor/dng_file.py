@@ -6,12 +6,11 @@ import os
 from datetime import datetime
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from kornia_tidy.files import write_bytes
 from kornia_tidy.sensor.dng_fields import ASCII, D65, RATIONAL, SHORT, SRATIONAL, Field, dng_bytes
-from kornia_tidy.sensor.raw_color import SRGB_FROM_XYZ
+from kornia_tidy.sensor.raw_color import srgb_from_xyz
 from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 
 ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}  # LibRaw's flip to TIFF's
@@ -87,7 +86,7 @@ def _xyz_to_camera(raw: RawCapture, planes: list[int]) -> Tensor | None:
         return raw.xyz_to_camera
     if raw.camera_to_srgb is None:
         return None
-    balanced = raw.camera_to_srgb.double().pinverse() @ torch.tensor(SRGB_FROM_XYZ, dtype=torch.float64)
+    balanced = raw.camera_to_srgb.double().pinverse() @ srgb_from_xyz()
     daylight = raw.white_balance if raw.daylight_balance is None else raw.daylight_balance
     return balanced if daylight is None else balanced / daylight.double()[planes][: len(balanced), None]
 

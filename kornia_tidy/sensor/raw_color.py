@@ -43,7 +43,7 @@ def camera_to_srgb(xyz_to_camera: Tensor) -> tuple[Tensor, Tensor]:
         >>> matrix.sum(1).round(decimals=4), daylight
         (tensor([1., 1., 1.]), tensor([2.2394, 0.8574, 1.1288]))
     """
-    srgb_to_camera = xyz_to_camera.double() @ _srgb_from_xyz().inverse()
+    srgb_to_camera = xyz_to_camera.double() @ srgb_from_xyz().inverse()
     sums = srgb_to_camera.sum(1, keepdim=True)
     if not bool((sums > 0).all()):
         raise ValueError(f"xyz_to_camera must see white in every channel, it gives {sums.flatten().tolist()}")
@@ -91,7 +91,7 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
         tensor([1., 1., 1.])
     """
     check_choice("chromatic adaptation", adaptation, ADAPTATIONS)
-    from_xyz = _srgb_from_xyz()
+    from_xyz = srgb_from_xyz()
     undone = matrix.double() * (daylight.double() / balance.double())
     light = from_xyz.inverse() @ undone.sum(1)
     if not bool((light > 0).all()):
@@ -105,7 +105,8 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
     return (result / light[1]).to(matrix)
 
 
-def _srgb_from_xyz() -> Tensor:
+def srgb_from_xyz() -> Tensor:
+    """Return the matrix from CIE XYZ to linear sRGB, (3, 3) float64; both have daylight (D65) for white."""
     return torch.tensor(SRGB_FROM_XYZ, dtype=torch.float64)
 
 

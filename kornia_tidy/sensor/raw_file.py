@@ -233,17 +233,15 @@ class RawCapture:
         optics: Callable[[Tensor, Tensor], Tensor],
         camera: RawCapture,
         noise: SensorNoise | None = None,
-        *,
-        color: str = "camera",
-        generator: torch.Generator | None = None,
+        **options: Any,
     ) -> RawCapture:
         """Return what a camera's raw file would hold of a scene with depth.
 
-        See :func:`~kornia_tidy.sensor.raw_simulation.simulate_scene`.
+        See :func:`~kornia_tidy.sensor.raw_simulation.simulate_scene`, whose options these are.
         """
         from kornia_tidy.sensor.raw_simulation import simulate_scene  # noqa: PLC0415 (it builds on this file)
 
-        return simulate_scene(image, depth, optics, camera, noise, color=color, generator=generator)
+        return simulate_scene(image, depth, optics, camera, noise, **options)
 
     @property
     def tile(self) -> tuple[int, int]:

@@ -55,6 +55,19 @@ class TestDemosaic(BaseTester):
         bound = 1e-9 if exact else 2e-7 if method == "bilinear" else 1.35 * ROUNDING.get(method, 0.51 / 65535)
         assert (image - levels[:, None, None]).abs().max() <= bound
 
+    @pytest.mark.parametrize(
+        ("colors", "tile", "methods"),
+        [
+            ("BGR", ((2, 1), (1, 0)), ("bilinear", "half", "kornia", "opencv_edge_aware", "libraw_ahd")),
+            ("YCGM", ((2, 3), (0, 1)), ("bilinear", "half", "libraw_linear")),
+        ],
+    )
+    def test_feature_channels_come_in_the_order_of_their_names(self, colors, tile, methods):
+        levels = torch.tensor([0.1, 0.3, 0.5, 0.9])[: len(colors)]
+        mosaic = levels[torch.tensor(tile)].repeat(12, 12)[None]
+        for method in methods:
+            self.assert_close(demosaic(mosaic, tile, colors, method)[:, 6, 6], levels, atol=1e-4)
+
     @pytest.mark.parametrize("letters", BAYER)
     @pytest.mark.parametrize("method", ["bilinear", "kornia", "opencv_bilinear", "libraw_linear"])
     def test_feature_bilinear_is_exact_on_ramps(self, letters, method):
