@@ -95,7 +95,7 @@ def in_words(result: PhotonTransfer) -> list[tuple[str, str]]:
     line = result.line
     iso = "" if result.iso is None else f", ISO {result.iso:g}"
     single = result.method == "single"
-    limit = "" if result.read_noise_resolved else " (no more than a guess: rounding to counts hides it)"
+    limit = "" if result.read_noise_resolved else " (no more than a guess: rounding to counts may hide it)"
     topics = [
         ("camera", (result.camera or "unknown") + iso),
         ("levels", f"black {result.black:g}, white {result.white:g}"),

@@ -105,7 +105,7 @@ def in_words(raw: RawCapture) -> list[tuple[str, str]]:
     matrices = [name for name in ("xyz_to_camera", "camera_to_srgb") if getattr(raw, name) is not None]
     aspect = "" if raw.pixel_aspect == 1 else f"; its pixels are {raw.pixel_aspect:.4g} times as wide as high"
     return [
-        ("camera", ", ".join(part for part in (_camera(raw.info), raw.info.lens) if part) or "unknown"),
+        ("camera", ", ".join(part for part in (raw.info.camera, raw.info.lens) if part) or "unknown"),
         ("exposure", _exposure(raw.info) or "unknown"),
         ("sensor", f"{width} x {height} px, {colour}"),
         (
@@ -152,13 +152,6 @@ def as_json(raw: RawCapture) -> dict[str, Any]:
         "flip": raw.flip,
         "pixel_aspect": raw.pixel_aspect,
     }
-
-
-def _camera(info: RawInfo) -> str:
-    """Return the camera's name; many models repeat who made them."""
-    make, model = info.make or "", info.model or ""
-    first = make.split()[0].lower() if make else ""
-    return model if first and first in model.lower() else f"{make} {model}".strip()
 
 
 def _exposure(info: RawInfo) -> str:

@@ -13,9 +13,9 @@ from kornia.color import CFA, raw_to_rgb
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
-from kornia_tidy.sensor.mosaic_dng import mosaic_dng
-
-Tile = tuple[tuple[int, ...], ...]
+from kornia_tidy.sensor.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
+from kornia_tidy.sensor.filter_array import Tile
+from kornia_tidy.sensor.raw_color import srgb_from_xyz
 
 # kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
 BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
@@ -26,6 +26,8 @@ LIBRAW = {
     "four-colour": ("linear", "vng"),
     "X-Trans": ("markesteijn",),
 }
+LARGEST_FACTOR = 100.0  # from sRGB to any camera: more is no camera, and would not fit a field
+ROWS_AT_ONCE = 64  # what is between two steps then stays in the processor's cache
 LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # pixels of the shorter side that it takes
 
 METHODS = (
@@ -46,7 +48,7 @@ def demosaic(
         mosaic: (..., 1, H, W), linear; white-balanced, for the methods that follow edges.
         pattern: index into ``colors`` at each place of the repeating tile, from the upper left corner.
         colors: names of the channels by index; a letter that comes twice is one colour. Both as
-            :func:`~kornia_tidy.sensor.raw_file.filter_tile` returns them.
+            :func:`~kornia_tidy.sensor.filter_array.filter_tile` returns them.
         method: how, by the name of who computes it.
 
             * ``"bilinear"``: for any tile; differentiable, on any device, nothing rounded. Measured values stay; others
@@ -95,9 +97,11 @@ def demosaic(
     if method in {"bilinear", "half"}:
         image = (bilinear if method == "bilinear" else binned)(flat, tile)
     elif library == "libraw":
-        image = _libraw(flat, letters, name, to_srgb)
+        image = _libraw(flat, letters, names, name, to_srgb)
     else:
         image = _kornia(flat, letters) if library == "kornia" else _opencv(flat, letters, name)
+        if names != "RGB":
+            image = image[:, ["RGB".index(letter) for letter in names]]
     return image.reshape(*mosaic.shape[:-3], *image.shape[-3:])
 
 
@@ -191,23 +195,21 @@ def _opencv(mosaic: Tensor, letters: str, name: str) -> Tensor:
     return _in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits)
 
 
-def _libraw(mosaic: Tensor, letters: str, name: str, to_srgb: Tensor | None) -> Tensor:
+def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None) -> Tensor:
     import rawpy  # noqa: PLC0415  (only who asks for it loads a C++ library)
 
-    kind = "Bayer" if letters in BAYER else "four-colour" if len(set(letters)) == 4 else "X-Trans"
+    kind = "Bayer" if letters in BAYER else "four-colour" if len(colors) == 4 else "X-Trans"
     check_choice(f"LibRaw's demosaicing of a {kind} array", name, LIBRAW[kind])
     side = 6 if kind == "X-Trans" else 2
     lacking = LIBRAW_SMALLEST[kind] - min(mosaic.shape[-2:])
-    tiles = max(
-        -(-lacking // (2 * side)), int(kind == "X-Trans"), 0
-    )  # it leaves the corner of an X-Trans picture black
+    tiles = max(-(-lacking // (2 * side)), int(kind == "X-Trans"), 0)  # it leaves the corner of X-Trans black
     margin = tiles * side
     height, width = mosaic.shape[-2:]
-    matrix = None if to_srgb is None else to_srgb.detach().double().cpu().numpy()
     algorithm = rawpy.DemosaicAlgorithm["AHD" if name == "markesteijn" else name.upper()]
+    fields = [] if kind == "four-colour" else _matrix_fields(to_srgb)
 
     def postprocess(counts: np.ndarray) -> np.ndarray:
-        with rawpy.imread(io.BytesIO(mosaic_dng(counts, letters, matrix))) as raw:
+        with rawpy.imread(io.BytesIO(dng_bytes(counts[..., None], letters, colors, 65535, fields))) as raw:
             return raw.postprocess(
                 demosaic_algorithm=algorithm,
                 output_color=rawpy.ColorSpace.raw,
@@ -224,6 +226,16 @@ def _libraw(mosaic: Tensor, letters: str, name: str, to_srgb: Tensor | None) -> 
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 
 
+def _matrix_fields(to_srgb: Tensor | None) -> list[Field]:
+    """Say which colours R, G and B are: those of sRGB where nothing is known, or the matrix is almost singular."""
+    matrix = torch.eye(3, dtype=torch.float64) if to_srgb is None else to_srgb.detach().double().cpu()
+    inverse = matrix.pinverse()
+    if float(inverse.abs().max()) > LARGEST_FACTOR:
+        inverse = torch.eye(3, dtype=torch.float64)
+    from_xyz = inverse @ srgb_from_xyz()
+    return [(50721, SRATIONAL, from_xyz.flatten().tolist()), (50778, SHORT, [D65])]
+
+
 def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray], bits: int) -> Tensor:
     """Compute (H, W) -> (H, W, C) in unsigned integers of 8 or 16 bits that span the mosaic's range, 0 and 1."""
     check_finite("mosaic", mosaic)
@@ -231,12 +243,19 @@ def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray
     least, most = torch.aminmax(values)
     low, high = min(0.0, float(least)), max(1.0, float(most))
     step = (high - low) / (2**bits - 1)
-    counts = (values - low).div_(step).round_().numpy().astype(np.uint8 if bits == 8 else np.uint16)
+    counts = np.empty(values.shape, np.uint8 if bits == 8 else np.uint16)
+    for top in range(0, values.shape[1], ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        counts[:, rows] = (values[:, rows] - low).div_(step).round_().numpy()
     images = []
     for plane in counts:
-        colors = compute(plane)
-        image = values.new_empty(colors.shape[2], *plane.shape)
-        for color in range(len(image)):
-            np.multiply(colors[..., color], step, out=image[color].numpy(), casting="same_kind")
-        images.append(image.add_(low) if low else image)
+        colors = compute(plane).transpose(2, 0, 1)
+        image = np.empty(colors.shape, values.numpy().dtype)  # NumPy's large pages are touched in half the time
+        for top in range(0, image.shape[1], ROWS_AT_ONCE):
+            rows = slice(top, top + ROWS_AT_ONCE)
+            for color, own in zip(colors[:, rows], image[:, rows], strict=True):
+                np.multiply(color, step, out=own, casting="same_kind")
+        if low:
+            image += low
+        images.append(torch.from_numpy(image))
     return (images[0][None] if len(images) == 1 else torch.stack(images)).to(mosaic)

@@ -27,10 +27,7 @@ FORMAT = "kornia_tidy.photon_transfer/1"
 ROUNDING = 1 / 12  # variance that rounding to whole counts adds
 RESOLVED = 0.24  # EMVA 1288: variance in counts squared below which rounding hides the read noise
 SAME_LEVEL = 0.02  # captures whose levels differ by less, and by less than a count more, are of one exposure
-LEAST_POINTS, LEAST_POINTS_SINGLE = (
-    3,
-    8,
-)  # flats say exactly what noise is; a picture's errors show in their number only
+LEAST_POINTS, LEAST_POINTS_SINGLE = 3, 8  # flats say exactly what noise is; of a picture many points together do
 WORST_R_SQUARED, WORST_GAIN_ERROR = 0.9, 0.25  # beyond these the pictures are said not to allow a calibration
 _BISQUARE = 4.685  # Tukey's constant: 95 % efficient for Gaussian noise
 
@@ -90,8 +87,13 @@ class PhotonTransfer:
 
     @property
     def read_noise_resolved(self) -> bool:
-        """Whether the read noise is large enough for the converter's steps; else it is only known to be small."""
-        return (self.line.read_noise / self.line.gain) ** 2 + ROUNDING >= RESOLVED
+        """Whether the read noise is seen, by three standard errors, to be more than the converter's steps hide.
+
+        Where they hide it the captures in the dark say nothing, and the line's value at zero light comes from the
+        bright ones alone: chance often makes it look large enough, and its error tells.
+        """
+        surely = max(self.line.read_noise - 3 * self.line.read_noise_error, 0.0)
+        return (surely / self.line.gain) ** 2 + ROUNDING >= RESOLVED
 
     def sensor_noise(self) -> SensorNoise:
         """Return this camera as the library's sensor, whose full scale 1 is the count of saturation.

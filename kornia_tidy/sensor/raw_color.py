@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,7 +43,7 @@ def camera_to_srgb(xyz_to_camera: Tensor) -> tuple[Tensor, Tensor]:
         >>> matrix.sum(1).round(decimals=4), daylight
         (tensor([1., 1., 1.]), tensor([2.2394, 0.8574, 1.1288]))
     """
-    srgb_to_camera = xyz_to_camera.double() @ _srgb_from_xyz().inverse()
+    srgb_to_camera = xyz_to_camera.double() @ srgb_from_xyz().inverse()
     sums = srgb_to_camera.sum(1, keepdim=True)
     if not bool((sums > 0).all()):
         raise ValueError(f"xyz_to_camera must see white in every channel, it gives {sums.flatten().tolist()}")
@@ -54,12 +60,12 @@ def assumed_camera_to_srgb() -> tuple[Tensor, Tensor]:
     Source: Darrodi et al., Reference data set for camera spectral sensitivity estimation, JOSA A 2015, for the
         sensitivities; AMPAS P-2013-001 for the fit.
     """
-    import colour  # noqa: PLC0415  (seconds: only who has such a camera waits for it)
-
-    fit = colour.matrix_idt(colour.MSDS_CAMERA_SENSITIVITIES[ASSUMED_CAMERA], colour.SDS_ILLUMINANTS["D65"])
+    with _colour_science() as colour:
+        fit = colour.matrix_idt(colour.MSDS_CAMERA_SENSITIVITIES[ASSUMED_CAMERA], colour.SDS_ILLUMINANTS["D65"])
+        spaces = colour.RGB_COLOURSPACES
+        from_aces = colour.matrix_RGB_to_RGB(spaces["ACES2065-1"], spaces["sRGB"], "Bradford")
     matrix, daylight = fit[:2]
-    spaces = colour.RGB_COLOURSPACES
-    to_srgb = torch.as_tensor(colour.matrix_RGB_to_RGB(spaces["ACES2065-1"], spaces["sRGB"], "Bradford") @ matrix)
+    to_srgb = torch.as_tensor(from_aces @ matrix)
     to_srgb = to_srgb / to_srgb.sum(1, keepdim=True)  # colour's white points are rounded: 1e-4
     return to_srgb.float(), torch.as_tensor(daylight).float()
 
@@ -85,20 +91,30 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
         tensor([1., 1., 1.])
     """
     check_choice("chromatic adaptation", adaptation, ADAPTATIONS)
-    import colour  # noqa: PLC0415
-
-    from_xyz = _srgb_from_xyz()
+    from_xyz = srgb_from_xyz()
     undone = matrix.double() * (daylight.double() / balance.double())
     light = from_xyz.inverse() @ undone.sum(1)
     if not bool((light > 0).all()):
         raise ValueError(f"white balance {balance.tolist()} belongs to no light: its XYZ is {light.tolist()}")
     white = from_xyz.inverse().sum(1)
-    moved = colour.adaptation.matrix_chromatic_adaptation_VonKries(
-        (light / light[1]).numpy(), white.numpy(), transform=adaptation
-    )
+    with _colour_science() as colour:
+        moved = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+            (light / light[1]).numpy(), white.numpy(), transform=adaptation
+        )
     result = from_xyz @ torch.as_tensor(moved) @ from_xyz.inverse() @ undone
     return (result / light[1]).to(matrix)
 
 
-def _srgb_from_xyz() -> Tensor:
+def srgb_from_xyz() -> Tensor:
+    """Return the matrix from CIE XYZ to linear sRGB, (3, 3) float64; both have daylight (D65) for white."""
     return torch.tensor(SRGB_FROM_XYZ, dtype=torch.float64)
+
+
+@contextmanager
+def _colour_science() -> Generator[Any]:
+    """Give the module; importing it takes seconds, warns and sets NumPy's print options, and its tables' steps warn."""
+    with warnings.catch_warnings(), np.printoptions():
+        warnings.simplefilter("ignore")
+        import colour  # noqa: PLC0415
+
+        yield colour

@@ -49,7 +49,12 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
     """Return a header and the counts of the visible area, row by row, channels last, unsigned 16 bits."""
     import numpy as np  # noqa: PLC0415 (after the limits)
     import rawpy  # noqa: PLC0415
-    from raw_tags import black_tile, camera_tags, missing_bytes  # noqa: PLC0415  # ty: ignore[import-not-found]
+    from raw_tags import (  # noqa: PLC0415  # ty: ignore[import-not-found]
+        black_tile,
+        camera_tags,
+        kodak_matrix,
+        missing_bytes,
+    )
 
     if missing := missing_bytes(data):
         raise ValueError(f"it is cut short, {missing} bytes of its picture are missing")
@@ -69,6 +74,9 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
             black = mean_over_tile(tile, len(pattern), len(pattern[0]))
     if counts.ndim == 3:
         counts = np.ascontiguousarray(counts[..., :channels])
+    camera_to_srgb = raw.color_matrix.tolist()
+    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw reads the tag too, and keeps it to itself
+        camera_to_srgb = kodak_matrix(data) or camera_to_srgb
     header = {
         "shape": (*counts.shape[:2], channels),
         "pattern": pattern,
@@ -76,7 +84,7 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         "black": black,
         "white": raw.white_level,
         "xyz_to_camera": raw.rgb_xyz_matrix.tolist(),
-        "camera_to_srgb": raw.color_matrix.tolist(),
+        "camera_to_srgb": camera_to_srgb,
         "white_balance": raw.camera_whitebalance,
         "daylight_balance": raw.daylight_whitebalance,
         "flip": sizes.flip,

@@ -42,7 +42,16 @@ SENTENCES = {
     "LibRawRequestForNonexistentImageError": "it holds no raw picture",
     "LibRawTooBigError": "its picture is larger than LibRaw decodes",
 }
+# Where memory ends shows in the kind of an error or in its words: C++'s, the dynamic linker's, which loads NumPy and
+# LibRaw under the limit too, and OpenBLAS's, which ends the process.
 OUT_OF_MEMORY = ("MemoryError", "LibRawUnsufficientMemoryError", "LibRawMemPoolOverflowError")
+OUT_OF_MEMORY_WORDS = (
+    "MemoryError",
+    "bad_alloc",
+    "failed to map segment",
+    "Cannot allocate memory",
+    "Memory allocation still failed",
+)
 
 
 def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[str, Any], Tensor, int]:
@@ -66,7 +75,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
         check_beginning(name, file.read(16))
         file.seek(0)  # where the process begins to read
         try:
-            complaint = _complaint(*_run(file, result, timeout, memory_limit))
+            complaint = _complaint(*_run(file, result, timeout, memory_limit), memory_limit)
         except subprocess.TimeoutExpired:
             complaint = f"decoding took longer than {timeout:g} s"
         header = _header(result)
@@ -155,13 +164,13 @@ def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) 
     return process.returncode, process.stderr.decode(errors="replace")
 
 
-def _complaint(status: int, printed: str) -> str | None:
-    """Return what an exit status means; None if all went well."""
+def _complaint(status: int, printed: str, memory_limit: int) -> str | None:
+    """Return what an exit status and printed words mean; None if all went well."""
     if status < 0:
         name = Signals(-status).name
         slow = "decoding it took more processor time than it may use"
         return slow if name == "SIGXCPU" else f"LibRaw crashed on it ({name})"
-    return f"its decoder failed ({' '.join(printed.split())[-200:]})" if status else None
+    return _failure(printed, memory_limit) if status else None
 
 
 def _header(result: IO[bytes]) -> dict[str, Any]:
@@ -186,8 +195,19 @@ def _counts(result: IO[bytes], shape: list[int]) -> Tensor:
 def _sentence(header: dict[str, Any], memory_limit: int) -> str:
     """Return what an exception in the decoder means."""
     kind, text = str(header["error"]), str(header.get("text", ""))
-    if kind in OUT_OF_MEMORY or "bad_alloc" in text:
-        return f"decoding it needs more than the {memory_limit / 2**20:.0f} MiB of memory that it may use"
+    if kind in OUT_OF_MEMORY:
+        return _too_much(memory_limit)
     if kind in SENTENCES:
         return SENTENCES[kind]
-    return text if kind == "ValueError" else f"its decoder failed ({text or kind})"
+    return text if kind == "ValueError" else _failure(text or kind, memory_limit)
+
+
+def _failure(text: str, memory_limit: int) -> str:
+    """Return what the words of a decoder mean that did not come to an answer."""
+    if any(words in text for words in OUT_OF_MEMORY_WORDS):
+        return _too_much(memory_limit)
+    return f"its decoder failed ({' '.join(text.split())[-200:]})"
+
+
+def _too_much(memory_limit: int) -> str:
+    return f"decoding it needs more than the {memory_limit / 2**20:.0f} MiB of memory that it may use"

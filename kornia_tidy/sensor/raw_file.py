@@ -14,13 +14,12 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.sensor.develop import develop
+from kornia_tidy.sensor.filter_array import filter_tile, tile_planes, tiled
 from kornia_tidy.sensor.raw_decoding import Source, decode_raw, source_bytes, source_name
 from kornia_tidy.sensor.raw_plausible import check_plausible
 
 if TYPE_CHECKING:
     from kornia_tidy.sensor.noise import SensorNoise
-
-PATTERN_COLORS = {"RGB": "RGBG", "CGMY": "GMCY"}  # LibRaw's order of the channels, by the letters of a filter array
 
 
 @dataclass(frozen=True)
@@ -234,17 +233,15 @@ class RawCapture:
         optics: Callable[[Tensor, Tensor], Tensor],
         camera: RawCapture,
         noise: SensorNoise | None = None,
-        *,
-        color: str = "camera",
-        generator: torch.Generator | None = None,
+        **options: Any,
     ) -> RawCapture:
         """Return what a camera's raw file would hold of a scene with depth.
 
-        See :func:`~kornia_tidy.sensor.raw_simulation.simulate_scene`.
+        See :func:`~kornia_tidy.sensor.raw_simulation.simulate_scene`, whose options these are.
         """
         from kornia_tidy.sensor.raw_simulation import simulate_scene  # noqa: PLC0415 (it builds on this file)
 
-        return simulate_scene(image, depth, optics, camera, noise, color=color, generator=generator)
+        return simulate_scene(image, depth, optics, camera, noise, **options)
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -263,12 +260,12 @@ class RawCapture:
             Noise around black stays below 0 and counts above white stay above 1: nothing is clamped.
         """
         light = self.counts.float()
-        rows, columns = self.tile
-        for row in range(rows):
-            for column in range(columns):
-                black = self.black[:, None, None] if self.pattern is None else self.black[row, column]
-                place = light[:, row::rows, column::columns]
-                place.sub_(black).div_(self.white - black)
+        if self.pattern is None:
+            black = self.black[:, None, None]
+            return light.sub_(black).div_(self.white - black)
+        rows = self.tile[0]
+        for row, black in enumerate(tiled(self.black, rows, light.shape[-1])):  # whole rows: their pixels lie together
+            light[:, row::rows].sub_(black).div_(self.white - black)
         return light
 
     def planes(self) -> Tensor:
@@ -289,47 +286,6 @@ class RawCapture:
         if self.flip & 1:
             image = image.flip(-1)
         return image.transpose(-1, -2) if self.flip & 4 else image
-
-
-def filter_tile(letters: str) -> tuple[tuple[tuple[int, ...], ...], str]:
-    """Return the tile of a filter array as indices, and the names of the channels that they are.
-
-    Args:
-        letters: by rows: 4 for a 2x2 tile, 36 for 6x6.
-
-    Convention:
-        As LibRaw: in a 2x2 tile of R, G and B the green of blue's row is a fourth channel.
-
-    Example:
-        >>> filter_tile("GRBG")
-        (((1, 0), (2, 3)), 'RGBG')
-    """
-    side = math.isqrt(len(letters))
-    kinds = "".join(sorted(set(letters)))
-    kinds = "RGB" if kinds == "BGR" else kinds
-    if side not in {2, 6} or side * side != len(letters):
-        raise ValueError(f"a filter array's tile has 4 or 36 letters, got {letters!r}")
-    check_choice("the letters of a filter array, sorted,", kinds, tuple(PATTERN_COLORS))
-    colors = PATTERN_COLORS[kinds] if side == 2 else kinds
-    rows = [letters[i : i + side] for i in range(0, len(letters), side)]
-    tile = tuple(
-        tuple(3 if colors == "RGBG" and c == "G" and "B" in row else colors.index(c) for c in row) for row in rows
-    )
-    return tile, colors
-
-
-def tile_planes(mosaic: Tensor, tile: tuple[int, int]) -> Tensor:
-    """Return a mosaic (C, H, W) taken apart by places of the tile: (C * rows * columns, H // rows, W // columns).
-
-    Example:
-        >>> tile_planes(torch.arange(8).view(1, 2, 4), (2, 2)).tolist()
-        [[[0, 2]], [[1, 3]], [[4, 6]], [[5, 7]]]
-    """
-    rows, columns = tile
-    channels, height, width = mosaic.shape[0], mosaic.shape[1] // rows, mosaic.shape[2] // columns
-    whole = mosaic[:, : height * rows, : width * columns]
-    places = whole.reshape(channels, height, rows, width, columns).permute(0, 2, 4, 1, 3)
-    return places.reshape(channels * rows * columns, height, width)
 
 
 def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:

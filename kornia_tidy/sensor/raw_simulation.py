@@ -13,15 +13,12 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
+from kornia_tidy.sensor.filter_array import tiled
 from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.raw_color import camera_to_srgb
 from kornia_tidy.sensor.raw_file import RawCapture
 
 COLORS = ("camera", "channels")
-XYZ_FROM_LINEAR_SRGB = (
-    (0.4124564, 0.3575761, 0.1804375),
-    (0.2126729, 0.7151522, 0.0721750),
-    (0.0193339, 0.1191920, 0.9503041),
-)
 
 
 def simulate_raw(
@@ -143,9 +140,9 @@ def sensor_counts(
     height, width = light.shape[-2:]
     black = camera.black.to(seen)[:, None, None]
     if camera.pattern is not None:
-        index = _repeated(torch.tensor(camera.pattern, device=seen.device), height, width)
+        index = tiled(torch.tensor(camera.pattern, device=seen.device), height, width)
         seen = seen.gather(1, index.expand(len(seen), 1, -1, -1))
-        black = _repeated(camera.black.to(seen), height, width)
+        black = tiled(camera.black.to(seen), height, width)
     if noise is not None:
         plain = SensorNoise(noise.sigma, full_well=noise.full_well, dark=noise.dark, clip=False)
         seen = plain(seen, generator=generator)
@@ -165,7 +162,7 @@ def _responses(camera: RawCapture, color: str) -> Tensor:
     if camera.camera_to_srgb is not None:
         balanced = camera.camera_to_srgb.double().cpu().pinverse()
     elif camera.xyz_to_camera is not None:
-        balanced = camera.xyz_to_camera.double().cpu() @ torch.tensor(XYZ_FROM_LINEAR_SRGB, dtype=torch.float64)
+        balanced = camera_to_srgb(camera.xyz_to_camera.double().cpu())[0].pinverse()
     else:
         raise ValueError(
             "the camera's colors are unknown, it carries no matrix: choose color='channels', or give it one with "
@@ -177,9 +174,3 @@ def _responses(camera: RawCapture, color: str) -> Tensor:
         return balanced[rows]
     sensitivity = 1 / balance.double().cpu()
     return balanced[rows] * (sensitivity / sensitivity.max())[:, None]
-
-
-def _repeated(tile: Tensor, height: int, width: int) -> Tensor:
-    """A tile (h, w) repeated over an image (1, 1, height, width)."""
-    rows, columns = tile.shape
-    return tile.repeat(-(-height // rows), -(-width // columns))[None, None, :height, :width]

@@ -1,9 +1,11 @@
-"""Names of camera and lens, exposure and black levels from the tags of a raw file, whatever nonsense these hold.
+"""Names, exposure, black levels and colours from the tags of a raw file, whatever nonsense these hold.
 
 LibRaw's Python package does not tell who built the camera, nor a black level that differs between places of a large
-tile. The decoding process runs this file, so it imports nothing but the standard library.
+tile, nor the colour matrix of Kodak's first cameras. The decoding process runs this file, so it imports nothing but the
+standard library.
 
-Source: TIFF 6.0, section 2; Exif 2.32, 4.6; DNG 1.7, BlackLevel; Canon's CRW by P. Harvey's notes on its format.
+Source: TIFF 6.0, section 2; Exif 2.32, 4.6; DNG 1.7, BlackLevel; Canon's CRW by P. Harvey's notes on its format;
+Kodak's matrix by what dcraw takes it for.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
 NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
 TIMES = (0x9003, 0x0132)
 SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL = 0x00FE, 0xC612, 0xC619, 0xC61A
+KODAK_MATRIX = 0x9218
 STORED = ((0x0111, 0x0117), (0x0144, 0x0145))  # where strips and tiles begin, and their lengths
 QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
 CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
@@ -57,6 +60,15 @@ def black_tile(data: bytes) -> list[list[float]] | None:
         levels = directory.get(BLACK_LEVEL, ())
         if max(rows, columns) > 2 and len(levels) == rows * columns and all(map(math.isfinite, levels)):
             return [list(levels[row * columns : (row + 1) * columns]) for row in range(rows)]
+    return None
+
+
+def kodak_matrix(data: bytes) -> list[list[float]] | None:
+    """Return the matrix from camera to RGB of a KDC file, by rows, which stand behind an offset each; None if none."""
+    for directory in tiff_directories(data):
+        values = directory.get(KODAK_MATRIX, ())
+        if len(values) == 12 and not isinstance(values[0], bytes):
+            return [list(values[row + 1 : row + 4]) for row in (0, 4, 8)]
     return None
 
 

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kornia_tidy.sensor.raw_file import RawCapture, tile_planes
+from kornia_tidy.sensor.filter_array import tile_planes
+from kornia_tidy.sensor.raw_file import RawCapture
 
 MOST_LEVELS = 32  # intervals of level, a channel
 FEWEST_BLOCKS = 30  # in an interval, whose variance is then known to 4 %

@@ -14,8 +14,8 @@ import torch
 from kornia_tidy.sensor.dng_file import encode_dng, write_dng
 from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 from tests.base import BaseTester
+from tests.sensor.dng import XTRANS
 
-XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
 MATRIX = torch.tensor([[0.9, -0.3, -0.1], [-0.8, 1.6, 0.3], [-0.3, 0.3, 0.8]])
 
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from scipy.optimize import curve_fit
@@ -122,15 +122,18 @@ class TestPhotonTransfer(BaseTester):
         result = photon_transfer(stack)
         assert result.line.gain == pytest.approx(gain, rel=0.03)
         assert result.line.read_noise == pytest.approx(read_noise, rel=0.03)
+        assert result.read_noise_resolved
         assert result.line.r_squared > 0.99
 
     @settings(max_examples=4, deadline=None)
     @given(gain=st.floats(5, 20), share=st.floats(0.05, 0.3), seed=st.integers(0, 2**32 - 1))
+    @example(gain=5.0, share=0.25, seed=129)  # chance makes it 0.49 ± 0.14 counts
     def test_feature_read_noise_that_rounding_hides_is_said_to_be(self, gain, share, seed):
+        """Of 400 such cameras the value alone exceeds the bound in 5 %, less one error in 0.3 %, less two in none."""
         result = photon_transfer(flats(np.random.default_rng(seed), gain, share * gain))
         assert not result.read_noise_resolved
         assert result.line.gain == pytest.approx(gain, rel=0.03)
-        assert result.line.read_noise < 0.6 * gain
+        assert result.line.read_noise < 0.7 * gain
 
     def test_feature_two_flats_of_uneven_light_are_enough(self):
         rng = np.random.default_rng(0)

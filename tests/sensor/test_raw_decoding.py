@@ -15,6 +15,21 @@ from tests.base import BaseTester
 from tests.sensor.dng import dng
 
 DATA = dng(np.random.default_rng(0).integers(64, 1000, (36, 48)))
+# What decoders said under limits of 60 to 200 MiB: Python, LibRaw, the linker that loads NumPy, and OpenBLAS.
+OUT_OF_MEMORY = (
+    'print(\'{"error": "MemoryError"}\')',
+    'print(\'{"error": "LibRawError", "text": "std::bad_alloc"}\')',
+    'print(\'{"error": "ImportError", "text": "Original error was: libopenblas.so: failed to map segment from '
+    "shared object\"}')",
+    "sys.exit('OpenBLAS error: Memory allocation still failed after 10 retries, giving up.')",
+    "raise MemoryError",
+)
+PEAK = """
+import json, runpy, sys
+runpy.run_path(sys.argv.pop(1), run_name="__main__")
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+sys.stderr.write(status["VmPeak"].split()[0])
+"""
 
 
 class TestDecodeRaw(BaseTester):
@@ -61,7 +76,7 @@ class TestDecodeRaw(BaseTester):
             ("print('{\"shape\": [2, 2, 1]}'); print('1234567', end='')", "gave no complete picture"),
             ("print('{\"shape\": [-1, -4, 1]}'); print('12345678', end='')", "gave no complete picture"),
             ("print('{\"shape\": \"22\"}'); print('12345678', end='')", "gave no complete picture"),
-            ('print(\'{"error": "MemoryError"}\')', "needs more than the 2048 MiB of memory that it may use"),
+            *((program, "needs more than the 2048 MiB of memory that it may use") for program in OUT_OF_MEMORY),
         ],
     )
     def test_exception_whatever_happens_is_one_sentence(self, program, reason, decoder_that):
@@ -82,9 +97,21 @@ class TestDecodeRaw(BaseTester):
 
     @pytest.mark.skipif(sys.platform != "linux", reason="the limit of memory is the system's")
     def test_exception_memory_is_bounded(self):
+        """24 megapixels are 46 MiB of file and as much of counts; Python, NumPy and LibRaw take what they take here."""
+        arguments = [sys.executable, "-I", "-S", "-c", PEAK, str(DECODER), json.dumps(sys.path), "60", str(2**31)]
+        told = subprocess.run(
+            arguments,
+            input=DATA,
+            capture_output=True,
+            check=True,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        )
+        limit = int(told.stderr) * 1024 + 32 * 2**20
+        assert decode_raw(DATA, 60, limit)[1].shape == (1, 36, 48)
         large = dng(np.random.default_rng(0).integers(64, 1000, (4000, 6000), dtype=np.uint16))
-        with pytest.raises(ValueError, match="needs more than the 140 MiB of memory"):
-            decode_raw(large, 60, 140 * 2**20)
+        with pytest.raises(ValueError, match=f"needs more than the {limit / 2**20:.0f} MiB of memory"):
+            decode_raw(large, 60, limit)
+        assert decode_raw(large, 60, limit + 128 * 2**20)[1].shape == (1, 4000, 6000)
 
     @pytest.mark.parametrize(("timeout", "memory_limit"), [(0, 2**31), (60, 0), (float("nan"), 2**31)])
     def test_exception_limits(self, timeout, memory_limit):

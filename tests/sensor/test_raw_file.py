@@ -12,7 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.sensor.raw_file import RawCapture, RawInfo, filter_tile, tile_planes
+from kornia_tidy.sensor.filter_array import filter_tile, tile_planes
+from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 from tests.base import DATA, BaseTester, needs_data
 from tests.sensor.dng import XTRANS, dng
 
@@ -26,7 +27,11 @@ README = {
     "raw/imageio+test_images/Blackmagic.dng": ("RGGB", 512, 65535, 2176, 4128),
     "raw/photoprism+photoprism/canon_eos_6d.dng": (None, 0, 65535, 816, 1224),
     "raw/colinleroy+a2tools/QKTK_IMAGE01.QTK": ("GRBG", 0, 1023, 240, 320),
+    "raw/colinleroy+a2tools/QKTK_IMAGE02.QTK": ("GRBG", 0, 1023, 240, 320),
     "raw/colinleroy+a2tools/QKTK_Image__1.qtk": ("GRBG", 0, 1023, 480, 640),
+    "raw/colinleroy+a2tools/QKTK_Image__2.qtk": ("GRBG", 0, 1023, 480, 640),
+    "raw/colinleroy+a2tools/QKTK_Image__6.qtk": ("GRBG", 0, 1023, 240, 320),
+    "raw/colinleroy+a2tools/QKTK_Mistigri.qtk": ("GRBG", 0, 1023, 240, 320),
     "raw/colinleroy+a2tools/DC50_DC0008L.KDC": ("GRBG", 0, 16383, 512, 768),
     "raw_synthetic/motorcycle_rggb.dng": ("RGGB", 512, 16383, 480, 720),
     "raw_synthetic/motorcycle_bggr.dng": ("BGGR", 512, 16383, 480, 720),
@@ -99,6 +104,11 @@ class TestOpenReal(BaseTester):
             level = levels[colors[row][column]]
             exact = (expected - np.float64(level)) / (white - level)
             np.testing.assert_allclose(light[place].numpy(), exact, rtol=0, atol=1e-7)
+
+    def test_smoke_every_file_is_either_read_or_refused_here(self):
+        files = {p.relative_to(DATA) for folder in ("raw", "raw_synthetic") for p in (DATA / folder).rglob("*.*")}
+        read = {str(path) for path in files if path.parent.name not in REFUSED and (DATA / path).is_file()}
+        assert read == set(README)
 
     @pytest.mark.parametrize("name", sorted(str(p) for f in REFUSED for p in (DATA / "raw" / f).glob("*")))
     def test_exception_refuses_with_one_sentence(self, name):

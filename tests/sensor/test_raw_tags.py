@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.sensor.raw_tags import black_tile, camera_tags, missing_bytes, tiff_directories
+from kornia_tidy.sensor.raw_tags import black_tile, camera_tags, kodak_matrix, missing_bytes, tiff_directories
 from tests.base import DATA, BaseTester, needs_data
-from tests.sensor.dng import LONG, SHORT, dng
+from tests.sensor.dng import LONG, SHORT, SRATIONAL, dng
 
 COUNTS = np.random.default_rng(0).integers(64, 1000, (36, 48))
 
@@ -62,6 +62,7 @@ class TestCameraTags(BaseTester):
         assert set(found) <= {"make", "model", "lens", "iso", "exposure", "aperture", "focal_length", "timestamp"}
         assert missing_bytes(start + data) >= 0
         black_tile(start + data)
+        kodak_matrix(start + data)
 
     @given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), max_size=30))
     @settings(max_examples=200, deadline=None)
@@ -71,6 +72,7 @@ class TestCameraTags(BaseTester):
             data[place] = value
         camera_tags(bytes(data))
         black_tile(bytes(data))
+        kodak_matrix(bytes(data))
         assert missing_bytes(bytes(data)) >= 0
 
     def test_feature_directories_that_name_each_other_are_read_once(self):
@@ -98,3 +100,13 @@ class TestLevelsAndLengths(BaseTester):
         assert missing_bytes(data) == 0
         assert missing_bytes(data[:-100]) == 100
         assert missing_bytes(dng(COUNTS, extra={254: (SHORT, [1])})[:-100]) == 0  # a preview may lie anywhere
+
+    def test_feature_matrix_of_kodaks_first_cameras(self):
+        values = [0, 1.5, -0.25, -0.25, 0, -0.5, 2, -0.5, 0, 0, -1, 2]
+        assert kodak_matrix(dng(COUNTS)) is None
+        assert kodak_matrix(dng(COUNTS, extra={0x9218: (SRATIONAL, values[:9])})) is None
+        assert kodak_matrix(dng(COUNTS, extra={0x9218: (SRATIONAL, values)})) == [
+            [1.5, -0.25, -0.25],
+            [-0.5, 2, -0.5],
+            [0, -1, 2],
+        ]

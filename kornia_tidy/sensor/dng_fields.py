@@ -1,0 +1,108 @@
+"""DNG files by their fields: samples of 16 bits, uncompressed in one strip."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+
+Field = tuple[int, int, Sequence[float] | bytes]  # tag, type, values
+
+BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10  # types of TIFF 6.0
+CODES = {BYTE: "B", SHORT: "H", LONG: "I"}
+COLOR_CODES = "RGBCMYW"  # a letter's place is its code in CFAPattern and CFAPlaneColor
+FILTER_ARRAY, LINEAR_RAW = 32803, 34892  # photometric interpretations
+D65 = 21  # EXIF's light source
+DATA_ALIGNMENT = 16
+DENOMINATOR = 1_000_000  # largest of a rational number
+
+
+def dng_bytes(
+    samples: np.ndarray,
+    letters: str | None,
+    colors: str,
+    white: int,
+    fields: Sequence[Field] = (),
+    exif: Sequence[Field] = (),
+) -> bytes:
+    """Return a DNG file.
+
+    Args:
+        samples: (H, W, C) uint16.
+        letters: of the filter array's tile, 4 or 36, by rows; None without one.
+        colors: the letters in the order in which a reader shall name them.
+        white: saturation count.
+        fields: what else there is to say, and
+        exif: the same, of the Exif directory.
+
+    Source: Adobe, Digital Negative Specification 1.4; TIFF 6.0 for the container.
+    """
+    height, width, channels = samples.shape
+    samples = np.ascontiguousarray(samples, dtype="<u2")
+    all_fields: list[Field] = [
+        (254, LONG, [0]),  # the full picture
+        (256, LONG, [width]),
+        (257, LONG, [height]),
+        (258, SHORT, [16] * channels),
+        (259, SHORT, [1]),  # not compressed
+        (262, SHORT, [LINEAR_RAW if letters is None else FILTER_ARRAY]),
+        (277, SHORT, [channels]),
+        (278, LONG, [height]),  # one strip
+        (279, LONG, [samples.nbytes]),
+        (284, SHORT, [1]),  # channels of a pixel together
+        (50706, BYTE, [1, 4, 0, 0]),  # DNG version, and that which a reader needs
+        (50707, BYTE, [1, 1, 0, 0]),
+        (50717, LONG, [white] * channels),
+        *fields,
+    ]
+    if letters is not None:
+        side = round(len(letters) ** 0.5)
+        all_fields += [
+            (33421, SHORT, [side, side]),
+            (33422, BYTE, [COLOR_CODES.index(letter) for letter in letters]),
+            (50710, BYTE, [COLOR_CODES.index(letter) for letter in colors]),
+            (50711, SHORT, [1]),  # pixels in rows and columns
+        ]
+    return b"".join(_tiff(all_fields, exif, samples.data.cast("B")))
+
+
+def _tiff(fields: list[Field], exif: Sequence[Field], data: memoryview) -> tuple[bytes, memoryview]:
+    """A little-endian TIFF: header, directory and Exif directory, and the data of its one strip behind them."""
+    begin = 8
+    if exif:
+        fields = [*fields, (34665, LONG, [0])]
+    fields = [*fields, (273, LONG, [0])]
+    table = _directory(fields, begin)  # once for its size
+    nested = _directory(exif, begin + len(table)) if exif else b""
+    strip = -(-(begin + len(table) + len(nested)) // DATA_ALIGNMENT) * DATA_ALIGNMENT
+    places = {34665: begin + len(table), 273: strip}
+    fields = [(tag, kind, [places[tag]] if tag in places else values) for tag, kind, values in fields]
+    head = struct.pack("<2sHI", b"II", 42, begin) + _directory(fields, begin) + nested
+    return head.ljust(strip, b"\0"), data
+
+
+def _directory(fields: Sequence[Field], begin: int) -> bytes:
+    """A directory that starts at a place in the file, and behind it the values longer than four bytes."""
+    entries, longer = b"", b""
+    outside = begin + 2 + 12 * len(fields) + 4
+    for tag, kind, values in sorted(fields, key=lambda field: field[0]):
+        count, content = _packed(kind, values)
+        if len(content) > 4:
+            place = struct.pack("<I", outside + len(longer))
+            longer += content + b"\0" * (len(content) % 2)
+            content = place
+        entries += struct.pack("<HHI", tag, kind, count) + content.ljust(4, b"\0")
+    return struct.pack("<H", len(fields)) + entries + struct.pack("<I", 0) + longer
+
+
+def _packed(kind: int, values: Sequence[float] | bytes) -> tuple[int, bytes]:
+    """How many values there are, and their bytes."""
+    if isinstance(values, bytes):
+        return len(values) + 1, values + b"\0"
+    if kind in CODES:
+        return len(values), struct.pack(f"<{len(values)}{CODES[kind]}", *(int(value) for value in values))
+    parts = [Fraction(value).limit_denominator(DENOMINATOR) for value in values]
+    code = "I" if kind == RATIONAL else "i"
+    return len(parts), b"".join(struct.pack(f"<2{code}", part.numerator, part.denominator) for part in parts)

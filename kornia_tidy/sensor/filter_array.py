@@ -1,0 +1,68 @@
+"""Filter arrays: the tile of colours that repeats over a sensor."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+
+Tile = tuple[tuple[int, ...], ...]  # index of a channel at each place, by rows
+
+PATTERN_COLORS = {"RGB": "RGBG", "CGMY": "GMCY"}  # LibRaw's order of the channels, by the letters of a filter array
+
+
+def filter_tile(letters: str) -> tuple[Tile, str]:
+    """Return the tile of a filter array as indices, and the names of the channels that they are.
+
+    Args:
+        letters: by rows: 4 for a 2x2 tile, 36 for 6x6.
+
+    Convention:
+        As LibRaw: in a 2x2 tile of R, G and B the green of blue's row is a fourth channel.
+
+    Example:
+        >>> filter_tile("GRBG")
+        (((1, 0), (2, 3)), 'RGBG')
+    """
+    side = math.isqrt(len(letters))
+    kinds = "".join(sorted(set(letters)))
+    kinds = "RGB" if kinds == "BGR" else kinds
+    if side not in {2, 6} or side * side != len(letters):
+        raise ValueError(f"a filter array's tile has 4 or 36 letters, got {letters!r}")
+    check_choice("the letters of a filter array, sorted,", kinds, tuple(PATTERN_COLORS))
+    colors = PATTERN_COLORS[kinds] if side == 2 else kinds
+    rows = [letters[i : i + side] for i in range(0, len(letters), side)]
+    tile = tuple(
+        tuple(3 if colors == "RGBG" and c == "G" and "B" in row else colors.index(c) for c in row) for row in rows
+    )
+    return tile, colors
+
+
+def tile_planes(mosaic: Tensor, tile: tuple[int, int]) -> Tensor:
+    """Return a mosaic (C, H, W) taken apart by places of the tile: (C * rows * columns, H // rows, W // columns).
+
+    Example:
+        >>> import torch
+        >>> tile_planes(torch.arange(8).view(1, 2, 4), (2, 2)).tolist()
+        [[[0, 2]], [[1, 3]], [[4, 6]], [[5, 7]]]
+    """
+    rows, columns = tile
+    channels, height, width = mosaic.shape[0], mosaic.shape[1] // rows, mosaic.shape[2] // columns
+    whole = mosaic[:, : height * rows, : width * columns]
+    places = whole.reshape(channels, height, rows, width, columns).permute(0, 2, 4, 1, 3)
+    return places.reshape(channels * rows * columns, height, width)
+
+
+def tiled(tile: Tensor, height: int, width: int) -> Tensor:
+    """Return what repeats after (rows, columns) over (height, width) pixels.
+
+    Example:
+        >>> import torch
+        >>> tiled(torch.tensor([[0, 1], [3, 2]]), 2, 5)
+        tensor([[0, 1, 0, 1, 0],
+                [3, 2, 3, 2, 3]])
+    """
+    rows, columns = tile.shape
+    return tile.repeat(-(-height // rows), -(-width // columns))[:height, :width]
