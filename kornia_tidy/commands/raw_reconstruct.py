@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -166,7 +167,8 @@ def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[T
         return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}
     raw: RawCapture = open_raw(path, args)
     light = raw.to_rgb(encoded=False, upright=False)
-    return light, raw.upright, vars(raw.info)
+    bare = replace(raw, counts=torch.empty(0))  # which way it is turned, and not the counts
+    return light, bare.upright, vars(raw.info)
 
 
 def write_results(
