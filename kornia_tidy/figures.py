@@ -151,10 +151,8 @@ def depth_at(defocus: float, camera: ThinLensCamera) -> float:
         >>> round(depth_at(0.0, ThinLensCamera()), 3)
         0.595
     """
-    lo, hi = camera.defocus_range
-    near, far = (1 / d for d in camera.depth_range)
-    inverse = far + (defocus - lo) / (hi - lo) * (near - far)
-    return 1 / inverse if inverse > 1e-9 else math.inf
+    depth = float(camera.depth(torch.tensor(defocus, dtype=torch.float64)))
+    return depth if depth < 1e9 else math.inf
 
 
 # ---------------------------------------------------------------------- the four parts, from left to right

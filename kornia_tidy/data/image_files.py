@@ -80,12 +80,19 @@ def write_image(
         ValueError: if its shape, a value (NaN, infinity), the bits or the suffix is not as above.
         FileNotFoundError: if the folder does not exist.
     """
-    suffix = Path(path).suffix.lower()
+    write_bytes(path, with_exif(encode_image(image, Path(path).suffix.lower(), bits), info or {}))
+
+
+def encode_image(image: Tensor, suffix: str = ".png", bits: int = 8) -> bytes:
+    """Return the bytes of the file that :func:`write_image` writes under a name with this suffix.
+
+    Example:
+        >>> encode_image(torch.rand(3, 4, 6), bits=16)[1:4]
+        b'PNG'
+    """
     check_choice("the suffix of an image file", suffix, SUFFIXES)
     check_choice(f"bits of a {suffix} file", bits, (8,) if suffix in {".jpg", ".jpeg"} else (8, 16))
     done, encoded = cv2.imencode(suffix, to_opencv(image, np.uint8 if bits == 8 else np.uint16))
     if not done:
-        raise ValueError(
-            f"cannot write {path}: OpenCV cannot encode an image of shape {tuple(image.shape)} as {suffix}"
-        )
-    write_bytes(path, with_exif(encoded.tobytes(), info or {}))
+        raise ValueError(f"OpenCV cannot encode an image of shape {tuple(image.shape)} as {suffix}")
+    return encoded.tobytes()

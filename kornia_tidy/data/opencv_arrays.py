@@ -76,6 +76,6 @@ def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
     most = 2 ** (8 * picture.itemsize) - 1
     for row in range(0, height, _ROWS):
         band = image[:, row : row + _ROWS].detach().cpu().double()
-        values = band.clamp_(0, 1).mul_(most).round_().numpy()
+        values = band.clamp(0, 1).mul_(most).round_().numpy()
         picture[row : row + _ROWS] = values[::-1].transpose(1, 2, 0)
     return picture if channels == 3 else picture[..., 0]

@@ -14,7 +14,7 @@ from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.reconstruction.tiled import reconstruct_tiled
-from kornia_tidy.training.tasks import MAPS, depth_of_nearness, split_maps
+from kornia_tidy.training.tasks import MAPS, metres, split_maps
 from kornia_tidy.training.trained import TrainedSystem
 
 
@@ -93,7 +93,7 @@ def reconstruct_light(
     image, near = named.get("image"), named.get("depth")
     if image is not None:
         image.clamp_(0, 1)
-    return Reconstruction(image, None if near is None else depth_of_nearness(head.camera, near))
+    return Reconstruction(image, None if near is None else metres(head.camera, near))
 
 
 def reconstruct_opencv(

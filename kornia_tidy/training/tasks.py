@@ -8,11 +8,15 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
+from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
 
 MAPS = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}  # and their channels, in order
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 """From prediction (B, C, H, W), target (B, C, H, W) and validity, bool (B, 1, H, W) or None, to a scalar."""
+
+# The paper's, Ikoma's of depth, and PhaseCam3D's of depth; each for every map of a task.
+LOSSES: dict[str, Loss] = {"mse": mse_loss, "l1": l1_loss, "phasecam3d": phasecam3d_loss}
 
 
 def channels_of(task: str) -> int:
@@ -56,57 +60,39 @@ def nearness(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
     return ((camera.defocus(depth, check_inputs=False) - lo) / (hi - lo)).clamp(0, 1)
 
 
-def depth_of_nearness(camera: ThinLensCamera, near: Tensor) -> Tensor:
-    r"""Return the depth that a nearness means, :func:`nearness` undone.
-
-    .. math:: z = 1 / \left( \frac{1}{z_{far}} + n \left( \frac{1}{z_{near}} - \frac{1}{z_{far}} \right) \right)
+def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
+    """Return the depth of what networks learn, the inverse of :func:`nearness`.
 
     Args:
-        camera: what turns depth into defocus.
-        near: any shape; values outside [0, 1] count as its ends.
+        camera: as for :func:`nearness`, one that knows metres.
+        nearness: any shape; beyond [0, 1] it is taken as the end of it.
 
     Returns:
-        Metres, same shape: the ends of the camera's range at 0 and 1; infinite at 0 if its far end is.
+        Same shape, metres from the near to the far end of the camera's range, which may be infinite.
 
     Example:
         >>> import torch
-        >>> depth_of_nearness(ThinLensCamera(), torch.tensor([1.0, 0.5, 0.0]))
+        >>> metres(ThinLensCamera(), torch.tensor([1.0, 0.5, 0.0]))
         tensor([0.2975, 0.5950,    inf])
     """
-    closest, farthest = (1 / end for end in camera.depth_range)
-    return near.clamp(0, 1).mul_(closest - farthest).add_(farthest).reciprocal_()
-
-
-def mean_square(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the mean squared error over all valid samples of the batch, the paper's loss.
-
-    Example:
-        >>> import torch
-        >>> mean_square(torch.zeros(1, 1, 1, 2), torch.tensor([2.0, 5.0]).view(1, 1, 1, 2))
-        tensor(14.5000)
-    """
-    if mask is None:
-        return (prediction - target).square().mean()
-    mask = mask.expand_as(target)
-    error = (prediction - target.where(mask, prediction.detach())).where(mask, 0)
-    return error.square().sum() / mask.sum().clamp(min=1)
+    lo, hi = camera.defocus_range
+    return camera.depth(lo + (hi - lo) * nearness.clamp(0, 1))
 
 
 def task_loss(
     loss: Loss, estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor], mask: Tensor, weights: Mapping[str, float]
 ) -> Tensor:
-    """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known."""
-    terms = [weights[name] * loss(estimate[name], truth[name], mask if name == "depth" else None) for name in estimate]
+    """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known.
+
+    A batch whose depth is nowhere known, as a crop may lie in a hole, teaches nothing about depth: that term is zero.
+    """
+    terms = []
+    for name, maps in estimate.items():
+        if name == "depth" and not bool(mask.any()):
+            terms.append(0 * maps.sum())
+        else:
+            terms.append(weights[name] * loss(maps, truth[name], mask if name == "depth" else None))
     return sum(terms[1:], terms[0])
-
-
-def image_rmse(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the root mean squared error of each image, (B,), over its valid pixels; NaN if it has none."""
-    if mask is None:
-        return (prediction - target).square().mean((1, 2, 3)).sqrt()
-    mask = mask.expand_as(target)
-    squares = (prediction - target).square().where(mask, 0).sum((1, 2, 3))
-    return (squares / mask.sum((1, 2, 3))).sqrt()
 
 
 def centre_crop(tensor: Tensor, height: int, width: int) -> Tensor:
