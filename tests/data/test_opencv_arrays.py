@@ -28,10 +28,10 @@ class TestOpenCVArrays(BaseTester):
     def test_property_there_and_back_is_the_same(self, picture):
         assert np.array_equal(to_opencv(from_opencv(picture), picture.dtype), picture)
 
-    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-    def test_feature_agrees_with_files(self, tmp_path, dtype):
+    @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+    def test_feature_agrees_with_files(self, tmp_path, kind):
         """More rows than are converted at a time."""
-        picture = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (300, 20, 3), dtype)
+        picture = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (300, 20, 3), kind, endpoint=True)
         cv2.imwrite(str(tmp_path / "a.png"), picture)
         image = from_opencv(picture)
         assert torch.equal(image, read_image(tmp_path / "a.png"))
