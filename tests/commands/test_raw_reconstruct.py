@@ -110,7 +110,9 @@ class TestRawReconstruct(BaseTester):
         lines = [line.split(maxsplit=1) for line in out.splitlines()[1:-1]]
         assert [file for file, _ in lines] == ["file", files[0], *bad, *files[1:]]  # the table, in the order asked for
         assert [said.endswith("done") for _, said in lines[1:]] == [True, False, False, False, True, True]
-        for (_, said), reason in zip(lines[2:5], ("not an image", "it is cut short", "there is no such file"), strict=True):
+        for (_, said), reason in zip(
+            lines[2:5], ("not an image", "it is cut short", "there is no such file"), strict=True
+        ):
             assert reason in said
             assert reason in err
         assert "3 of 6 files failed" in err
