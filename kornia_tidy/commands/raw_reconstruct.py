@@ -57,11 +57,14 @@ the sensor, as the lens's PSFs lie there, with square pixels. Then the encoding 
 the network was trained with (sRGB's unless --color-space was linear or paper). What
 comes out is turned upright.
 
+Memory: --memory for the tiles, about 40 bytes a pixel of each file at work, and 0.4 GiB
+for the program; in all 1.8 GiB for a file of 24 megapixels.
+
 examples:
   All files of a folder; if interrupted, go on with --resume:
     kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o sharp --resume
 
-  A network of one's own, two files at a time, one read and written while the other is computed:
+  A network of one's own; of two files, one is read and written while the other is computed:
     kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths --jobs 2
 
 Exit status 2 if any file failed; the others are reconstructed all the same.

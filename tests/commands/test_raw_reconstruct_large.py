@@ -1,4 +1,4 @@
-"""`raw reconstruct` of a 24-megapixel raw file with the network that comes with the library: memory, progress, seams."""
+"""`raw reconstruct` of a 24-megapixel raw file with a network of the library's own: memory, progress, seams."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class TestLargeCapture(BaseTester):
     def test_feature_24_megapixels_take_two_gibibytes_and_show_no_seam(self, capture):
         """On two threads. A strip from end to end crosses every cut of the tiles, wherever these are."""
         command = [sys.executable, "-m", "kornia_tidy.cli", "raw", "reconstruct", str(capture), "--head", "edof-5"]
-        threads = {name: "2" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2")
         with subprocess.Popen(
             [*command, "-o", str(capture.parent)], env={**os.environ, **threads}, stderr=subprocess.PIPE, text=True
         ) as process:
