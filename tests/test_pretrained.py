@@ -35,7 +35,8 @@ class TestPretrained(BaseTester):
         scenes = DeadLeaves(4, 128, 128, depth_range=system.optics.camera.depth_range, seed=31)
         scores = mean_row(evaluate(system, scenes, each=note))
         told = about_pretrained()["systems"][name]["scores"]["dead leaves"]
-        assert scores["image_psnr"] > float(torch.stack(captures).mean()) + 1
+        gain = told["image_psnr"] - told["capture_psnr"]
+        assert scores["image_psnr"] > float(torch.stack(captures).mean()) + gain / 2
         assert abs(scores["image_psnr"] - told["image_psnr"]) < 2.5
         if "depth_rmse" in told:
             assert scores["depth_rmse"] < told["depth_rmse"] + 0.1

@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from io import SEEK_END
 from pathlib import Path
-from signal import SIGXCPU, Signals
+from signal import Signals
 from tempfile import TemporaryFile
 from typing import IO, Any, BinaryIO
 
@@ -157,10 +157,10 @@ def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) 
 
 def _complaint(status: int, printed: str) -> str | None:
     """Return what an exit status means; None if all went well."""
-    if status == -SIGXCPU:
-        return "decoding it took more processor time than it may use"
     if status < 0:
-        return f"LibRaw crashed on it ({Signals(-status).name})"
+        name = Signals(-status).name
+        slow = "decoding it took more processor time than it may use"
+        return slow if name == "SIGXCPU" else f"LibRaw crashed on it ({name})"
     return f"its decoder failed ({' '.join(printed.split())[-200:]})" if status else None
 
 

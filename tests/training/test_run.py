@@ -45,7 +45,7 @@ class TestTrain(BaseTester):
         assert list((tmp_path / "tensorboard").glob("events.*"))
 
     def test_feature_learning_lowers_the_loss(self, tmp_path):
-        train(SETTINGS.replace(epochs=12, augment=False, ema=0.0), tmp_path)
+        train(SETTINGS.replace(size=64, validation_scenes=2, epochs=12, augment=False, ema=0.0), tmp_path)
         losses = [float(row["val_loss"]) for row in rows(tmp_path / "validation.csv")]
         assert losses[-1] < 0.8 * losses[0]
 
