@@ -1,0 +1,275 @@
+"""`raw reconstruct`: a batch survives a bad file, an interrupt and a second start, and writes what it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy.cli import main
+from kornia_tidy.commands import raw_reconstruct
+from kornia_tidy.data import read_depth, read_image
+from kornia_tidy.pretrained import load_pretrained
+from kornia_tidy.sensor.dng_file import encode_dng
+from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.sensor.raw_simulation import simulate_raw
+from kornia_tidy.training.light_head import LightHead, reconstruct_light
+from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.state_file import write_state
+from kornia_tidy.training.trained import load_trained
+from tests.base import DATA, BaseTester, needs_data
+
+FILES = 8  # in the batch that gets a signal
+ENDS = [".png", ".jpg", "_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png", ".json"]
+
+
+def checkpoint(path, seed=0, **settings):
+    torch.manual_seed(seed)
+    training = TidyTraining.from_settings(TrainingSettings(masks=1, window=23, ema=0, width=4, **settings))
+    write_state(path, {"settings": training.settings.as_dict(), "state_dict": training.state_dict(), "global_step": 3})
+    return str(path)
+
+
+def capture(path, seed=0, size=(90, 110)):
+    picture = np.random.default_rng(seed).integers(0, 65535, (*size, 3), np.uint16)
+    cv2.imwrite(str(path), cv2.GaussianBlur(picture, (0, 0), 3))
+    return str(path)
+
+
+def raw_file(size=(60, 80), seed=0):
+    """A DNG of a camera whose colours are those of sRGB."""
+    light = torch.rand(3, *size, generator=torch.Generator().manual_seed(seed))
+    camera = RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095)
+    return encode_dng(simulate_raw(light, replace(camera, camera_to_srgb=torch.eye(3))))
+
+
+@pytest.fixture
+def batch(tmp_path):
+    files = [capture(tmp_path / f"{name}.png", seed) for seed, name in enumerate("abc")]
+    return files, checkpoint(tmp_path / "joint.safetensors", task="joint"), tmp_path / "out"
+
+
+def reconstruct(files, weights, folder, *options):
+    return main(["raw", "reconstruct", *files, "--head", weights, "-o", str(folder), *options])
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+class TestRawReconstruct(BaseTester):
+    def test_smoke_all_results_are_there(self, batch, capsys):
+        files, weights, folder = batch
+        assert reconstruct(files, weights, folder) == 0
+        assert sorted(contents(folder)) == sorted(f"{name}{end}" for name in "abc" for end in ENDS)
+        out = capsys.readouterr().out
+        assert out.count("110 x 90") == 3
+        assert "3 of 3 in" in out
+
+    def test_feature_files_hold_what_the_library_computes(self, batch):
+        files, weights, folder = batch
+        assert reconstruct(files[:1], weights, folder, "--linear") == 0
+        head = LightHead(load_trained(weights))
+        image, depth = reconstruct_light(head, read_image(files[0]))
+        assert (read_image(folder / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-7
+        assert (read_image(folder / "a.jpg") - image).abs().mean() < 0.02
+        exact = np.load(folder / "a_depth.npy")
+        assert np.array_equal(exact, depth[0].numpy())
+        self.assert_close(read_depth(folder / "a_depth.pfm").depth, depth)
+        units = cv2.imread(str(folder / "a_depth.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(units, np.clip(np.rint(exact.astype(float) / 0.001), 1, 65535))
+        record = json.loads((folder / "a.json").read_text())
+        assert record["size"] == [110, 90]
+        assert record["depth_png"] == "metres = value * 0.001; 65535 is 65.535 m or farther"
+
+    def test_feature_an_image_task_has_no_depth(self, tmp_path):
+        weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
+        assert reconstruct([capture(tmp_path / "a.png")], weights, tmp_path / "out", "--format", "tiff") == 0
+        assert sorted(contents(tmp_path / "out")) == ["a.jpg", "a.json", "a.tif"]
+
+    @pytest.mark.parametrize("jobs", ["1", "3"])
+    def test_feature_a_bad_file_does_not_stop_the_rest(self, batch, jobs, capsys):
+        files, weights, folder = batch
+        bad = [str(folder.parent / name) for name in ("bad.png", "cut.dng", "missing.png")]
+        for path, start in zip(bad[:2], (b"no picture", raw_file()[:5000]), strict=True):
+            Path(path).write_bytes(start)
+        assert reconstruct([files[0], *bad, *files[1:]], weights, folder, "--jobs", jobs) == 2
+        out, err = capsys.readouterr()
+        assert {path.stem for path in folder.glob("*.json")} == {"a", "b", "c"}
+        lines = [line.split(maxsplit=1) for line in out.splitlines()[1:-1]]
+        assert [file for file, _ in lines] == ["file", files[0], *bad, *files[1:]]  # the table, in the order asked for
+        assert [said.endswith("done") for _, said in lines[1:]] == [True, False, False, False, True, True]
+        reasons = ("not an image", "it is cut short", "there is no such file")
+        for (_, said), reason in zip(lines[2:5], reasons, strict=True):
+            assert reason in said
+            assert reason in err
+        assert "3 of 6 files failed" in err
+        assert "Traceback" not in err
+
+    def test_feature_not_even_a_mistake_of_ours_stops_the_rest(self, batch, monkeypatch, capsys):
+        files, weights, folder = batch
+
+        def read(path, args):
+            if path == files[1]:
+                raise RuntimeError("out of memory\nallocated 5 of 4 GiB")
+            return read_light(path, args)
+
+        read_light = raw_reconstruct.read_light
+        monkeypatch.setattr(raw_reconstruct, "read_light", read)
+        assert reconstruct(files, weights, folder) == 2
+        assert "out of memory allocated 5 of 4 GiB\n" in capsys.readouterr().out
+        assert {path.stem for path in folder.glob("*.json")} == {"a", "c"}
+
+    def test_feature_jobs_do_not_change_results(self, batch):
+        files, weights, folder = batch
+        assert reconstruct(files, weights, folder, "--jobs", "3", "--memory", "30") == 0
+        assert reconstruct(files, weights, folder.with_name("alone"), "--memory", "10") == 0
+        assert contents(folder) == contents(folder.with_name("alone"))
+
+    def test_feature_interrupted_and_resumed_is_as_if_nothing_had_been(self, batch, monkeypatch, capsys):
+        files, weights, folder = batch
+        assert reconstruct(files, weights, folder.with_name("whole")) == 0
+
+        def interrupting(path, data):
+            if path.name == "b_depth_colors.png":  # all of the first file's results, and some of the second's
+                raise KeyboardInterrupt
+            write(path, data)
+
+        write = raw_reconstruct.write_bytes
+        monkeypatch.setattr(raw_reconstruct, "write_bytes", interrupting)
+        assert reconstruct(files, weights, folder) == 130
+        assert (folder / "a.json").exists()
+        assert (folder / "b.png").exists()
+        assert not (folder / "b.json").exists()
+        assert not list(folder.glob(".*"))
+        assert "interrupted" in capsys.readouterr().err
+        monkeypatch.undo()
+        before = (folder / "a.png").stat().st_mtime_ns
+        (folder / f".{32 * 'a'}.tmp").write_bytes(b"what somebody killed was writing")
+        assert reconstruct(files, weights, folder, "--resume") == 0
+        assert (folder / "a.png").stat().st_mtime_ns == before
+        assert "kept" in capsys.readouterr().out
+        assert contents(folder) == contents(folder.with_name("whole"))
+
+    @pytest.mark.parametrize("change", ["checkpoint", "file", "option", "missing", "record", "none"])
+    def test_feature_resume_keeps_only_what_is_still_right(self, batch, change, capsys):
+        files, weights, folder = batch
+        assert reconstruct(files[:1], weights, folder) == 0
+        options = ["--resume"]
+        if change == "checkpoint":
+            checkpoint(weights, seed=1, task="joint")
+        elif change == "file":
+            capture(files[0], seed=9)
+        elif change == "option":
+            options += ["--depth-unit", "0.002"]
+        elif change == "missing":
+            (folder / "a_depth.pfm").unlink()
+        elif change == "record":
+            (folder / "a.json").write_text("{")
+        capsys.readouterr()
+        assert reconstruct(files[:1], weights, folder, *options) == 0
+        assert ("kept" in capsys.readouterr().out) == (change == "none")
+        assert (folder / "a_depth.pfm").exists()
+
+    def test_feature_a_network_that_comes_with_the_library_needs_no_checkpoint(self, tmp_path, capsys):
+        (tmp_path / "a.dng").write_bytes(raw_file())
+        assert reconstruct([str(tmp_path / "a.dng")], "edof-0", tmp_path) == 0
+        assert json.loads((tmp_path / "a.json").read_text())["head"] == "edof-0"
+        light = RawCapture.open(tmp_path / "a.dng").to_rgb(encoded=False, upright=False)
+        image, _ = reconstruct_light(LightHead(load_pretrained("edof-0")), light)
+        assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-6
+        with pytest.raises(SystemExit):
+            main(["raw", "reconstruct", "--help"])
+        assert "--head HEAD edof-5, edof-1, edof-0, or a checkpoint" in " ".join(capsys.readouterr().out.split())
+
+    def test_feature_dumps_are_developed_linearly(self, tmp_path):
+        """A grey mosaic of 25 % light: what the network sees is 0.25 in all three colours, but for one dead pixel."""
+        counts = np.full((64, 80), 64 + 240, "<u2")
+        counts[0, 0] = 64
+        counts.tofile(tmp_path / "a.raw")
+        options = ["--size", "80x64", "--pattern", "GRBG", "--black", "64", "--white", "1024"]
+        args = raw_reconstruct.argparse.Namespace(
+            size=(64, 80), pattern="GRBG", black=[64.0], white=1024.0, dtype=None, byte_order=None, linear=False
+        )
+        light, _, _ = raw_reconstruct.read_light(str(tmp_path / "a.raw"), args)
+        assert light.shape == (3, 64, 80)
+        self.assert_close(light[:, 8:], torch.full((3, 56, 80), 0.25), atol=1e-3)
+        weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
+        assert reconstruct([str(tmp_path / "a.raw")], weights, tmp_path / "out", *options) == 0
+
+    @needs_data
+    def test_feature_a_raw_file_keeps_camera_and_exposure(self, tmp_path):
+        image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")
+        weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
+        files = [str(DATA / "raw" / "colinleroy+a2tools" / "QKTK_IMAGE01.QTK")]
+        assert reconstruct(files, weights, tmp_path / "out") == 0
+        for suffix in (".png", ".jpg"):
+            with image.open(tmp_path / "out" / f"QKTK_IMAGE01{suffix}") as picture:
+                assert picture.getexif()[0x010F] == "Apple"
+
+    def test_exception_is_one_sentence_before_any_work(self, batch, capsys):
+        files, weights, folder = batch
+        (folder.parent / "sub").mkdir()
+        twin = capture(folder.parent / "sub" / "a.png")
+        for words, sentence in (
+            ([[*files, twin], weights, folder], "would both become"),
+            ([files, weights, folder.parent], "it is an input"),
+            ([files, files[0], folder], "is no checkpoint of kornia_tidy"),
+            ([files, "edof-7", folder], "--head is edof-5, edof-1, edof-0, or a checkpoint: there is no file edof-7"),
+            ([files, weights, folder, "--memory", "1"], "the smallest tile of this head"),
+        ):
+            assert reconstruct(*words) == 2
+            assert sentence in capsys.readouterr().err
+        with pytest.raises(SystemExit):
+            reconstruct(files, weights, folder, "--jobs", "0")
+        assert not folder.exists() or not list(folder.iterdir())
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGKILL])
+    def test_feature_a_signal_leaves_whole_files_only(self, tmp_path, signum):
+        """In processes of their own, all of which get it, as by Ctrl-C, once the first file is done."""
+        files = [tmp_path / f"{i}.dng" for i in range(FILES)]
+        for i, path in enumerate(files):
+            path.write_bytes(raw_file((300, 400), i))
+        folder = tmp_path / "out"
+        command = [sys.executable, "-m", "kornia_tidy.cli", "raw", "reconstruct", *map(str, files), "--head"]
+        command += [checkpoint(tmp_path / "joint.safetensors", task="joint"), "-o", str(folder), "--jobs", "2"]
+        process = subprocess.Popen(
+            [*command, "--resume"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
+        )
+        deadline = time.monotonic() + 120
+        while not list(folder.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        os.killpg(process.pid, signum)
+        _, err = process.communicate(timeout=60)
+        assert "Traceback" not in err
+        if signum == signal.SIGINT:
+            assert process.returncode == 130, err
+            assert err.endswith("kornia-tidy: interrupted\n")
+            assert not list(folder.glob(".*"))
+        else:
+            assert process.returncode == -signal.SIGKILL
+        finished = {path.stem for path in folder.glob("*.json")}
+        assert 0 < len(finished) < FILES
+        for path in folder.glob("[!.]*"):
+            if path.suffix in {".png", ".jpg"} and "colors" not in path.name:
+                assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape[:2] == (300, 400)
+        for stem in finished:
+            assert all((folder / f"{stem}{end}").stat().st_size for end in ENDS)
+        kept = {stem: (folder / f"{stem}.png").stat().st_mtime_ns for stem in finished}
+        again = subprocess.run([*command, "--resume"], check=False, capture_output=True, timeout=250, text=True)
+        assert again.returncode == 0, again.stderr
+        assert again.stdout.count("kept") == len(finished)
+        assert sorted(contents(folder)) == sorted(f"{i}{end}" for i in range(FILES) for end in ENDS)
+        assert all((folder / f"{stem}.png").stat().st_mtime_ns == then for stem, then in kept.items())

@@ -1,0 +1,78 @@
+"""`raw reconstruct` of a 24-megapixel raw file with a network of the library's own: memory, progress, seams."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kornia_tidy import SensorNoise
+from kornia_tidy.data import read_image
+from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.pretrained import load_pretrained
+from kornia_tidy.reconstruction import receptive_field
+from kornia_tidy.sensor.dng_file import write_dng
+from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.training.light_head import LightHead
+from tests.base import BaseTester
+
+ROWS, COLUMNS = 4000, 6000
+SIDE = 250  # of the scene that is simulated, and repeated in rows and columns
+KEPT = 64  # px across, of a strip that the network sees as a whole
+MOST_MEMORY = 2 << 30  # bytes
+COUNTS = 1.5  # of 65535: half a count of rounding, and one in which float32 may differ
+
+resource = pytest.importorskip("resource", reason="this system does not tell how much memory a process took")
+
+
+@pytest.fixture
+def capture(tmp_path):
+    optics = load_pretrained("edof-5").optics
+    optics.sensor = None
+    image, depth = dead_leaves(SIDE, SIDE, depth_range=optics.camera.depth_range, num_leaves=250, seed=1)
+    camera = replace(RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095), camera_to_srgb=torch.eye(3))
+    raw = RawCapture.from_scene(image, depth, optics, camera, SensorNoise.physical(10500, 2.4))
+    path = tmp_path / "large.dng"
+    write_dng(path, replace(raw, counts=raw.counts.repeat(1, ROWS // SIDE, COLUMNS // SIDE)))
+    return path
+
+
+def seen_whole(head, light):
+    with torch.no_grad():
+        return head(light[None].contiguous(memory_format=torch.channels_last))[0][0].clamp(0, 1)
+
+
+@pytest.mark.slow
+class TestLargeCapture(BaseTester):
+    def test_feature_24_megapixels_take_two_gibibytes_and_show_no_seam(self, capture):
+        """On two threads. A strip from end to end crosses every cut of the tiles, wherever these are."""
+        command = [sys.executable, "-m", "kornia_tidy.cli", "raw", "reconstruct", str(capture), "--head", "edof-5"]
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2")
+        with subprocess.Popen(
+            [*command, "-o", str(capture.parent)], env={**os.environ, **threads}, stderr=subprocess.PIPE, text=True
+        ) as process:
+            err = process.stderr.read()
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0, err
+        most = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        print(f"peak memory {most / 2**20:.0f} MiB")
+        assert most <= MOST_MEMORY
+        shown = [float(part) for part in re.findall(r"(\d\.\d\d)/1 \[", err)]
+        assert len(set(shown)) > 5
+        assert shown == sorted(shown)
+
+        head = LightHead(load_pretrained("edof-5"))
+        light = RawCapture.open(capture).to_rgb(encoded=False, upright=False)
+        written = read_image(capture.with_suffix(".png"))
+        assert written.shape == (3, ROWS, COLUMNS)
+        margin = -(-receptive_field(head) // 16) * 16
+        for axis, begin in ((1, 2000), (2, 3008)):  # multiples of the network's stride, as both sides are
+            strip = light.narrow(axis, begin - margin, KEPT + 2 * margin)
+            whole = seen_whole(head, strip).narrow(axis, margin, KEPT)
+            assert (written.narrow(axis, begin, KEPT) - whole).abs().max() <= COUNTS / 65535

@@ -1,0 +1,62 @@
+"""Pictures to and from OpenCV's layout, against files that OpenCV wrote and read."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from kornia_tidy.data import from_opencv, read_image, to_opencv, write_image
+from tests.base import BaseTester
+
+
+class TestOpenCVArrays(BaseTester):
+    @settings(max_examples=60, deadline=None)
+    @given(
+        st.sampled_from([np.uint8, np.uint16]).flatmap(
+            lambda dtype: arrays.arrays(
+                dtype,
+                st.tuples(st.integers(1, 5), st.integers(1, 5), st.just(3))
+                | st.tuples(st.integers(1, 5), st.integers(1, 5)),
+            )
+        )
+    )
+    def test_property_there_and_back_is_the_same(self, picture):
+        assert np.array_equal(to_opencv(from_opencv(picture), picture.dtype), picture)
+
+    @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+    def test_feature_agrees_with_files(self, tmp_path, kind):
+        """More rows than are converted at a time."""
+        picture = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (300, 20, 3), kind, endpoint=True)
+        cv2.imwrite(str(tmp_path / "a.png"), picture)
+        image = from_opencv(picture)
+        assert torch.equal(image, read_image(tmp_path / "a.png"))
+        write_image(tmp_path / "b.png", image, 8 * picture.itemsize)
+        assert np.array_equal(cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_UNCHANGED), picture)
+
+    def test_feature_alpha_is_dropped_and_red_comes_first(self):
+        picture = np.array([[[10, 20, 30, 40]]], np.uint8)
+        self.assert_close(from_opencv(picture).flatten() * 255, torch.tensor([30.0, 20.0, 10.0]))
+
+    def test_feature_values_beyond_are_clipped_and_the_image_is_left_alone(self):
+        image = torch.tensor([[[-1.0, 0.5, 3.0]]], dtype=torch.float64)
+        assert to_opencv(image).tolist() == [[0, 128, 255]]
+        assert image.tolist() == [[[-1.0, 0.5, 3.0]]]
+
+    def test_exception_names_what_is_wrong(self):
+        with pytest.raises(TypeError, match="must be an array of uint8 or uint16, got float32"):
+            from_opencv(np.zeros((2, 2, 3), np.float32))
+        with pytest.raises(TypeError, match="must be an array of uint8 or uint16, got list"):
+            from_opencv([[0]])
+        with pytest.raises(ValueError, match=r"must have shape .* got \(2, 2, 5\)"):
+            from_opencv(np.zeros((2, 2, 5), np.uint8))
+        with pytest.raises(TypeError, match="must be of uint8 or uint16, got int32"):
+            to_opencv(torch.zeros(1, 2, 2), np.int32)
+        with pytest.raises(ValueError, match=r"image must have shape .* got \(2, 2, 2\)"):
+            to_opencv(torch.zeros(2, 2, 2))
+        with pytest.raises(ValueError, match="image must be finite, got nan"):
+            to_opencv(torch.full((1, 2, 2), torch.nan))
