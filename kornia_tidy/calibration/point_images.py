@@ -19,7 +19,7 @@ from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.sensor.noise import SensorNoise
 
 MARGIN = 8  # pixels around the window, in which moving an image by parts of a pixel may ring
-LEAST_SIGNAL = 30.0  # of a point's light over its noise
+LEAST_SIGNAL = 10.0  # of a point's light over its noise
 
 
 @dataclass(frozen=True, eq=False)

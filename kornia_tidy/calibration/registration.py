@@ -12,7 +12,8 @@ from kornia_tidy.calibration.dithering import ResolvedPSF, resolve_psf
 from kornia_tidy.calibration.point_images import MARGIN, PointImage
 
 ROUNDS, SMALL_STEP = 8, 5e-4  # of brightness, and in pixels
-LEAST_MISFIT, TIMES_MEDIAN = 2.0, 3.0  # an image misfits beyond both
+LEAST_MISFIT, BETTER = 1.5, 0.7  # an image is odd where the mean misfit is above, and without it smaller by this
+LEAST_IMAGES = 4  # of which one can be odd
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,7 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
 
     Rounds of two steps: PSFs for these places by :func:`resolve_psf`; then places and brightness for these PSFs by
     Gauss and Newton's step. The places as a whole stay where they are, as no image tells a PSF that is off its centre
-    from a point that is. An image whose residuals are larger than noise, and than those of the others, is left out.
+    from a point that is. An image without which the others fit each other far better is left out.
 
     Args:
         images: N without fault.
@@ -57,21 +58,71 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
     while True:
         brightness = brightness / brightness[used].mean()
         for _ in range(ROUNDS):
-            scaled, noise = light / brightness.view(-1, 1, 1, 1), variance / brightness.view(-1, 1, 1, 1) ** 2
-            own = offsets - phases[:, None]  # of each channel
-            psfs = [resolve_psf(scaled[used, c], own[c, used], noise[used, c], limit) for c, limit in enumerate(cutoff)]
-            step, misfit = _newton_step(scaled[..., inside, inside], noise[..., inside, inside], psfs, own)
+            fit = _Fit.of(light, variance, offsets - phases[:, None], brightness, cutoff, used)
+            step = fit.step.clone()
             step[:, 1:] -= step[used, 1:].mean(0)
-            brightness = brightness * (1 + step[:, 0])
+            brightness = brightness * (1 + step[:, 0].clamp(-0.5, 0.5))
             offsets = offsets + step[:, 1:].clamp(-0.5, 0.5)
             if float(step[used].abs().max()) < SMALL_STEP:
                 break
-        leverage = sum(psf.leverage for psf in psfs) / len(psfs)
-        misfit = torch.where(used, misfit / max(1 - leverage, 0.1), misfit)
-        odd = used & (misfit > LEAST_MISFIT) & (misfit > TIMES_MEDIAN * misfit[used].median())
-        if not bool(odd.any()):
-            return Registered(psfs, brightness, offsets, misfit, used)
-        used = used & (misfit < misfit[odd].max())  # the worst goes first: it may have spoilt the others
+        odd = _odd_one(light, variance, offsets - phases[:, None], brightness, cutoff, used, fit)
+        if odd is None:
+            return Registered(fit.psfs, brightness, offsets, fit.misfit, used)
+        used[odd] = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """PSFs for images at given places, the steps (N, 3) that their residuals ask for, and how large these are."""
+
+    psfs: list[ResolvedPSF]
+    step: Tensor
+    misfit: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        light: Tensor,
+        variance: Tensor,
+        offsets: Tensor,
+        brightness: Tensor,
+        cutoff: Sequence[float],
+        used: Tensor,
+    ) -> _Fit:
+        scale, inside = brightness.view(-1, 1, 1, 1), slice(MARGIN, -MARGIN)
+        light, variance = light / scale, variance / scale**2
+        psfs = [
+            resolve_psf(light[used, c], offsets[c, used], variance[used, c], limit) for c, limit in enumerate(cutoff)
+        ]
+        step, misfit = _newton_step(light[..., inside, inside], variance[..., inside, inside], psfs, offsets)
+        leverage = sum(psf.leverage for psf in psfs) / len(psfs)  # what an image decides of the PSF is no residual
+        return cls(psfs, step, torch.where(used, misfit / max(1 - leverage, 0.1), misfit))
+
+
+def _odd_one(
+    light: Tensor,
+    variance: Tensor,
+    offsets: Tensor,
+    brightness: Tensor,
+    cutoff: Sequence[float],
+    used: Tensor,
+    fit: _Fit,
+) -> int | None:
+    """Return the image without which the others fit each other far better, if there is one.
+
+    It need not be the one with the largest residuals: few images follow one that is wrong.
+    """
+    before = float(fit.misfit[used].mean())
+    if before < LEAST_MISFIT or int(used.sum()) < LEAST_IMAGES:
+        return None
+    candidates = used.nonzero().flatten().tolist()
+    left = []
+    for candidate in candidates:
+        others = used.clone()
+        others[candidate] = False
+        left.append(float(_Fit.of(light, variance, offsets, brightness, cutoff, others).misfit[others].mean()))
+    best = min(left)
+    return candidates[left.index(best)] if best < BETTER * before else None
 
 
 def _newton_step(
