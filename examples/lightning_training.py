@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.training.scenes import DeadLeavesScenes
+from kornia_tidy.data import DeadLeaves
 from kornia_tidy.training.trained import load_weights
 
 
@@ -46,7 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> float:
     torch.manual_seed(0)
     folder = Path(options.output)
     module = TidyTraining(TiDyOptics(PixelwiseMask(3)), OwnNetwork(), task="edof", lr=1e-3, ema=0.9)
-    scenes = [DeadLeavesScenes(count, options.size, seed=seed) for seed, count in enumerate((options.scenes, 4))]
+    shape = {"height": options.size, "width": options.size, "depth_range": (0.3, float("inf"))}
+    scenes = [DeadLeaves(count, **shape, seed=seed) for seed, count in enumerate((options.scenes, 4))]
     trainer = pl.Trainer(
         accelerator="cpu",
         max_epochs=options.epochs,

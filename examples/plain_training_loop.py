@@ -8,25 +8,25 @@ import argparse
 import torch
 
 from kornia_tidy import TiDyOptics
+from kornia_tidy.data import DeadLeaves
+from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.training.heads import PlainHead
-from kornia_tidy.training.scenes import DeadLeavesScenes
-from kornia_tidy.training.tasks import mean_square, nearness
+from kornia_tidy.training.tasks import nearness
 
 
 def main(arguments: list[str] | None = None) -> list[float]:
     """Train, and return the loss of every step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=100, help="steps (default: 100)")
-    scenes = DeadLeavesScenes(4 * parser.parse_args(arguments).steps, size=64)
+    scenes = DeadLeaves(4 * parser.parse_args(arguments).steps, 64, 64)
     torch.manual_seed(0)
-    loader = torch.utils.data.DataLoader(scenes, batch_size=4)
     network, optics = PlainHead(out_channels=1), TiDyOptics()  # line 1: the camera
     groups = [*optics.parameter_groups(lr_metres=1e-8), {"params": network.parameters()}]  # line 2: its masks
     optimizer = torch.optim.Adam(groups, lr=1e-3, betas=(0.99, 0.999))
     losses = []
-    for batch in loader:
+    for batch in torch.utils.data.DataLoader(scenes, batch_size=4):
         coded = optics(batch["image"], batch["depth"])  # line 3: the network sees captures, not images
-        loss = mean_square(network(coded), nearness(optics.camera, batch["depth"]), batch["mask"])
+        loss = mse_loss(network(coded), nearness(optics.camera, batch["depth"]), batch["mask"])
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
+
+_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # what the writers below call files and folders until they are whole
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -105,3 +108,13 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
         shutil.rmtree(new, ignore_errors=True)
         if path.exists():
             shutil.rmtree(old, ignore_errors=True)
+
+
+def remove_leftovers(folder: str | os.PathLike[str]) -> None:
+    """Remove from a folder what writers left that were killed at work. Nobody may be writing into it."""
+    for path in Path(folder).iterdir():
+        if _LEFTOVER.fullmatch(path.name):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)

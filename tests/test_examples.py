@@ -194,3 +194,15 @@ class TestLightningTraining(BaseTester):
         error = example.main(["--epochs", "2", "--scenes", "8", "--size", "48", "--output", str(tmp_path)])
         assert 0 < error < 0.3
         assert {"best.safetensors", "last.safetensors"} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("example", ["train_on_rendered"], indirect=True)
+class TestTrainOnRendered(BaseTester):
+    def test_feature_the_loss_falls_and_captures_are_made_once(self, example, tmp_path, capsys):
+        few = ["--scenes", "8", "--size", "64", "--epochs", "6", "--output", str(tmp_path)]
+        losses = example.main(few)
+        assert len(losses) == 12
+        assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
+        assert "8 captures made, 0 found" in capsys.readouterr().out
+        assert example.main(few) == losses
+        assert "0 captures made, 8 found" in capsys.readouterr().out

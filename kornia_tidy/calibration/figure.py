@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -57,7 +57,8 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
         rows += [("the fitted mask's", fit.psfs.cpu(), None), ("measured less fitted", left, float(left.abs().max()))]
     width, height = max(7.5, CELL * (len(columns) + 1.6)), CELL * (len(rows) + 0.5) + 2.2
     figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(CELL * (len(rows) + 0.5), 2.2))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(CELL * (len(rows) + 0.5), 2.2))
+    above, below = parts[0], parts[1]
     table = above.subplots(len(rows), len(columns), squeeze=False)
     for number, (line, (name, values, scale)) in enumerate(zip(table, rows, strict=True)):
         for axes, d in zip(line, columns, strict=True):

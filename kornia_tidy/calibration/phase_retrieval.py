@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -82,12 +83,12 @@ def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel
     if measured.psfs.shape[1] != channels:
         raise ValueError(f"the spectrum has {channels} channels, the measured PSFs {measured.psfs.shape[1]}")
     model = _Model(measured, lens, channel)
-    groups = [{"params": [model.shifts], "lr": 0.02}]
+    groups: list[dict[str, Any]] = [{"params": [model.shifts], "lr": 0.02}]
     if model.learning:
         groups.append(adam_groups(lens.masks, STEP))
     else:
         groups.append({"params": [model.offset], "lr": 0.2})
-    optimizer = torch.optim.Adam(groups)  # ty: ignore[invalid-argument-type]
+    optimizer = torch.optim.Adam(groups)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
     for _ in range(iterations):
         optimizer.zero_grad()
@@ -104,7 +105,7 @@ def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel
         error.backward()
         return error
 
-    polish.step(evaluate)  # ty: ignore[invalid-argument-type]
+    polish.step(evaluate)
     model.settle()
     return model.fit()
 
@@ -149,7 +150,8 @@ def retrieve_mask(
                 best = fit
             if float(best.residual.mean()) < good:
                 break
-        found.append(best.lens.masks.phase.detach()[0])  # ty: ignore[unresolved-attribute]
+        assert best is not None  # starts is 1 or more
+        found.append(best.lens.masks.phase.detach()[0])
     masks = PixelwiseMask(1, size)
     factors = [masks.dispersion(_mean_wavelength(spectrum, channel)) for channel in range(len(found))]
     with torch.no_grad():

@@ -12,8 +12,9 @@ from tqdm import tqdm
 from kornia_tidy.commands.options import seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_scene_options, given_settings
-from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, mean_row, write_table
-from kornia_tidy.training.scenes import make_scenes
+from kornia_tidy.training.data_sets import make_scenes
+from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, metric_range, table, write_table
+from kornia_tidy.training.tasks import MAPS
 from kornia_tidy.training.trained import load_trained
 
 DESCRIPTION = """\
@@ -21,8 +22,13 @@ Let a trained camera and network see scenes they were not trained on. FOLDER get
 results.csv (a line a scene), summary.json (means and settings), and of the first scenes
 the capture, the estimates, the truths and the errors times 3, as pictures.
 
-Errors are root mean squares: of images in [0, 1], and of depth as it is learnt, 0 at the
-far and 1 at the near end of the camera's range, linear in inverse depth.
+image_rmse, image_psnr (dB), image_ssim: of the image in [0, 1], not clipped to it.
+depth_rmse: of depth as it is learnt, 0 at the far and 1 at the near end of the camera's
+  range, linear in inverse depth; depth_rmse_radians: of the defocus behind it.
+depth_rmse_metres, depth_abs_rel, depth_log10, depth_delta1 to 3 (within 1.25, 1.25^2 and
+  1.25^3): of depth in metres, where it is known and within the camera's range, and at
+  most 32 times as far as its near end if it reaches to infinity. Estimates are clamped
+  to this range. depth_counted: the share of pixels that count.
 """
 
 
@@ -37,10 +43,18 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help="best.safetensors or last.safetensors of a run")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="made if missing (default: evaluation, beside it)")
-    parser.add_argument("--scenes", type=int, default=32, metavar="N", help="number, of scenes made here (default: 32)")
+    parser.add_argument(
+        "--scenes", type=int, metavar="N", help="number (default: all that are for testing; 32 of scenes made here)"
+    )
     parser.add_argument("--pictures", type=int, default=8, metavar="N", help="scenes drawn (default: 8)")
     parser.add_argument("--noise-seed", type=seed, default=0, metavar="N", help="of the sensor (default: 0)")
-    add_scene_options(parser.add_argument_group("scenes", "Defaults are those of the training."))
+    add_scene_options(
+        parser.add_argument_group(
+            "scenes",
+            "Defaults are those of the training. They are the data's own for testing: a tenth of\n"
+            "an rgbd-folder that was trained on, and all of another.",
+        )
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -49,9 +63,13 @@ def run(args: argparse.Namespace) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     system = load_trained(args.checkpoint)
-    given = {name: value for name, value in given_settings(args).items() if name != "scenes"}
-    settings = system.settings.replace(**given, validation_scenes=args.scenes)
-    scenes = make_scenes(settings, "test")
+    trained = system.settings
+    settings = trained.replace(**{name: value for name, value in given_settings(args).items() if name != "scenes"})
+    if settings.data != trained.data and "root" not in args:
+        settings = settings.replace(root=None)  # the folder was that of the other data
+    seen = (settings.data, _place(settings.root)) == (trained.data, _place(trained.root))
+    split = "test" if seen or settings.data != "rgbd-folder" else "all"
+    scenes = make_scenes(settings, split, args.scenes)
     tell("system", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, {system.step} steps")
     folder.mkdir(parents=True, exist_ok=True)
     with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene") as progress:
@@ -62,9 +80,16 @@ def run(args: argparse.Namespace) -> None:
             progress.update()
 
         rows = evaluate(system, scenes, args.noise_seed, each)
-    about = {"checkpoint": str(args.checkpoint), "step": system.step, "noise_seed": args.noise_seed}
-    write_table(folder, rows, {**about, "settings": settings.as_dict()})
-    for name, value in mean_row(rows).items():
-        tell(name, f"{value:.4f}" + (" dB" if name.endswith("psnr") else ""))
+    about = {"checkpoint": str(args.checkpoint), "step": system.step, "noise_seed": args.noise_seed, "split": split}
+    near, far = metric_range(settings.camera())
+    write_table(folder, rows, {**about, "metres_counted": [near, far], "settings": settings.as_dict()})
+    for line in table(rows):
+        print(line)
+    if "depth" in MAPS[settings.task]:
+        tell("metres", f"pixels count whose depth is known, from {near:.4g} to {far:.4g} m")
     tell("wrote", f"{folder / 'results.csv'}, {len(rows)} scenes")
     tell("", str(folder / "summary.json"))
+
+
+def _place(root: str | None) -> Path | None:
+    return None if root is None else Path(root).resolve()

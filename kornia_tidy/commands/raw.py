@@ -5,10 +5,17 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kornia_tidy.commands import raw_calibrate_psf, raw_info
+from kornia_tidy.commands import (
+    raw_calibrate_noise,
+    raw_calibrate_psf,
+    raw_develop,
+    raw_info,
+    raw_reconstruct,
+    raw_simulate,
+)
 
 # Each has add_parser(subparsers), which sets run(args).
-SUBCOMMANDS = (raw_info, raw_calibrate_psf)
+SUBCOMMANDS = (raw_info, raw_develop, raw_reconstruct, raw_calibrate_noise, raw_calibrate_psf, raw_simulate)
 
 DESCRIPTION = """\
 Camera raw files: the counts of a sensor, before any camera has made a picture of

@@ -24,7 +24,7 @@ def add_dump_options(parser: argparse.ArgumentParser) -> None:
         "--pattern",
         type=str.upper,
         metavar="LETTERS",
-        help="colours of the filter array's tile, by rows: RGGB, GBRG, GMYC, 36 letters for X-Trans; NONE for monochrome",
+        help="colours of the filter array's tile, by rows: RGGB, GMYC, 36 letters for X-Trans; NONE for monochrome",
     )
     group.add_argument("--black", type=float, nargs="+", metavar="N", help="count without light, one or one a place")
     group.add_argument("--white", type=float, metavar="N", help="saturation count")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -12,15 +13,23 @@ from kornia_tidy.commands.options import seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.scene.compositing import COMPOSITING
+from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.heads import HEADS
 from kornia_tidy.training.lightning_extra import require_lightning
-from kornia_tidy.training.scenes import SCENES
-from kornia_tidy.training.settings import PRECISIONS, TrainingSettings
-from kornia_tidy.training.tasks import MAPS
+from kornia_tidy.training.settings import PRECISIONS, SCHEDULES, TrainingSettings
+from kornia_tidy.training.tasks import LOSSES, MAPS
 
 DESCRIPTION = """\
 Learn the phase masks of a camera together with the network that reads its captures:
 an all-in-focus image (edof), a depth map (depth), or both (joint).
+
+Scenes are painted here (dead-leaves) or files in --root: the frames of FlyingThings3D
+(flying-things), the paper's patches of them (flying-things-patches), NYU Depth v2 (nyu),
+all as published, or a folder of one's own (rgbd-folder), in which rgbd.json tells which
+files are pairs and how depth is stored:
+  {"image": "*.png", "depth": "*_depth.png", "scale": 0.001}
+Published splits are kept; of a folder a tenth is for validation and a tenth for testing.
+FlyingThings3D has no size: its nearest things are taken to be at the camera's near end.
 """
 
 EPILOG = """\
@@ -33,8 +42,12 @@ was never stopped (to the bit on one CPU process).
 examples:
   The paper's extended depth of field, on scenes made here:
     kornia-tidy train --task edof --masks 5 --pretrain-epochs 300 -o outputs/edof
-  A first look, in minutes:
-    kornia-tidy train --task depth --size 96 --scenes 64 --batch 4 --epochs 5 -o outputs/look
+  A first look, in minutes on a CPU, for which the paper's network is too large:
+    kornia-tidy train --task depth --head plain --size 96 --scenes 64 --batch 4 --epochs 5 \\
+      -o outputs/look
+  The paper's patches, by the loss of PhaseCam3D:
+    kornia-tidy train --task depth --data flying-things-patches --root FlyingThings3D \\
+      --loss phasecam3d --border valid -o outputs/depth
   Goes on after an interruption; a longer run may be asked for:
     kornia-tidy train --resume --epochs 400 -o outputs/edof
 """
@@ -59,31 +72,33 @@ def add_parser(subparsers: Any) -> None:
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
-    _setting(system, "head", choices=tuple(HEADS), help="network")
-    _setting(system, "width", type=int, metavar="C", help="channels of its first level")
+    _setting(
+        system,
+        "head",
+        choices=tuple(HEADS),
+        help="network; without a GPU take plain, or a small --width: the paper's has 34.9 million weights",
+    )
+    _setting(
+        system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
+    )
+    _setting(
+        system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
+    )
+    _setting(
+        system,
+        "loss",
+        choices=tuple(LOSSES),
+        help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes",
+    )
     _setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
     _setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
 
     data = parser.add_argument_group("scenes")
     add_scene_options(data)
-    _setting(data, "scenes", type=int, metavar="N", help="number for training, of scenes made here")
-    _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation")
+    _setting(data, "scenes", type=int, metavar="N", help="number for training, of patches and scenes made here")
+    _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation, at most")
 
-    camera = parser.add_argument_group("camera")
-    _setting(
-        camera,
-        "depth_range",
-        type=float,
-        nargs=2,
-        metavar=("NEAR", "FAR"),
-        help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
-    )
-    _setting(camera, "focal_length", type=float, metavar="M", help="metres")
-    _setting(camera, "pixel_pitch", type=float, metavar="M", help="metres")
-    _setting(camera, "sigma", type=float, metavar="S", help="read noise, of full scale")
-    _setting(camera, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
-    _setting(camera, "compositing", choices=tuple(COMPOSITING), help="of depths")
-    _setting(camera, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
+    add_camera_settings(parser.add_argument_group("camera"))
 
     learning = parser.add_argument_group("learning")
     _setting(learning, "epochs", type=int, metavar="N", help="passes over the scenes")
@@ -92,6 +107,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(learning, "accumulate", type=int, metavar="N", help="batches in a step")
     _setting(learning, "lr", type=float, metavar="LR", help="learning rate of the network")
     _setting(learning, "lr_metres", type=float, metavar="LR", help="learning rate of the masks, metres of height")
+    _setting(learning, "schedule", choices=SCHEDULES, help="of both rates; cosine: up, then down to zero")
     _setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
     _setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
     _setting(learning, "precision", choices=PRECISIONS, help="of the network; optics stay in float32")
@@ -109,8 +125,26 @@ def add_parser(subparsers: Any) -> None:
 def add_scene_options(group: Any) -> None:
     """Add which scenes, to a command that takes its defaults from settings."""
     _setting(group, "data", choices=tuple(SCENES), help="where scenes come from")
-    _setting(group, "root", metavar="FOLDER", help="folder of the data, where they need one")
-    _setting(group, "size", type=int, metavar="PX", help="side of the scenes")
+    _setting(group, "root", metavar="FOLDER", help="folder of data that are files; default: data/NAME")
+    _setting(group, "size", type=int, metavar="PX", help="side of the scenes; larger ones are cropped")
+
+
+def add_camera_settings(group: Any) -> None:
+    """Add which lens and sensor, to a command that takes its defaults from settings."""
+    _setting(
+        group,
+        "depth_range",
+        type=float,
+        nargs=2,
+        metavar=("NEAR", "FAR"),
+        help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
+    )
+    _setting(group, "focal_length", type=float, metavar="M", help="metres")
+    _setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
+    _setting(group, "sigma", type=float, metavar="S", help="read noise, of full scale")
+    _setting(group, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
+    _setting(group, "compositing", choices=tuple(COMPOSITING), help="of depths")
+    _setting(group, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
 
 
 def given_settings(args: argparse.Namespace) -> dict[str, Any]:
@@ -131,10 +165,11 @@ def run(args: argparse.Namespace) -> None:
     stored = args.resume and (folder / SETTINGS).exists()
     settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()
     settings = settings.replace(**given_settings(args))
+    say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # one of the processes speaks for all
     many = {"strategy": "ddp"} if args.devices > 1 else {}
-    tell("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
+    say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
     goes_on = args.resume and (folder / LAST).exists()
-    tell("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
+    say("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
     try:
         module = train(
             settings,
@@ -149,12 +184,16 @@ def run(args: argparse.Namespace) -> None:
             **many,
         )
     except KeyboardInterrupt:
-        tell("stopped", f"--resume -o {folder} goes on from the last checkpoint")
+        say("stopped", f"--resume -o {folder} goes on from the last checkpoint")
         raise
-    tell("camera", module.optics.extra_repr())
-    tell("wrote", f"{folder / BEST}: evaluate this one")
+    say("camera", module.optics.extra_repr())
+    say("wrote", f"{folder / BEST}: evaluate this one")
     for name in (LAST, SETTINGS, "training.csv", "validation.csv", "pictures"):
-        tell("", str(folder / name))
+        say("", str(folder / name))
+
+
+def _nothing(*_: str) -> None:
+    """Say nothing."""
 
 
 def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)

@@ -2,12 +2,13 @@
 
 from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
 from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth
-from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches
+from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches, split_frames
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
-from kornia_tidy.data.patches import Patches, crop, random_crop
+from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
+from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
 from kornia_tidy.data.rgbd import Scene, read_rgbd
-from kornia_tidy.data.rgbd_folder import RGBDFolder
+from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
 
 __all__ = [
@@ -20,13 +21,18 @@ __all__ = [
     "Scene",
     "SceneDataset",
     "UnreadableItemError",
+    "central_crop",
     "crop",
     "dead_leaves",
+    "described_folder",
+    "from_opencv",
     "paper_patches",
     "random_crop",
     "read_depth",
     "read_image",
     "read_rgbd",
+    "split_frames",
+    "to_opencv",
     "write_depth",
     "write_image",
 ]

@@ -16,8 +16,9 @@ from torch import Tensor
 from kornia_tidy.data.leaf_textures import paint_leaves
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.dataset_transform import item_generator
+from kornia_tidy.seeds import keyed_seed
 
+PIXELS_A_LEAF, MOST_LEAVES = 256, 3000  # in scenes of a data set: things of sizes as in photographs, with depth to see
 COVERAGE = 3.0  # how many leaves lie over a pixel on average; exp(-3) = 5 % of the picture shows the background
 LARGEST_RADIUS = 0.25  # of the picture's geometric mean side
 SMALLEST_LEAF = 1.0  # px: a smaller leaf would fall between pixels
@@ -108,7 +109,7 @@ class DeadLeaves(SceneDataset):
         height: rows in pixels.
         width: columns in pixels.
         depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
-        num_leaves: number of shapes in a scene.
+        num_leaves: number of shapes in a scene. Default: one for 256 pixels, and 3000 at most.
         seed: data sets of different seeds share no scene: train with one, test with another.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
 
@@ -128,13 +129,15 @@ class DeadLeaves(SceneDataset):
         width: int,
         *,
         depth_range: tuple[float, float] = (0.3, 10.0),
-        num_leaves: int = 3000,
+        num_leaves: int | None = None,
         seed: int = 0,
         transform: Transform | None = None,
     ) -> None:
         super().__init__(transform)
         if not isinstance(length, Integral) or length < 1:
             raise ValueError(f"length must be a positive integer, got {length!r}")
+        if num_leaves is None:
+            num_leaves = min(MOST_LEAVES, max(1, height * width // PIXELS_A_LEAF))
         _check_arguments(height, width, depth_range, num_leaves, seed)
         self.length, self.height, self.width = length, height, width
         self.depth_range, self.num_leaves, self.seed = depth_range, num_leaves, seed
@@ -149,7 +152,7 @@ class DeadLeaves(SceneDataset):
 
     def read(self, index: int) -> Scene:
         """Paint a scene; its depth is known everywhere."""
-        seed = item_generator(self.seed, index).initial_seed() % 2**64
+        seed = keyed_seed(self.seed, "scene", index)
         image, depth = dead_leaves(
             self.height, self.width, depth_range=self.depth_range, num_leaves=self.num_leaves, seed=seed
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from torch.utils.data import Subset
 
@@ -15,6 +15,7 @@ from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 
 FOCAL_PX = 1050.0  # 35 mm on a sensor 32 mm and 960 pixels wide
+NEAREST = 160.0  # px of disparity, which holds what was seen: 1.1 to 152
 SOURCE = "https://lmb.informatik.uni-freiburg.de/resources/datasets/SceneFlowDatasets.en.html"
 
 PATCH_SIZE = 278  # px: 256 remain where a PSF of 23 pixels sees no border
@@ -118,12 +119,39 @@ class FlyingThings3D(SceneDataset):
             )
 
 
+def split_frames(
+    root: str | os.PathLike[str], split: Literal["train", "val", "test"] = "train", **options: Any
+) -> Subset[Any]:
+    """The frames of FlyingThings3D in three parts: every tenth sequence of the published TRAIN is for validation.
+
+    Args:
+        root: see :class:`FlyingThings3D`.
+        split: training and validation are from different sequences of the published TRAIN, testing from TEST.
+        **options: passed on to :class:`FlyingThings3D`.
+
+    Raises:
+        FileNotFoundError: as :class:`FlyingThings3D`; so is its ``ValueError``.
+        ValueError: if there are fewer than ten sequences of TRAIN.
+    """
+    check_choice("split", split, tuple(PATCH_COUNTS))
+    frames = FlyingThings3D(root, "test" if split == "test" else "train", **options)
+    if split == "test":
+        return Subset(frames, range(len(frames)))
+    sequences = sorted({_sequence(name) for name in frames.names})
+    held_out = set(sequences[HELD_OUT - 1 :: HELD_OUT])
+    if not held_out:
+        raise ValueError(f"{root} has {len(sequences)} sequences of TRAIN: {HELD_OUT} or more are needed to validate")
+    return Subset(
+        frames, [i for i, name in enumerate(frames.names) if (_sequence(name) in held_out) == (split == "val")]
+    )
+
+
 def paper_patches(
     root: str | os.PathLike[str],
     split: Literal["train", "val", "test"] = "train",
     *,
     count: int | None = None,
-    disparity_range: tuple[float, float] = (0.0, 160.0),
+    disparity_range: tuple[float, float] = (0.0, NEAREST),
     seed: int = 0,
     transform: Transform | None = None,
 ) -> Patches:
@@ -137,7 +165,7 @@ def paper_patches(
         root: see :class:`FlyingThings3D`.
         split: training and validation are from different sequences of the published TRAIN, testing from TEST.
         count: how many patches. Default: as many as in the paper.
-        disparity_range: (far, near) in pixels that become 0 and 1; the default holds what was seen (1.1 to 152).
+        disparity_range: (far, near) in pixels that become 0 and 1.
         seed: another one cuts other patches.
         transform: called with each patch.
 
@@ -150,19 +178,9 @@ def paper_patches(
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 3; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
     """
-    check_choice("split", split, tuple(PATCH_COUNTS))
-    frames = FlyingThings3D(root, "test" if split == "test" else "train", disparity_range=disparity_range)
-    chosen = range(len(frames))
-    if split != "test":
-        sequences = sorted({_sequence(name) for name in frames.names})
-        held_out = set(sequences[HELD_OUT - 1 :: HELD_OUT])
-        chosen = [i for i in chosen if (_sequence(frames.names[i]) in held_out) == (split == "val")]
-        if not chosen:
-            raise ValueError(
-                f"{root} has {len(sequences)} sequences of TRAIN: {HELD_OUT} or more are needed to validate"
-            )
+    frames = split_frames(root, split, disparity_range=disparity_range)
     count = PATCH_COUNTS[split] if count is None else count
-    return Patches(Subset(frames, chosen), PATCH_SIZE, count, seed=seed, transform=transform)
+    return Patches(frames, PATCH_SIZE, count, seed=seed, transform=transform)
 
 
 def _sequence(name: str) -> str:

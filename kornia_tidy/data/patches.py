@@ -106,6 +106,18 @@ def random_crop(
     return _random_crop(sample, _height_width(size), generator)[0]
 
 
+def central_crop(sample: dict[str, Any], size: int | tuple[int, int]) -> dict[str, Any]:
+    """Cut the window in the middle from all maps of a sample alike. See :func:`random_crop`.
+
+    Example:
+        >>> central_crop({"image": torch.arange(25).view(1, 5, 5)}, (1, 3))["image"]
+        tensor([[[11, 12, 13]]])
+    """
+    height, width = _height_width(size)
+    image_height, image_width = _fitting((height, width), sample)
+    return crop(sample, (image_height - height) // 2, (image_width - width) // 2, height, width)
+
+
 def crop(sample: dict[str, Any], top: int, left: int, height: int, width: int) -> dict[str, Any]:
     """Cut the window that starts at row ``top`` and column ``left`` from all maps of a sample. See :func:`random_crop`.
 
@@ -129,12 +141,18 @@ def crop(sample: dict[str, Any], top: int, left: int, height: int, width: int) -
 def _random_crop(
     sample: dict[str, Any], size: tuple[int, int], generator: torch.Generator | None
 ) -> tuple[dict[str, Any], tuple[int, int]]:
-    height, width = sample["image"].shape[-2:]
-    if size[0] > height or size[1] > width:
-        raise ValueError(f"a patch of {size[0]} x {size[1]} pixels does not fit into an image of {height} x {width}")
+    height, width = _fitting(size, sample)
     top = int(torch.randint(height - size[0] + 1, (), generator=generator))
     left = int(torch.randint(width - size[1] + 1, (), generator=generator))
     return crop(sample, top, left, *size), (top, left)
+
+
+def _fitting(size: tuple[int, int], sample: dict[str, Any]) -> tuple[int, int]:
+    """Height and width of a sample, into which a patch must fit."""
+    height, width = sample["image"].shape[-2:]
+    if size[0] > height or size[1] > width:
+        raise ValueError(f"a patch of {size[0]} x {size[1]} pixels does not fit into an image of {height} x {width}")
+    return height, width
 
 
 def _height_width(size: int | tuple[int, int]) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import json
 import os
 import re
 from pathlib import Path
@@ -11,6 +12,10 @@ from typing import Any
 from kornia_tidy.data.depth_files import check_depth_options
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.files import read_bytes
+
+ABOUT = "rgbd.json"
+KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m", "doffs_px")
 
 
 class RGBDFolder(SceneDataset):
@@ -73,6 +78,47 @@ class RGBDFolder(SceneDataset):
         """Read a pair."""
         _, image, depth = self.pairs[index]
         return read_rgbd(self.root / image, self.root / depth, **self.depth_options)
+
+
+def described_folder(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
+    """Return the scenes of a folder that tells in ``rgbd.json`` which files are pairs and how depth is stored.
+
+    Args:
+        root: the folder. The file in it holds arguments of :class:`RGBDFolder` as JSON, such as
+            ``{"image": "*.png", "depth": "*_depth.png", "scale": 0.001}``.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, no ``rgbd.json`` in it, or no file fits a pattern.
+        ValueError: if ``rgbd.json`` is not as above, or as :class:`RGBDFolder` does.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from kornia_tidy.data import write_depth, write_image
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_image(f"{folder}/lamp.png", torch.rand(3, 4, 6))
+        ...     write_depth(f"{folder}/lamp_depth.png", torch.full((1, 4, 6), 1.25), scale=0.001)
+        ...     _ = Path(folder, "rgbd.json").write_text('{"image": "*.png", "depth": "*_depth.png", "scale": 0.001}')
+        ...     described_folder(folder)[0]["depth"].unique()
+        tensor([1.2500])
+    """
+    root = Path(root)
+    path = root / ABOUT
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there is no {path}: it tells which files in the folder are pairs and how depth is stored, such as "
+            '{"image": "*.png", "depth": "*_depth.png", "scale": 0.001} for millimetres'
+        )
+    try:
+        about = json.loads(read_bytes(path))
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    if not isinstance(about, dict) or not {"image", "depth"} <= set(about) <= set(KNOWN):
+        raise ValueError(f'cannot read {path}: it should hold "image" and "depth" and may hold {", ".join(KNOWN[2:])}')
+    try:
+        return RGBDFolder(root, transform=transform, **about)
+    except (AttributeError, TypeError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
 
 
 def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:

@@ -32,7 +32,15 @@ def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
         FileNotFoundError: if there is no file.
         ValueError: if it is a folder, empty, cut short, damaged or of no known format.
     """
-    data = read_bytes(path)
+    return decode_stored(read_bytes(path), path)
+
+
+def decode_stored(data: bytes, path: str | os.PathLike[str]) -> NDArray[Any]:
+    """Return the numbers in the bytes of a file, as :func:`read_stored` does; messages call it by its path.
+
+    Raises:
+        ValueError: if they are cut short, damaged or of no known format.
+    """
     try:
         if data.startswith(NPY):
             stored = np.lib.format.read_array(BytesIO(data), allow_pickle=False)

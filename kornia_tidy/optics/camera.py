@@ -184,6 +184,32 @@ class ThinLensCamera(nn.Module):
             check_depth(depth)
         return thin_lens_defocus(depth, self.aperture_radius, self.focus_distance)
 
+    def depth(self, defocus: Tensor) -> Tensor:
+        r"""Return the depth that has a defocus: the inverse of :meth:`defocus`.
+
+        .. math:: 1 / z = 1 / z_{far} + (\psi - \psi_{far}) \, \lambda_0 / (\pi R^2)
+
+        Counted from the far end of the range, so that the defocus of infinity is exactly infinitely far.
+
+        Args:
+            defocus: radians, any shape.
+
+        Returns:
+            Metres, same shape and dtype; ``inf`` for the defocus of infinity, and for less, which no depth has.
+
+        Example:
+            >>> import torch
+            >>> camera = ThinLensCamera()
+            >>> camera.depth(camera.defocus(torch.tensor([0.3, 1.5, float("inf")])))
+            tensor([0.3000, 1.5000,    inf])
+        """
+        scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
+        inverse = 1 / self.depth_range[1] + (_at_least_float32(defocus) - self.defocus_range[0]) / scale
+        if isinstance(self.focus_distance, Tensor):  # it may have moved since the range was chosen
+            here = thin_lens_defocus(inverse.new_tensor(self.depth_range[1]), self.aperture_radius, self.focus_distance)
+            inverse = inverse + (self.defocus_range[0] - here) / scale
+        return inverse.clamp(min=0).reciprocal().to(defocus.dtype)
+
     def resized(self, scale: float) -> ThinLensCamera:
         """Return this camera for images resized by ``scale`` (0.5 halves their sides), so that PSFs keep their size.
 

@@ -19,6 +19,7 @@ from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
+from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
@@ -52,6 +53,8 @@ class CodedLens(nn.Module):
 
     _state: int | None = None  # the one state looked through, if not all
     _bank: PSFBank | None = None  # measured, in the place of the masks' own
+
+    _seen: Spectrum  # what PSFs are computed at: the spectrum, at no more wavelengths than the fidelity allows
 
     def __init__(
         self,
@@ -240,7 +243,8 @@ class CodedLens(nn.Module):
             The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
         if self._bank is not None:
-            self._window, self._held = self._bank.window, tuple(map(float, torch.aminmax(self._bank.energy)))
+            energy = self._bank.energy
+            self._window, self._held = self._bank.window, (float(energy.min()), float(energy.max()))
             return self._window
         self._check_layers()
         settings, fixed = self.fidelity, self._fixed_window
@@ -270,10 +274,15 @@ class CodedLens(nn.Module):
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states, weights = self._states(torch.float32)
-        return self._build(states, weights, self.spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
+        return self._build(states, weights, self._seen.flat(), self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
+        """Set an attribute; a part that shapes the PSFs makes wavelengths, window and pupil to be found anew."""
+        if name in ("spectrum", "fidelity"):
+            both = {**self.__dict__, name: value}
+            if "spectrum" in both and "fidelity" in both:
+                spectrum, most = both["spectrum"], both["fidelity"].wavelengths
+                self.__dict__["_seen"] = spectrum if most is None else fewer_wavelengths(spectrum, most)
         super().__setattr__(name, value)
         if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
             self.__dict__.update(_window=None, _pupil=None)
@@ -386,7 +395,7 @@ class CodedLens(nn.Module):
 
     def _spectrum(self, channels: int) -> Spectrum:
         if channels == len(self.spectrum.weights):
-            return self.spectrum
+            return self._seen
         if channels == 1:
             return Spectrum.monochrome()
         raise ValueError(

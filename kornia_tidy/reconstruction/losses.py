@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
 
+PHASECAM3D_WEIGHT = 20.0  # of its RMSE beside its gradients
+
 
 def mse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     r"""Return the mean squared error, the paper's loss for depth maps and for all-in-focus images.
@@ -120,6 +122,26 @@ def gradient_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None
         squares = torch.where(pairs, error.diff(dim=axis), 0).square()
         loss = loss + safe_sqrt(_mean(squares, pairs, f"pair of pixels {name} each other"))
     return loss
+
+
+def phasecam3d_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return PhaseCam3D's whole loss of a map: 20 times :func:`rmse_loss`, and :func:`gradient_loss`.
+
+    Args:
+        prediction: as for :func:`gradient_loss`, in [0, 1].
+        target: as for :func:`gradient_loss`, in [0, 1].
+        mask: as for :func:`gradient_loss`.
+
+    Returns:
+        A scalar; errors are those of :func:`gradient_loss`.
+
+    Source: Wu et al., PhaseCam3D, ICCP 2019.
+
+    Example:
+        >>> phasecam3d_loss(torch.full((1, 1, 4, 4), 0.55), torch.full((1, 1, 4, 4), 0.5))
+        tensor(1.0000)
+    """
+    return PHASECAM3D_WEIGHT * rmse_loss(prediction, target, mask) + gradient_loss(prediction, target, mask)
 
 
 def joint_loss(

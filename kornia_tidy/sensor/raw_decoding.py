@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from io import SEEK_END
 from pathlib import Path
-from signal import Signals
+from signal import SIGXCPU, Signals
 from tempfile import TemporaryFile
 from typing import IO, Any, BinaryIO
 
@@ -64,8 +64,11 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
         length = file.seek(0, SEEK_END)
         file.seek(0)
         check_beginning(name, file.read(16))
-        os.lseek(file.fileno(), 0, os.SEEK_SET)  # where the process begins to read
-        complaint = _run(file, result, timeout, memory_limit)
+        file.seek(0)  # where the process begins to read
+        try:
+            complaint = _complaint(*_run(file, result, timeout, memory_limit))
+        except subprocess.TimeoutExpired:
+            complaint = f"decoding took longer than {timeout:g} s"
         header = _header(result)
         if complaint is None and "error" in header:
             complaint = _sentence(header, memory_limit)
@@ -116,43 +119,49 @@ def check_beginning(name: str, data: bytes) -> None:
 
 @contextmanager
 def _opened(source: Source) -> Generator[IO[bytes]]:
-    """Give a source as a file of the system: bytes, and files that only Python knows, in a temporary one."""
+    """Give a source as a file of the system, unbuffered as another process will read it; bytes in a temporary one."""
     if isinstance(source, str | os.PathLike):
         path = check_file(source)
         if not path.is_file():
             raise ValueError(f"cannot read {path}: it is not a regular file")
-        with path.open("rb") as file:
+        with path.open("rb", buffering=0) as file:
             yield file
         return
     data = source if isinstance(source, bytes | bytearray | memoryview) else source.read()
     if not isinstance(data, bytes | bytearray | memoryview):
         raise TypeError(f"a raw file must be a path, bytes or a binary file, got a file of {type(data).__name__}")
-    with TemporaryFile() as file:
+    with TemporaryFile(buffering=0) as file:
         file.write(data)
         file.seek(0)
         yield file
 
 
-def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) -> str | None:
-    """Let the decoder read one file and write the other; return what went wrong, if anything did."""
+def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) -> tuple[int, str]:
+    """Let the decoder read one file and write the other; return its exit status and what it printed.
+
+    Raises:
+        subprocess.TimeoutExpired: if it took too long; it is dead by then.
+    """
     arguments = [json.dumps(sys.path), str(int(timeout) + 1), str(int(memory_limit))]
-    try:
-        process = subprocess.run(  # noqa: S603 (our own interpreter and file)
-            [sys.executable, "-I", "-S", str(DECODER), *arguments],
-            stdin=file,
-            stdout=result,
-            stderr=subprocess.PIPE,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # threads that decode nothing, each with its stack
-            timeout=timeout,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return f"decoding took longer than {timeout:g} s"
-    if process.returncode < 0:
-        return f"LibRaw crashed on it ({Signals(-process.returncode).name})"
-    if process.returncode:
-        return f"its decoder failed ({' '.join(process.stderr.decode(errors='replace').split())[-200:]})"
-    return None
+    process = subprocess.run(  # noqa: S603 (our own interpreter and file)
+        [sys.executable, "-I", "-S", str(DECODER), *arguments],
+        stdin=file,
+        stdout=result,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # threads that decode nothing, each with its stack
+        timeout=timeout,
+        check=False,
+    )
+    return process.returncode, process.stderr.decode(errors="replace")
+
+
+def _complaint(status: int, printed: str) -> str | None:
+    """Return what an exit status means; None if all went well."""
+    if status == -SIGXCPU:
+        return "decoding it took more processor time than it may use"
+    if status < 0:
+        return f"LibRaw crashed on it ({Signals(-status).name})"
+    return f"its decoder failed ({' '.join(printed.split())[-200:]})" if status else None
 
 
 def _header(result: IO[bytes]) -> dict[str, Any]:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.sensor.develop import develop
 from kornia_tidy.sensor.raw_decoding import Source, decode_raw, source_bytes, source_name
 from kornia_tidy.sensor.raw_plausible import check_plausible
+
+if TYPE_CHECKING:
+    from kornia_tidy.sensor.noise import SensorNoise
 
 PATTERN_COLORS = {"RGB": "RGBG", "CGMY": "GMCY"}  # LibRaw's order of the channels, by the letters of a filter array
 
@@ -42,6 +46,18 @@ class RawInfo:
     aperture: float | None = None
     focal_length: float | None = None
     timestamp: datetime | None = None
+
+    @property
+    def camera(self) -> str:
+        """Make and model, the make once where the model repeats it; empty if unknown.
+
+        Example:
+            >>> RawInfo("NIKON CORPORATION", "NIKON D5100").camera, RawInfo("Sony", "ILCE-7").camera
+            ('NIKON D5100', 'Sony ILCE-7')
+        """
+        make, model = (self.make or "").strip(), (self.model or "").strip()
+        first = make.split()[0].lower() if make else ""
+        return model if first and first in model.lower() else f"{make} {model}".strip()
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +226,26 @@ class RawCapture:
         levels = levels.flatten().expand(math.prod(shape)).reshape(shape)
         return cls(counts.to(torch.int32), tile, colors, levels, float(white), info=info or RawInfo())
 
+    @classmethod
+    def from_scene(
+        cls,
+        image: Tensor,
+        depth: Tensor,
+        optics: Callable[[Tensor, Tensor], Tensor],
+        camera: RawCapture,
+        noise: SensorNoise | None = None,
+        *,
+        color: str = "camera",
+        generator: torch.Generator | None = None,
+    ) -> RawCapture:
+        """Return what a camera's raw file would hold of a scene with depth.
+
+        See :func:`~kornia_tidy.sensor.raw_simulation.simulate_scene`.
+        """
+        from kornia_tidy.sensor.raw_simulation import simulate_scene  # noqa: PLC0415 (it builds on this file)
+
+        return simulate_scene(image, depth, optics, camera, noise, color=color, generator=generator)
+
     @property
     def tile(self) -> tuple[int, int]:
         """Rows and columns after which the filter array repeats; (1, 1) without one."""
@@ -241,6 +277,10 @@ class RawCapture:
         Without a filter array that is :meth:`mosaic`. Incomplete tiles at the right and the bottom are left out.
         """
         return tile_planes(self.mosaic(), self.tile)
+
+    def to_rgb(self, method: str | None = None, **options: Any) -> Tensor:
+        """Return the capture as a picture, see :func:`~kornia_tidy.sensor.develop.develop`."""
+        return develop(self, method, **options)
 
     def upright(self, image: Tensor) -> Tensor:
         """Return a picture of this capture, (..., H, W), turned as the camera was held."""

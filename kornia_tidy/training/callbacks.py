@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from kornia_tidy.training.pictures import draw_pictures
-from kornia_tidy.training.random_state import random_state, set_random_state
+from kornia_tidy.training.random_state import own_random_state, random_states, set_random_state
 
 LAST, BEST = "last.safetensors", "best.safetensors"
 
@@ -24,7 +24,7 @@ class SaveCheckpoints(pl.Callback):
 
     A run that goes on from ``last.safetensors`` ends with the same weights as one that never stopped: to the bit on
     one process and a CPU, or wherever the operations themselves are deterministic. The states of the global generators
-    are those of the first process.
+    of all processes are saved.
 
     Args:
         folder: where to.
@@ -37,7 +37,7 @@ class SaveCheckpoints(pl.Callback):
         self.folder, self.every, self.monitor, self.patience = Path(folder), every, monitor, patience
         self.best, self.waited = math.inf, 0
         self._saved_step = 0
-        self._pending: Mapping[str, Any] | None = None
+        self._pending: Any = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Begin counting, and stop a run that had stopped."""
@@ -47,7 +47,7 @@ class SaveCheckpoints(pl.Callback):
     def on_train_batch_start(self, *args: Any, **kwargs: Any) -> None:
         """Put the generators where they were: only here is all done that may draw from them on the way."""
         if self._pending is not None:
-            set_random_state(self._pending)
+            set_random_state(own_random_state(self._pending))
             self._pending = None
 
     def on_train_batch_end(self, trainer: pl.Trainer, *args: Any, **kwargs: Any) -> None:
@@ -74,8 +74,8 @@ class SaveCheckpoints(pl.Callback):
         self._save(trainer)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a run needs to go on."""
-        return {"best": self.best, "waited": self.waited, "random": random_state()}
+        """Return what a run needs to go on. All processes take part, as in every save."""
+        return {"best": self.best, "waited": self.waited, "random": random_states()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take what :meth:`state_dict` returned."""

@@ -17,22 +17,32 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.files import write_bytes
+from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
+from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores
 from kornia_tidy.training.pictures import error_map
 from kornia_tidy.training.scenes import Broken, SceneLoader
-from kornia_tidy.training.tasks import centre_crop, image_rmse, nearness, split_maps
+from kornia_tidy.training.tasks import centre_crop, metres, nearness, split_maps
 from kornia_tidy.training.trained import TrainedSystem
 
-Row = dict[str, float]
+Row = dict[str, Any]
+"""``scene``, its number, ``name``, and scores by name."""
+
+ABOUT_ROW = ("scene", "name")
+REACH = 32.0  # near ends of a range without a far end, within which depth is scored in metres
 
 
 class Looked(NamedTuple):
     """One scene as a trained system sees it; maps are (C, H, W)."""
 
     index: int
+    name: str
     coded: Tensor
     estimate: dict[str, Tensor]
     truth: dict[str, Tensor]
+    depth: Tensor
+    """(1, H, W), as the data have it."""
     mask: Tensor
+    """bool (1, H, W), True where depth is known."""
 
 
 @torch.no_grad()
@@ -51,8 +61,7 @@ def evaluate(
         each: is shown every scene, to draw it or to say how far things are.
 
     Returns:
-        One row a scene: ``scene``, and for each map its root mean squared error, of an image in [0, 1] or of nearness
-        in [0, 1]; for images their peak signal-to-noise ratio in dB too. Depth is compared where it is known.
+        One row a scene, with the scores of :func:`image_row` and :func:`depth_row`, as the task has them.
 
     Raises:
         ValueError: if a scene is broken; it is named.
@@ -62,16 +71,68 @@ def evaluate(
         if isinstance(batch, Broken):
             raise ValueError(batch.reason)
         looked = _look(system, batch)
-        row: Row = {"scene": looked.index}
-        for name, maps in looked.estimate.items():
-            known = looked.mask[None] if name == "depth" else None
-            row[f"{name}_rmse"] = float(image_rmse(maps[None], looked.truth[name][None], known))
-            if name == "image":
-                row["image_psnr"] = -20 * math.log10(max(row["image_rmse"], 1e-12))
+        row: Row = {"scene": looked.index, "name": looked.name}
+        if "depth" in looked.estimate:
+            row |= depth_row(system.optics.camera, looked)
+        if "image" in looked.estimate:
+            row |= image_row(looked)
         rows.append(row)
         if each is not None:
             each(looked)
     return rows
+
+
+def image_row(looked: Looked) -> dict[str, float]:
+    """Return the scores of an all-in-focus image, which is not clipped to [0, 1] for them.
+
+    Returns:
+        ``image_rmse``, ``image_psnr`` in dB, and ``image_ssim``; see :mod:`kornia_tidy.reconstruction.metrics`.
+    """
+    scores = image_scores(looked.estimate["image"][None], looked.truth["image"][None])
+    return {f"image_{name}": float(value) for name, value in scores.items()}
+
+
+def depth_row(camera: ThinLensCamera | DefocusRange, looked: Looked) -> dict[str, float]:
+    r"""Return the scores of a depth map where depth is known.
+
+    Args:
+        camera: what turned depth into defocus.
+        looked: the scene.
+
+    Returns:
+        - ``depth_rmse``, of nearness in [0, 1] over the camera's range, as it is learnt, and ``depth_rmse_radians``, of
+          the defocus behind it: papers use both, and PhaseCam3D's radians are 20 times its nearness.
+        - ``depth_rmse_metres``, ``depth_abs_rel``, ``depth_log10`` and ``depth_delta1`` to ``depth_delta3``, of depth
+          in metres, over the share ``depth_counted`` of all pixels. Without these for a camera that knows no metres.
+
+    Convention:
+        In metres those pixels count whose depth is known and lies within :func:`metric_range`, so that infinity, which
+        has no error in metres, does not. Estimates are clamped to this range.
+    """
+    estimate, truth, mask = looked.estimate["depth"][None], looked.truth["depth"][None], looked.mask[None]
+    lo, hi = camera.defocus_range
+    unit, radians = defocus_scores(estimate, truth, mask, span=hi - lo).values()
+    row = {"depth_rmse": unit, "depth_rmse_radians": radians}
+    if isinstance(camera, ThinLensCamera):
+        near, far = metric_range(camera)
+        depth = looked.depth[None].to(estimate)
+        counted = mask & (depth >= near) & (depth <= far)
+        scores = depth_scores(metres(camera, estimate).clamp(near, far), depth, counted)
+        scores["rmse_metres"] = scores.pop("rmse")
+        row |= {f"depth_{name}": value for name, value in scores.items()}
+        row["depth_counted"] = counted.float().mean()
+    return {name: float(value) for name, value in row.items()}
+
+
+def metric_range(camera: ThinLensCamera) -> tuple[float, float]:
+    """Return the depths that are scored in metres: the camera's range, to 32 times its near end if it has no far end.
+
+    Example:
+        >>> metric_range(ThinLensCamera()), metric_range(ThinLensCamera(depth_range=(0.5, 4.0)))
+        ((0.2975, 9.52), (0.5, 4.0))
+    """
+    near, far = camera.depth_range
+    return near, REACH * near if math.isinf(far) else far
 
 
 def mean_row(rows: Sequence[Row]) -> Row:
@@ -83,8 +144,8 @@ def mean_row(rows: Sequence[Row]) -> Row:
     """
     scores = {}
     for name in rows[0]:
-        values = [row[name] for row in rows if not math.isnan(row[name])]
-        if name != "scene":
+        if name not in ABOUT_ROW:
+            values = [row[name] for row in rows if not math.isnan(row[name])]
             scores[name] = sum(values) / len(values) if values else math.nan
     return scores
 
@@ -98,6 +159,22 @@ def write_table(folder: str | os.PathLike[str], rows: Sequence[Row], about: dict
     write_bytes(Path(folder) / "results.csv", text.getvalue().encode())
     summary = {**about, "scenes": len(rows), "mean": mean_row(rows)}
     write_bytes(Path(folder) / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Return the lines of a table of scores: their mean and their range over the scenes that have them.
+
+    Example:
+        >>> for line in table([{"scene": 0, "depth_rmse": 0.25}, {"scene": 1, "depth_rmse": 0.75}]):
+        ...     print(line)
+        score                       mean    lowest   highest
+        depth_rmse                0.5000    0.2500    0.7500
+    """
+    lines = [f"{'score':<20}{'mean':>12}{'lowest':>10}{'highest':>10}"]
+    for name, mean in mean_row(rows).items():
+        values = [row[name] for row in rows if not math.isnan(row[name])] or [math.nan]
+        lines.append(f"{name:<20}{mean:>12.4f}{min(values):>10.4f}{max(values):>10.4f}")
+    return lines
 
 
 def draw_scene(folder: Path, looked: Looked) -> None:
@@ -118,4 +195,5 @@ def _look(system: TrainedSystem, batch: dict[str, Any]) -> Looked:
     maps = split_maps(system.settings.task, system.head(coded).float())
     truth = {"image": sample["all_in_focus"][0], "depth": nearness(system.optics.camera, depth)[0]}
     mask = centre_crop(batch["mask"], *coded.shape[-2:])[0]
-    return Looked(int(batch["index"]), coded[0], {name: m[0] for name, m in maps.items()}, truth, mask)
+    estimate = {name: m[0] for name, m in maps.items()}
+    return Looked(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask)

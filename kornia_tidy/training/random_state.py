@@ -1,26 +1,15 @@
-"""Where randomness comes from in training: states that can be saved, and seeds that follow from what they are for."""
+"""Where randomness comes from in training: states that can be saved, and blocks that are seeded."""
 
 from __future__ import annotations
 
-import hashlib
 import random
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
-
-
-def keyed_seed(*keys: int | str) -> int:
-    """Return a seed that depends on these keys only; those of neighbours are unrelated.
-
-    Example:
-        >>> keyed_seed(0, "noise", 3) == keyed_seed(0, "noise", 3) != keyed_seed(0, "noise", 4)
-        True
-    """
-    digest = hashlib.sha256("/".join(map(str, keys)).encode()).digest()
-    return int.from_bytes(digest[:8], "little") >> 1  # what every generator takes: 63 bits
+import torch.distributed as dist
 
 
 def random_state() -> dict[str, Any]:
@@ -52,6 +41,27 @@ def set_random_state(state: Mapping[str, Any]) -> None:
     np.random.set_state((name, words.numpy().astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
     version, own, spare = state["python"]
     random.setstate((version, tuple(own.tolist()), spare))
+
+
+def random_states() -> list[dict[str, Any]]:
+    """Return :func:`random_state` of each process of a run, in their order; all of them must call it."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return [random_state()]
+    states: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(states, random_state())  # between processes of one run; what is read from files is no pickle
+    return states
+
+
+def own_random_state(states: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return this process's part of what :func:`random_states` returned.
+
+    A run that goes on with more processes than it had gives its states out by turns. A single state, which is what
+    checkpoints held at first, is for all.
+    """
+    if isinstance(states, Mapping):
+        return states
+    rank = dist.get_rank() if dist.is_available() and dist.is_initialized() else 0
+    return states[rank % len(states)]
 
 
 @contextmanager

@@ -17,12 +17,12 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
 
+from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
 from kornia_tidy.training.data_module import SceneData
+from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.module import TidyTraining
-from kornia_tidy.training.random_state import keyed_seed
-from kornia_tidy.training.scenes import make_scenes
 from kornia_tidy.training.settings import TrainingSettings, differences
 from kornia_tidy.training.trained import load_weights
 
@@ -63,6 +63,7 @@ def train(
         OSError: if the disk is full; the last checkpoint is then intact.
     """
     folder = Path(folder)
+    scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
     checkpoint = _prepare(folder, settings, resume)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
@@ -77,14 +78,7 @@ def train(
         if module.average is not None:
             module.average.network.load_state_dict(module.head.state_dict())
     module.settings.write(folder / SETTINGS)
-    data = SceneData(
-        make_scenes(settings, "train"),
-        make_scenes(settings, "validation"),
-        settings.batch,
-        settings.seed,
-        settings.augment,
-        workers,
-    )
+    data = SceneData(scenes, validation, settings.batch, settings.seed, settings.augment, workers)
     callbacks: list[pl.Callback] = [
         SaveCheckpoints(folder, save_every, patience=settings.patience),
         WriteLog(folder),

@@ -1,70 +1,18 @@
-"""Scenes to train on: data sets by name, the order they are seen in, and batches of them that can be repeated."""
+"""Scenes to train on: the order they are seen in, and batches of them that can be repeated."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
-from kornia_tidy.checks import check_choice
-from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.training.random_state import keyed_seed, seeded
-from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.seeds import keyed_seed
+from kornia_tidy.training.random_state import seeded
 
-PIXELS_A_LEAF = 25  # in small scenes, whose leaves else would be specks
 GAIN = (0.8, 1.1)  # range of the brightness that augmentation varies
-
-
-class DeadLeavesScenes(Dataset):
-    """Scenes painted on demand, the same each time: item i follows from the seed and i.
-
-    Args:
-        count: number of scenes.
-        size: side in pixels.
-        depth_range: nearest and farthest depth in metres.
-        seed: data sets of different seeds share no scene.
-
-    Example:
-        >>> sorted(DeadLeavesScenes(2, 32)[0])
-        ['depth', 'image', 'index', 'mask']
-    """
-
-    def __init__(
-        self, count: int, size: int = 278, depth_range: tuple[float, float] = (0.3, float("inf")), seed: int = 0
-    ) -> None:
-        self.count, self.size, self.depth_range, self.seed = count, size, depth_range, seed
-
-    def __len__(self) -> int:
-        """Return the number of scenes."""
-        return self.count
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return one scene."""
-        if not 0 <= index < self.count:
-            raise IndexError(f"the scenes are 0 to {self.count - 1}, got {index}")
-        seed = keyed_seed(self.seed, "scene", index)
-        leaves = min(3000, max(1, self.size**2 // PIXELS_A_LEAF))
-        image, depth = dead_leaves(self.size, self.size, depth_range=self.depth_range, num_leaves=leaves, seed=seed)
-        return {"image": image, "depth": depth, "mask": torch.ones_like(depth, dtype=torch.bool), "index": index}
-
-
-def _dead_leaves(settings: TrainingSettings, split: str) -> Dataset:
-    count = settings.scenes if split == "train" else settings.validation_scenes
-    depths = settings.depth_range or (0.3, float("inf"))
-    return DeadLeavesScenes(count, settings.size, depths, keyed_seed(settings.seed, split))
-
-
-# From settings and split ("train" or "validation") to a map-style data set of {"image", "depth", "mask", "index"}.
-SCENES: dict[str, Callable[[TrainingSettings, str], Dataset]] = {"dead-leaves": _dead_leaves}
-
-
-def make_scenes(settings: TrainingSettings, split: str) -> Dataset:
-    """Return the data set that settings name, of a split: ``"train"`` or ``"validation"``."""
-    check_choice("data", settings.data, tuple(SCENES))
-    return SCENES[settings.data](settings, split)
 
 
 # ---------------------------------------------------------------------- order
@@ -173,7 +121,8 @@ class RepeatableScenes(Dataset):
                     image, depth, mask = augmented(image, depth, mask)
         except (KeyError, OSError, ValueError) as error:
             return Broken(f"scene {index} of the data cannot be used: {error}")
-        return {"image": image, "depth": depth, "mask": mask, "index": index, "epoch": epoch}
+        name = sample.get("name", "")
+        return {"image": image, "depth": depth, "mask": mask, "index": index, "name": name, "epoch": epoch}
 
 
 def augmented(image: Tensor, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -209,8 +158,8 @@ class _Collate:
         if len(sizes) > 1:
             return Broken(f"the scenes of a batch must have one size, got {sorted(sizes)}")
         keys = [key for scene in scenes for key in (scene["epoch"], scene["index"])]
-        tensors = [{name: scene[name] for name in ("image", "depth", "mask", "index")} for scene in scenes]
-        return {**default_collate(tensors), "noise_seed": keyed_seed(self.seed, "noise", *keys)}
+        samples = [{key: scene[key] for key in ("image", "depth", "mask", "index", "name")} for scene in scenes]
+        return {**default_collate(samples), "noise_seed": keyed_seed(self.seed, "noise", *keys)}
 
 
 class SceneLoader(DataLoader):
@@ -229,7 +178,8 @@ class SceneLoader(DataLoader):
         world: number of processes that share the scenes.
 
     Example:
-        >>> loader = SceneLoader(DeadLeavesScenes(4, 32), batch=2)
+        >>> from kornia_tidy.data import DeadLeaves
+        >>> loader = SceneLoader(DeadLeaves(4, 32, 32), batch=2)
         >>> batch = next(iter(loader))
         >>> batch["image"].shape, loader.state_dict()
         (torch.Size([2, 3, 32, 32]), {'epoch': 0, 'batches': 1})

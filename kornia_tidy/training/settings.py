@@ -12,10 +12,12 @@ from typing import Any, Self
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.scene.convolution import BORDERS
-from kornia_tidy.training.tasks import MAPS
+from kornia_tidy.training.tasks import LOSSES, MAPS
 
+SCHEDULES = ("constant", "cosine")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
 
 
@@ -37,15 +39,17 @@ class TrainingSettings:
         color_space: see there. None: its default.
         border: see there.
         head: name of the network, see :data:`kornia_tidy.training.heads.HEADS`.
-        width: channels of its first level. None: its default.
-        data: name of the data, see :data:`kornia_tidy.training.scenes.SCENES`.
-        root: folder of the data, where it needs one.
-        size: side of the scenes in pixels.
+        width: channels of its first level. None: its default; the paper's attention U-Net has 64.
+        residual: the network estimates what is to be added to the capture; for tasks with an image.
+        data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
+        root: folder of the data, where they are files. None: ``data/NAME``.
+        size: side of the scenes in pixels; larger ones are cropped, at random for training.
         scenes: number of training scenes, where the data have no number of their own.
-        validation_scenes: number of scenes that tell how training goes.
+        validation_scenes: number of scenes that tell how training goes, at most.
         augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does.
         lr: learning rate of the network.
         lr_metres: learning rate of the masks in metres of height.
+        schedule: of both rates: ``"constant"``, or ``"cosine"``: up in a tenth of the steps, then down to zero.
         batch: scenes in a batch.
         accumulate: batches in a step of the optimiser.
         epochs: passes over the data.
@@ -55,6 +59,7 @@ class TrainingSettings:
         ema: decay of the moving average of the network. 0: none.
         depth_weight: of the depth loss in the joint task.
         image_weight: of the image loss in the joint task.
+        loss: name of the loss, see :data:`kornia_tidy.training.tasks.LOSSES`.
         precision: of the network.
         seed: everything random follows from it.
 
@@ -77,8 +82,9 @@ class TrainingSettings:
     compositing: str = "gather"
     color_space: str | None = None
     border: str = "reflect"
-    head: str = "plain"
+    head: str = "attention-unet"
     width: int | None = None
+    residual: bool = False
     data: str = "dead-leaves"
     root: str | None = None
     size: int = 278
@@ -87,6 +93,7 @@ class TrainingSettings:
     augment: bool = True
     lr: float = 1e-4
     lr_metres: float = 1e-8
+    schedule: str = "constant"
     batch: int = 32
     accumulate: int = 1
     epochs: int = 300
@@ -95,12 +102,15 @@ class TrainingSettings:
     ema: float = 0.999
     depth_weight: float = 1.0
     image_weight: float = 1.0
+    loss: str = "mse"
     precision: str = "32-true"
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_choice("task", self.task, tuple(MAPS))
+        check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
+        check_choice("schedule", self.schedule, SCHEDULES)
         check_choice("compositing", self.compositing, tuple(COMPOSITING))
         check_choice("border", self.border, BORDERS)
         Fidelity.preset(self.fidelity)
@@ -111,6 +121,8 @@ class TrainingSettings:
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
+        if self.residual and "image" not in MAPS[self.task]:
+            raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
         if self.patience is not None and self.patience < 1:
             raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
         if not 0 <= self.ema < 1:
@@ -121,6 +133,13 @@ class TrainingSettings:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some values changed."""
         return replace(self, **changes)
+
+    def camera(self) -> ThinLensCamera:
+        """Return the lens and the sensor's pixels."""
+        lens: dict[str, Any] = {"focal_length": self.focal_length, "pixel_pitch": self.pixel_pitch}
+        return (
+            ThinLensCamera(**lens) if self.depth_range is None else ThinLensCamera.for_scene(self.depth_range, **lens)
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as a dictionary of plain values."""

@@ -8,11 +8,15 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
+from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
 
 MAPS = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}  # and their channels, in order
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 """From prediction (B, C, H, W), target (B, C, H, W) and validity, bool (B, 1, H, W) or None, to a scalar."""
+
+# The paper's, Ikoma's of depth, and PhaseCam3D's of depth; each for every map of a task.
+LOSSES: dict[str, Loss] = {"mse": mse_loss, "l1": l1_loss, "phasecam3d": phasecam3d_loss}
 
 
 def channels_of(task: str) -> int:
@@ -56,36 +60,39 @@ def nearness(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
     return ((camera.defocus(depth, check_inputs=False) - lo) / (hi - lo)).clamp(0, 1)
 
 
-def mean_square(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the mean squared error over all valid samples of the batch, the paper's loss.
+def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
+    """Return the depth of what networks learn, the inverse of :func:`nearness`.
+
+    Args:
+        camera: as for :func:`nearness`, one that knows metres.
+        nearness: any shape; beyond [0, 1] it is taken as the end of it.
+
+    Returns:
+        Same shape, metres from the near to the far end of the camera's range, which may be infinite.
 
     Example:
         >>> import torch
-        >>> mean_square(torch.zeros(1, 1, 1, 2), torch.tensor([2.0, 5.0]).view(1, 1, 1, 2))
-        tensor(14.5000)
+        >>> metres(ThinLensCamera(), torch.tensor([1.0, 0.5, 0.0]))
+        tensor([0.2975, 0.5950,    inf])
     """
-    if mask is None:
-        return (prediction - target).square().mean()
-    mask = mask.expand_as(target)
-    error = (prediction - target.where(mask, prediction.detach())).where(mask, 0)
-    return error.square().sum() / mask.sum().clamp(min=1)
+    lo, hi = camera.defocus_range
+    return camera.depth(lo + (hi - lo) * nearness.clamp(0, 1))
 
 
 def task_loss(
     loss: Loss, estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor], mask: Tensor, weights: Mapping[str, float]
 ) -> Tensor:
-    """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known."""
-    terms = [weights[name] * loss(estimate[name], truth[name], mask if name == "depth" else None) for name in estimate]
+    """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known.
+
+    A batch whose depth is nowhere known, as a crop may lie in a hole, teaches nothing about depth: that term is zero.
+    """
+    terms = []
+    for name, maps in estimate.items():
+        if name == "depth" and not bool(mask.any()):
+            terms.append(0 * maps.sum())
+        else:
+            terms.append(weights[name] * loss(maps, truth[name], mask if name == "depth" else None))
     return sum(terms[1:], terms[0])
-
-
-def image_rmse(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the root mean squared error of each image, (B,), over its valid pixels; NaN if it has none."""
-    if mask is None:
-        return (prediction - target).square().mean((1, 2, 3)).sqrt()
-    mask = mask.expand_as(target)
-    squares = (prediction - target).square().where(mask, 0).sum((1, 2, 3))
-    return (squares / mask.sum((1, 2, 3))).sqrt()
 
 
 def centre_crop(tensor: Tensor, height: int, width: int) -> Tensor:

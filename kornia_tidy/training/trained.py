@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.phase_masks import FresnelLens, PixelwiseMask
+from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.heads import make_head
@@ -37,13 +37,10 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
         >>> build_optics(TrainingSettings(masks=2, window=23)).window
         23
     """
-    lens: dict[str, Any] = {"focal_length": settings.focal_length, "pixel_pitch": settings.pixel_pitch}
-    near_far = settings.depth_range
-    camera = ThinLensCamera(**lens) if near_far is None else ThinLensCamera.for_scene(near_far, **lens)
     noise = torch.Generator().manual_seed(settings.seed)
     optics = TiDyOptics(
         PixelwiseMask(settings.masks, generator=noise) if settings.masks else FresnelLens(),
-        camera,
+        settings.camera(),
         sensor=SensorNoise(settings.sigma),
         fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
         compositing=settings.compositing,
@@ -61,7 +58,8 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 
 def build_head(settings: TrainingSettings) -> nn.Module:
     """Return the network that settings describe, its weights drawn from the global generator."""
-    return make_head(settings.head, channels_of(settings.task), settings.width)
+    head = make_head(settings.head, channels_of(settings.task), settings.width)
+    return Residual(head) if settings.residual else head
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:

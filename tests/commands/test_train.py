@@ -16,7 +16,8 @@ from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
 
-SMALL = ["--masks", "1", "--size", "40", "--scenes", "4", "--validation-scenes", "1", "--batch", "2", "--width", "4"]
+SMALL = ["--masks", "1", "--head", "plain", "--width", "4"]
+SMALL += ["--size", "40", "--scenes", "4", "--validation-scenes", "1", "--batch", "2"]
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ class TestTrain(BaseTester):
     def test_feature_the_options_are_the_settings(self, run):
         settings = TrainingSettings.read(run / "settings.json")
         expected = TrainingSettings(
-            task="joint", masks=1, size=40, scenes=4, validation_scenes=1, batch=2, width=4, epochs=1,
+            task="joint", masks=1, head="plain", size=40, scenes=4, validation_scenes=1, batch=2, width=4, epochs=1,
             pretrain_epochs=1, lr=1e-3, seed=3, window=settings.window,
         )  # fmt: skip
         assert settings == expected

@@ -5,7 +5,8 @@ import torch
 from torch import nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.training.scenes import Broken, DeadLeavesScenes, SceneLoader
+from kornia_tidy.data import DeadLeaves
+from kornia_tidy.training.scenes import Broken, SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.trained import build_optics, check_weights, load_trained, load_weights
 from tests.base import BaseTester
@@ -19,7 +20,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning"),
     pytest.mark.filterwarnings("ignore::lightning.pytorch.utilities.warnings.PossibleUserWarning"),
 ]
-SETTINGS = TrainingSettings(task="joint", masks=2, width=4, size=48, window=23, lr=1e-3)
+SETTINGS = TrainingSettings(task="joint", masks=2, head="plain", width=4, size=48, window=23, lr=1e-3)
 
 
 def made(**changes):
@@ -28,7 +29,7 @@ def made(**changes):
 
 
 def batch(count=2):
-    return next(iter(SceneLoader(DeadLeavesScenes(count, 48), count)))
+    return next(iter(SceneLoader(DeadLeaves(count, 48, 48), count)))
 
 
 def trainer(folder, steps=2, **options):
@@ -95,7 +96,7 @@ class TestTidyTraining(BaseTester):
         module, types = made(), []
         module.optics.register_forward_hook(lambda m, i, o: types.append(o["image"].dtype))
         module.head.layers[0].register_forward_hook(lambda m, i, o: types.append(o.dtype))
-        trainer(tmp_path, 1, precision=precision).fit(module, SceneLoader(DeadLeavesScenes(2, 48), 2))
+        trainer(tmp_path, 1, precision=precision).fit(module, SceneLoader(DeadLeaves(2, 48, 48), 2))
         assert types == [torch.float32, torch.float32 if precision == "32-true" else torch.bfloat16]
         assert module.optics.masks.phase.dtype == torch.float32
 
@@ -137,7 +138,7 @@ class TestTidyTraining(BaseTester):
 def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     module, run = made(), trainer(folder)
-    run.fit(module, SceneLoader(DeadLeavesScenes(2, 48), 1))
+    run.fit(module, SceneLoader(DeadLeaves(2, 48, 48), 1))
     run.save_checkpoint(folder / "a.safetensors")
     return module, folder / "a.safetensors"
 
@@ -185,11 +186,11 @@ class TestCheckpoint(BaseTester):
     def test_exception_a_run_that_differs_is_not_resumed_from_it(self, changes, sentence, saved, tmp_path):
         module = made(**changes)
         with pytest.raises(ValueError, match=sentence):
-            trainer(tmp_path).fit(module, SceneLoader(DeadLeavesScenes(2, 48), 1), ckpt_path=saved[1])
+            trainer(tmp_path).fit(module, SceneLoader(DeadLeaves(2, 48, 48), 1), ckpt_path=saved[1])
 
     def test_exception_objects_of_ones_own_cannot_be_made_from_a_file(self, tmp_path):
         module, run = TidyTraining(build_optics(SETTINGS), made().head, task="joint"), trainer(tmp_path, 1)
-        run.fit(module, SceneLoader(DeadLeavesScenes(1, 48), 1))
+        run.fit(module, SceneLoader(DeadLeaves(1, 48, 48), 1))
         run.save_checkpoint(tmp_path / "b.safetensors")
         with pytest.raises(ValueError, match="were given as objects"):
             load_trained(tmp_path / "b.safetensors")

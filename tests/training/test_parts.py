@@ -13,10 +13,10 @@ from torch import nn
 from kornia_tidy import DefocusRange, ThinLensCamera
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.heads import make_head
-from kornia_tidy.training.random_state import keyed_seed, random_state, seeded, set_random_state
+from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.state_file import read_state, write_state
-from kornia_tidy.training.tasks import centre_crop, image_rmse, mean_square, nearness, split_maps, task_loss
+from kornia_tidy.training.tasks import LOSSES, centre_crop, metres, nearness, split_maps, task_loss
 from tests.base import BaseTester
 
 
@@ -43,10 +43,10 @@ class TestRandomState(BaseTester):
             assert draws() == one
         assert draws() == expected
 
-    def test_feature_keys_do_not_run_together(self):
-        seeds = {keyed_seed(*keys) for keys in ((1, 2), (12,), (2, 1), ("1", "", "2"), (1,), (0, 1, 2))}
-        assert len(seeds) == 6
-        assert all(0 <= seed < 2**63 for seed in seeds)
+    def test_feature_each_process_takes_its_own_of_the_states_and_a_single_one_is_for_all(self):
+        (state,) = random_states()
+        assert torch.equal(own_random_state([state, {}])["torch"], torch.get_rng_state())
+        assert own_random_state({"torch": 1}) == {"torch": 1}
 
 
 class TestMovingAverage(BaseTester):
@@ -84,26 +84,46 @@ class TestTasks(BaseTester):
         assert nearness(camera, torch.tensor([0.1]))[0] == 1
         self.assert_close(nearness(DefocusRange(), torch.tensor([0.25])), torch.tensor([0.25]))
 
-    def test_feature_masked_pixels_have_no_part_in_loss_and_gradient(self):
+    @pytest.mark.parametrize("name", LOSSES)
+    def test_feature_masked_pixels_have_no_part_in_loss_and_gradient(self, name):
         prediction = torch.rand(2, 1, 4, 4, requires_grad=True)
         target = torch.rand(2, 1, 4, 4)
-        mask = torch.rand(2, 1, 4, 4) > 0.5
+        mask = torch.rand(2, 1, 4, 4) > 0.3
         target[~mask] = float("nan")
-        loss = mean_square(prediction, target, mask)
+        loss = task_loss(LOSSES[name], {"depth": prediction}, {"depth": target}, mask, {"depth": 1.0})
         loss.backward()
-        expected = (prediction.detach()[mask] - target[mask]).square().mean()
-        self.assert_close(loss.detach(), expected)
+        kept = prediction.detach()[mask] - target[mask]
+        expected = {"mse": kept.square().mean(), "l1": kept.abs().mean()}
+        if name in expected:
+            self.assert_close(loss.detach(), expected[name])
+        assert loss.isfinite()
         assert (prediction.grad[~mask] == 0).all()
-        errors = image_rmse(prediction.detach(), target, mask)
-        self.assert_close(errors[0], (prediction.detach()[0][mask[0]] - target[0][mask[0]]).square().mean().sqrt())
+        assert (prediction.grad[mask] != 0).any()
+
+    def test_feature_a_batch_in_a_hole_teaches_nothing_about_depth(self):
+        output, truth = torch.rand(1, 4, 2, 2, requires_grad=True), torch.full((1, 1, 2, 2), float("nan"))
+        maps = {"depth": truth, "image": torch.rand(1, 3, 2, 2)}
+        weights, nowhere = {"depth": 1.0, "image": 1.0}, torch.zeros(1, 1, 2, 2, dtype=torch.bool)
+        loss = task_loss(LOSSES["mse"], split_maps("joint", output), maps, nowhere, weights)
+        loss.backward()
+        self.assert_close(loss.detach(), (output[:, 1:] - maps["image"]).square().mean().detach())
+        assert (output.grad[:, 0] == 0).all()
 
     def test_feature_the_joint_loss_weighs_both_and_masks_depth_only(self):
         output, truth = torch.rand(1, 4, 2, 2), {"depth": torch.rand(1, 1, 2, 2), "image": torch.rand(1, 3, 2, 2)}
         mask = torch.tensor([[[[True, False], [False, False]]]])
         estimate = split_maps("joint", output)
-        loss = task_loss(mean_square, estimate, truth, mask, {"depth": 2.0, "image": 3.0})
+        loss = task_loss(LOSSES["mse"], estimate, truth, mask, {"depth": 2.0, "image": 3.0})
         depth = (output[0, 0, 0, 0] - truth["depth"][0, 0, 0, 0]) ** 2
         self.assert_close(loss, 2 * depth + 3 * (output[:, 1:] - truth["image"]).square().mean())
+
+    @pytest.mark.parametrize("depth_range", [(0.3, float("inf")), (0.5, 4.0)])
+    def test_feature_metres_bring_back_the_depth_that_was_learnt_as_nearness(self, depth_range):
+        depth = torch.tensor([*depth_range, 0.6, 1.5, 3.9], dtype=torch.float64)
+        camera = ThinLensCamera.for_scene(depth_range)
+        self.assert_close(metres(camera, nearness(camera, depth)), depth, rtol=1e-12)
+        ends = metres(camera, torch.tensor([-0.5, 1.5]))
+        self.assert_close(ends, torch.tensor(depth_range[::-1]))
 
     def test_exception_a_head_of_other_channels_is_refused(self):
         with pytest.raises(ValueError, match=r"must return \(B, 1, H, W\)"):
@@ -123,6 +143,12 @@ class TestSettings(BaseTester):
         settings = TrainingSettings()
         assert (settings.lr, settings.lr_metres, settings.batch, settings.masks) == (1e-4, 1e-8, 32, 5)
         assert (settings.depth_weight, settings.image_weight, settings.size) == (1, 1, 278)
+        assert (settings.head, settings.width, settings.loss) == ("attention-unet", None, "mse")
+
+    def test_feature_settings_stored_before_there_was_a_choice_of_loss_are_read(self):
+        values = TrainingSettings(head="plain").as_dict()
+        del values["loss"]
+        assert TrainingSettings.from_dict(values) == TrainingSettings(head="plain", loss="mse")
 
     @pytest.mark.parametrize(
         ("change", "sentence"),
@@ -131,6 +157,7 @@ class TestSettings(BaseTester):
             ({"masks": -1}, "masks must be a whole number of at least 0, got -1"),
             ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
             ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
+            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', got 'ssim'"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),

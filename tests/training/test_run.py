@@ -8,7 +8,8 @@ import os
 import pytest
 import torch
 
-from kornia_tidy.training import scenes, state_file
+from kornia_tidy.data import DeadLeaves
+from kornia_tidy.training import data_sets, scenes, state_file
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.state_file import read_state
 from tests.base import BaseTester
@@ -19,8 +20,9 @@ from kornia_tidy.training.callbacks import drop_rows_after  # noqa: E402
 from kornia_tidy.training.run import train  # noqa: E402
 
 SETTINGS = TrainingSettings(
-    task="depth", masks=1, width=4, size=32, scenes=4, validation_scenes=1, batch=2, epochs=2, window=9, lr=1e-2
-)
+    task="depth", masks=1, head="plain", width=4, size=32, scenes=4, validation_scenes=1, batch=2, epochs=2, window=9,
+    lr=1e-2,
+)  # fmt: skip
 
 
 def rows(path):
@@ -76,14 +78,14 @@ class TestTrain(BaseTester):
     def test_exception_a_broken_scene_stops_by_name_and_the_run_goes_on_once_it_is_mended(
         self, workers, tmp_path, monkeypatch
     ):
-        class Breaking(scenes.DeadLeavesScenes):
+        class Breaking(DeadLeaves):
             def __getitem__(self, index):
                 if broken and index == broken[0]:
                     raise ValueError("cannot read /data/2.png: the file is cut short")
                 return super().__getitem__(index)
 
-        make = {"dead-leaves": lambda settings, split: Breaking(4 if split == "train" else 1, 32)}
-        monkeypatch.setattr(scenes, "SCENES", make)
+        make = {"dead-leaves": lambda settings, split, count: Breaking(4 if split == "train" else 1, 32, 32)}
+        monkeypatch.setattr(data_sets, "SCENES", make)
         order = [index for batch in scenes.EpochBatches(4, 1) for _, index in batch]
         broken = [order[2]]
         settings = SETTINGS.replace(batch=1, epochs=1)

@@ -11,13 +11,10 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.training.scenes import (
     Broken,
-    DeadLeavesScenes,
     EpochBatches,
     RepeatableScenes,
     SceneLoader,
-    make_scenes,
 )
-from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
@@ -152,16 +149,3 @@ class TestSceneLoader(BaseTester):
         assert len(corners) == 4
         assert 0.8 <= min(gains) < 0.85
         assert 1.05 < max(gains) <= 1.1
-
-
-class TestDeadLeavesScenes(BaseTester):
-    def test_feature_splits_share_no_scene_and_repeat(self):
-        settings = TrainingSettings(size=24, scenes=3, validation_scenes=2)
-        train, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
-        assert (len(train), len(validation)) == (3, 2)
-        assert torch.equal(train[1]["image"], make_scenes(settings, "train")[1]["image"])
-        assert not torch.equal(train[1]["image"], validation[1]["image"])
-
-    def test_exception_out_of_range(self):
-        with pytest.raises(IndexError, match="the scenes are 0 to 1, got 2"):
-            DeadLeavesScenes(2, 8)[2]

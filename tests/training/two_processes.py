@@ -11,8 +11,9 @@ from kornia_tidy.training.run import train
 from kornia_tidy.training.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(
-    task="joint", masks=2, width=4, size=48, scenes=40, validation_scenes=2, batch=1, epochs=1, window=23, lr=1e-3
-)
+    task="joint", masks=2, head="plain", width=4, size=48, scenes=40, validation_scenes=2, batch=1, epochs=1,
+    window=23, lr=1e-3,
+)  # fmt: skip
 
 
 if __name__ == "__main__":

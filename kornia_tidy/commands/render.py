@@ -1,0 +1,199 @@
+"""`kornia-tidy render`: a whole data set of scenes as coded captures on disk."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import sys
+import time
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from kornia_tidy.checks import check_positive
+from kornia_tidy.commands.options import seed
+from kornia_tidy.commands.report import tell
+from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
+from kornia_tidy.files import read_bytes
+from kornia_tidy.rendering.layout import BESIDE, Layout
+from kornia_tidy.rendering.render_scenes import render_scenes, shard_items_within
+from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.training.data_sets import SPLITS, make_scenes
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.trained import build_optics, load_trained
+
+OF_SCENES = ("data", "root", "size", "scenes", "validation_scenes", "depth_range", "seed")
+OF_CAMERA = (
+    "masks", "focal_length", "pixel_pitch", "depth_range", "sigma", "fidelity", "compositing", "border",
+)  # fmt: skip
+OF_PRESET = ("sigma", "fidelity", "compositing", "border")  # what may replace a part of a published system
+
+DESCRIPTION = """\
+Photograph every scene of a data set through a camera with phase masks, once and for all,
+and keep the captures to train on. The camera is made of the options below, or is a
+published one (--preset), or one that was trained (--checkpoint).
+
+FOLDER gets render.json (everything that made the captures), the captures, and when all
+of them are there index.csv:
+  000123/coded.png, image.png, depth.npy, mask.png, scene.json     a folder for each scene
+  00004.tar with 000123.coded.png, 000123.depth.npy, ...           --shard-...: WebDataset
+Images are PNG of 16 bits, or with --float NPY (rows, columns, RGB) of float32; image is
+the all-in-focus one; depth is NPY of float32 in metres, inf for a sky; the mask is 255
+where depth is known.
+"""
+
+EPILOG = """\
+Killed or stopped, the same command goes on and ends with the same bytes: a capture or a
+shard appears under its name when it is whole. Captures follow from camera, scene, seed
+and number alone, whatever --jobs is and whichever process renders them (on processors of
+one kind). torchrun's processes, or any with RANK and WORLD_SIZE in their environment,
+share the work, on one machine or on several that see FOLDER.
+
+examples:
+  Scenes made here, through five random masks, on all of 8 cores:
+    kornia-tidy render --scenes 1000 --jobs 8 -o captures
+  The scenes that a training was not shown, through the masks it learnt, in shards:
+    kornia-tidy render --checkpoint outputs/edof/best.safetensors --split test \\
+        --shard-megabytes 500 -o captures
+  Two machines with 16 processes each:
+    torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy.cli render ... -o captures
+
+In Python, in a data loader:
+  from kornia_tidy.rendering import CodedCaptures
+  CodedCaptures("captures")[0]        # {"coded", "image", "depth", "mask", "index", "name"}
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the command to argparse."""
+    parser = subparsers.add_parser(
+        "render",
+        help="data set -> coded captures on disk",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="made if missing")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that render here (default: 1)")
+    parser.add_argument("--noise-seed", type=seed, default=0, metavar="N", help="of the sensor's noise (default: 0)")
+
+    files = parser.add_argument_group("files")
+    files.add_argument(
+        "--beside", nargs="*", choices=BESIDE, default=BESIDE, help="what lies beside the coded image (default: all)"
+    )
+    files.add_argument("--float", action="store_true", help="images as float32 NPY, not as 16-bit PNG")
+    shards = files.add_mutually_exclusive_group()
+    shards.add_argument("--shard-items", type=int, metavar="N", help="tar files of N captures, not folders")
+    shards.add_argument(
+        "--shard-megabytes", type=float, metavar="MB", help="tar files of about this size, judged by the first capture"
+    )
+
+    scenes = parser.add_argument_group("scenes", "With --checkpoint, defaults are those of the training.")
+    add_scene_options(scenes)
+    scenes.add_argument(
+        "--split", choices=SPLITS, default="train", help="part of the data; all: of an rgbd-folder (default: train)"
+    )
+    scenes.add_argument(
+        "--scenes",
+        type=int,
+        metavar="N",
+        help="number of patches and scenes made here; of files at most, but of their train split all "
+        "(default: the split's)",
+    )
+
+    camera = parser.add_argument_group("camera", f"With --preset: {', '.join(f'--{name}' for name in OF_PRESET)} only.")
+    which = camera.add_mutually_exclusive_group()
+    which.add_argument("--preset", choices=tuple(SYSTEMS), metavar="NAME", help=f"one of {', '.join(SYSTEMS)}")
+    which.add_argument("--checkpoint", metavar="FILE", help="best.safetensors of a training")
+    camera.add_argument(
+        "--masks", type=int, default=argparse.SUPPRESS, metavar="K", help="random ones; 0: a Fresnel lens (default: 5)"
+    )
+    add_camera_settings(camera)
+    camera.add_argument(
+        "--seed",
+        type=seed,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help="of random masks and scenes made here (default: 0)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Render, and tell how it went."""
+    rank, world = (_environment(name, default) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
+    optics, settings, camera_from = _camera(args)
+    scenes = make_scenes(settings, args.split, args.scenes)
+    layout = Layout(tuple(args.beside), args.float, args.shard_items)
+    if args.shard_megabytes is not None:
+        check_positive("--shard-megabytes", args.shard_megabytes)
+        size = int(args.shard_megabytes * 1e6)
+        items = shard_items_within(optics, scenes, layout, size, args.noise_seed)
+        layout = Layout(layout.beside, layout.floats, items)
+    values = settings.as_dict()
+    made_from = {**camera_from, "split": args.split, "scenes": {name: values[name] for name in OF_SCENES}}
+    who = f", process {rank + 1} of {world}" if world > 1 else ""
+    if rank == 0:
+        tell("camera", optics.camera.extra_repr())
+        tell("masks", optics.masks.extra_repr())
+        tell("scenes", f"{len(scenes)} of {settings.data!r}, {args.split}")  # ty: ignore[invalid-argument-type]
+    start = time.perf_counter()
+    with tqdm(
+        desc=f"render{who}", file=sys.stderr, leave=False, unit="scene", disable=None if rank == 0 else True
+    ) as bar:
+
+        def each(done: int, total: int) -> None:
+            if bar.total is None:
+                bar.total, bar.initial, bar.n = total, done - 1, done - 1
+            bar.update(done - bar.n)
+
+        try:
+            made, found = render_scenes(
+                optics, scenes, args.output, layout, seed=args.noise_seed, jobs=args.jobs, rank=rank, world=world,
+                made_from=made_from, each=each,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            bar.close()
+            tell("stopped", "the same command goes on")
+            raise
+    seconds = time.perf_counter() - start
+    before = f", {found} were there" if found else ""
+    tell("wrote", f"{args.output}{who}: {made} captures in {seconds:.1f} s, {made / seconds:.2f} a second{before}")
+
+
+def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dict[str, Any]]:
+    """The camera, the settings that scenes are made by, and what the camera was made from."""
+    given = {name: value for name, value in given_settings(args).items() if name != "scenes"}
+    if args.scenes is not None:
+        given |= {"scenes": args.scenes, "validation_scenes": args.scenes}
+    own = [name for name in OF_CAMERA if name in given]
+    allowed, source = (OF_PRESET, "--preset") if args.preset else ((), "--checkpoint")
+    if (args.preset or args.checkpoint) and (wrong := [name for name in own if name not in allowed]):
+        raise ValueError(f"--{wrong[0].replace('_', '-')} does not go with {source}, which has its own")
+    if args.checkpoint:
+        system = load_trained(args.checkpoint)
+        digest = hashlib.sha256(read_bytes(args.checkpoint)).hexdigest()
+        if given.get("data", system.settings.data) != system.settings.data:
+            given = {"root": None, **given}  # the folder was that of the other data
+        return system.optics, system.settings.replace(**given), {"checkpoint": str(args.checkpoint), "sha256": digest}
+    settings = TrainingSettings().replace(**given)
+    if not args.preset:
+        return build_optics(settings), settings, {"options": {name: getattr(settings, name) for name in OF_CAMERA}}
+    overrides: dict[str, Any] = {name: given[name] for name in own if name != "sigma"}
+    if "sigma" in own:
+        overrides["sensor"] = SensorNoise(settings.sigma)
+    noise = torch.Generator().manual_seed(settings.seed)
+    optics = TiDyOptics.from_preset(args.preset, generator=noise, **overrides)
+    seen = settings.replace(depth_range=getattr(optics.camera, "depth_range", None))
+    return optics, seen, {"preset": args.preset, "options": {name: given[name] for name in own}}
+
+
+def _environment(name: str, default: int) -> int:
+    text = os.environ.get(name, str(default))
+    if not text.isdecimal():
+        raise ValueError(f"{name} in the environment must be a whole number, got {text!r}")
+    return int(text)

@@ -1,0 +1,157 @@
+"""Data sets by name: scenes to train on, others that tell how training goes, and others again to be judged by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch.utils.data import Dataset, Subset
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data.flying_things import FOCAL_PX, NEAREST, paper_patches, split_frames
+from kornia_tidy.data.nyu_depth import NYUDepthV2
+from kornia_tidy.data.patches import central_crop, random_crop
+from kornia_tidy.data.remembered import Remembered
+from kornia_tidy.data.rgbd_folder import described_folder
+from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.seeds import keyed_seed
+from kornia_tidy.training.random_state import seeded
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.tasks import metres
+
+SPLITS = ("train", "validation", "test", "all")
+PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}
+SHARE = 10  # one in so many scenes is for validation, and one for testing where nothing else is published
+TESTED = 32  # scenes made here, unless asked for more
+
+
+def make_scenes(settings: TrainingSettings, split: str, count: int | None = None) -> Dataset[Any]:
+    """Return the data set that settings name.
+
+    Args:
+        settings: its ``data``, ``root``, ``size``, ``scenes``, ``validation_scenes``, ``depth_range`` and ``seed``.
+        split: ``"train"``, ``"validation"`` or ``"test"``; ``"all"`` of a folder that was not trained on.
+        count: scenes for ``"test"`` or ``"all"``, drawn by the seed. None: all of them.
+
+    Returns:
+        A map-style data set of ``{"image", "depth", "mask", "index", "name"}``, with depth in metres. Scenes of files
+        are cropped to the size: for training at a place that follows from torch's global generator, else in the middle.
+
+    Raises:
+        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        ValueError: if a name is unknown, the first scene is smaller than the size, or the data cannot be used.
+
+    Example:
+        >>> scenes = make_scenes(TrainingSettings(size=32, scenes=3), "train")
+        >>> len(scenes), scenes[0]["image"].shape
+        (3, torch.Size([3, 32, 32]))
+    """
+    check_choice("data", settings.data, tuple(SCENES))
+    check_choice("split", split, SPLITS if settings.data == "rgbd-folder" else SPLITS[:3])
+    if count is not None and count < 1:
+        raise ValueError(f"the number of scenes must be 1 or more, got {count}")
+    scenes = SCENES[settings.data](settings, split, count)
+    with seeded(0):
+        scenes[0]  # most data have one size: what is too small is found here, before any work
+    return scenes
+
+
+def _dead_leaves(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+    counts = {"train": settings.scenes, "validation": settings.validation_scenes, "test": count or TESTED}
+    depths = settings.depth_range or (0.3, math.inf)
+    seed = keyed_seed(settings.seed, split)
+    return Remembered(DeadLeaves(counts[split], settings.size, settings.size, depth_range=depths, seed=seed))
+
+
+def _flying_things(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+    """Frames have no size: they are taken to be so large that their nearest things are at the camera's near end."""
+    baseline = settings.camera().depth_range[0] * NEAREST / FOCAL_PX
+    frames = split_frames(_root(settings), PUBLISHED[split], baseline_m=baseline, transform=_Cut.of(settings, split))
+    return _limited(frames, settings, split, count)
+
+
+def _flying_things_patches(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+    """Their normalised disparity goes from the far to the near end of the camera's range, as it does in the paper."""
+    cut = _Cut.of(settings, split)._replace(camera=settings.camera())
+    options: dict[str, Any] = {"seed": settings.seed, "transform": cut}
+    if split == "train":
+        options["count"] = settings.scenes
+    return _limited(paper_patches(_root(settings), PUBLISHED[split], **options), settings, split, count)
+
+
+def _nyu(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+    """Validation takes every tenth run of the published training frames: neighbours show the same room."""
+    published = "test" if split == "test" else "train"
+    frames = NYUDepthV2(_root(settings), published, transform=_Cut.of(settings, split))
+    if split == "test":
+        return _limited(frames, settings, split, count)
+    run = max(1, len(frames) // SHARE**2)
+    held_out = [i for i in range(len(frames)) if i // run % SHARE == SHARE - 1] or [len(frames) - 1]
+    kept = sorted(set(range(len(frames))) - set(held_out))
+    return _limited(Subset(frames, kept if split == "train" else held_out), settings, split, count)
+
+
+def _rgbd_folder(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+    """A tenth for validation and a tenth for testing, drawn by the seed."""
+    pairs = described_folder(_root(settings), _Cut.of(settings, split))
+    if split == "all":
+        return _limited(pairs, settings, split, count)
+    part = max(1, len(pairs) // SHARE)
+    if len(pairs) < 3:
+        raise ValueError(f"{_root(settings)} has {len(pairs)} scenes: 3 or more are needed to train, validate and test")
+    ends = {"validation": (0, part), "test": (part, 2 * part), "train": (2 * part, len(pairs))}[split]
+    return _limited(Subset(pairs, _order(len(pairs), settings.seed)[slice(*ends)]), settings, split, count)
+
+
+Maker = Callable[[TrainingSettings, str, int | None], Dataset[Any]]
+SCENES: dict[str, Maker] = {
+    "dead-leaves": _dead_leaves,
+    "flying-things": _flying_things,
+    "flying-things-patches": _flying_things_patches,
+    "nyu": _nyu,
+    "rgbd-folder": _rgbd_folder,
+}
+
+
+class _Cut(NamedTuple):
+    """Cuts a scene to the size, at random or in the middle, and turns normalised disparity to metres for a camera."""
+
+    size: int
+    at_random: bool
+    camera: ThinLensCamera | None = None
+
+    @classmethod
+    def of(cls, settings: TrainingSettings, split: str) -> _Cut:
+        return cls(settings.size, split == "train")
+
+    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+        height, width = sample["image"].shape[-2:]
+        if min(height, width) < self.size:
+            raise ValueError(
+                f"{sample['name']} has {height} x {width} pixels: choose a size of {min(height, width)} or less, not "
+                f"{self.size}"
+            )
+        sample = (random_crop if self.at_random else central_crop)(sample, self.size)
+        return sample if self.camera is None else {**sample, "depth": metres(self.camera, sample["depth"])}
+
+
+def _root(settings: TrainingSettings) -> Path:
+    return Path("data", settings.data) if settings.root is None else Path(settings.root)
+
+
+def _limited(scenes: Any, settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+    """At most as many scenes as asked for, drawn by the seed."""
+    if not len(scenes):
+        raise ValueError(f"{_root(settings)} has no scenes for the split {split!r}")
+    limit = {"train": None, "validation": settings.validation_scenes}.get(split, count)
+    if limit is not None and limit < len(scenes):
+        scenes = Subset(scenes, sorted(_order(len(scenes), settings.seed)[:limit]))
+    return scenes
+
+
+def _order(count: int, seed: int) -> list[int]:
+    return torch.randperm(count, generator=torch.Generator().manual_seed(keyed_seed(seed, "split"))).tolist()
