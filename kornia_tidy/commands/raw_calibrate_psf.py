@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,6 +17,9 @@ from kornia_tidy.data.image_files import SUFFIXES, read_image
 from kornia_tidy.files import replacing
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.sensor.noise import SensorNoise
+
+if TYPE_CHECKING:
+    from kornia_tidy.calibration.point_images import Tile
 
 DESCRIPTION = """\
 Measure the PSFs of a camera from pictures of a point of light at known distances.
@@ -82,9 +85,8 @@ def run(args: argparse.Namespace) -> None:
     stages = Stages()
     with stages("measure"):
         images = _images(args, places)
-        channels = len(next(iter(images.values()))[0].light)
-        cutoff = _cutoff(camera, channels, mosaic=channels == 4)
-        measured = measure_psfs(images, camera, args.window, cutoff)
+        channels = 1 + max(next(iter(images.values()))[0].channels)
+        measured = measure_psfs(images, camera, args.window, _cutoff(camera, channels))
     tell("camera", camera.extra_repr())
     for report in measured.reports:
         if report.rejected is not None:
@@ -153,37 +155,36 @@ def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
     for distance in args.distances:
         images[distance] = []
         for _ in range(places):
-            frames, phases = zip(*[_read(next(files), args) for _ in args.exposures], strict=True)
+            frames, tiles = zip(*[_read(next(files), args) for _ in args.exposures], strict=True)
             if len({frame.shape for frame in frames}) > 1:
                 raise ValueError(f"the exposures of one place differ in size: {[tuple(f.shape) for f in frames]}")
             reference = _read(next(references), args)[0] if args.reference else None
             images[distance] += point_images(
-                torch.stack(frames), exposures, sensor, args.window, args.points, reference, phases[0]
+                torch.stack(frames), exposures, sensor, args.window, args.points, reference, tiles[0]
             )
     return images
 
 
-def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tensor]:
-    """Return linear light (C, H, W), and the place of each channel's pixels in the tile, in pixels of a channel."""
+def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tile | None]:
+    """Return linear light (C, H, W), of a mosaic its planes with the channels that its tile sees."""
     if Path(path).suffix.lower() in SUFFIXES:
-        light = read_image(path)
-        return light, torch.zeros(len(light), 2)
+        return read_image(path), None
     raw = open_raw(path, args)
     rows, columns = raw.tile
     if (rows, columns) not in {(1, 1), (2, 2)}:
         raise ValueError(f"cannot measure PSFs on {path}: its tile is {rows}x{columns}, 2x2 or none is needed")
-    planes = raw.planes()
-    if (rows, columns) == (1, 1):
-        return planes, torch.zeros(len(planes), 2)
-    return planes, torch.tensor([(row / rows, column / columns) for row in range(rows) for column in range(columns)])
+    if raw.pattern is None:
+        return raw.planes(), None
+    letters = "".join(dict.fromkeys(raw.colors))  # both greens are one channel
+    return raw.planes(), tuple(tuple(letters.index(raw.colors[color]) for color in row) for row in raw.pattern)
 
 
-def _cutoff(camera: ThinLensCamera, channels: int, mosaic: bool) -> float | list[float]:
+def _cutoff(camera: ThinLensCamera, channels: int) -> list[float]:
     """Return the highest frequency that the lens passes, at the shortest wavelength a channel may see."""
     from kornia_tidy.calibration.measured_psfs import diffraction_cutoff  # noqa: PLC0415
 
     shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)
-    return [min(4.0, diffraction_cutoff(camera, wave) * (2 if mosaic else 1)) for wave in shortest]
+    return [min(2.0, diffraction_cutoff(camera, wave)) for wave in shortest]
 
 
 def _spectrum(channels: int) -> Any:

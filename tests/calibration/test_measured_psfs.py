@@ -11,7 +11,7 @@ from kornia_tidy.calibration import MeasuredPSFs, diffraction_cutoff, measure_ps
 from kornia_tidy.optics.initial_masks import fisher_mask
 from kornia_tidy.scene.compositing import render
 from tests.base import BaseTester
-from tests.calibration.captures import exposed, on_pixels, point_light
+from tests.calibration.captures import exposed, on_pixels, planes, point_light
 
 WINDOW, SIDE = 21, 85
 CAMERA, SPECTRUM = ThinLensCamera(), Spectrum.rgb()
@@ -134,23 +134,23 @@ class TestMeasurePSFs(BaseTester):
         ]
         self.assert_close(*banks, atol=1e-7)
 
-    def test_feature_planes_of_a_mosaic_are_each_at_their_own_place(self, coded, flat):
-        """Four planes of a sensor whose tiles are the pixels of this camera: ninths stand for the half pixel."""
-        fine = {z: coded[z][1:2] for z in DISTANCES}
-        phases = torch.tensor([(0.0, 0.0), (0.0, 4 / 9), (4 / 9, 0.0), (4 / 9, 4 / 9)])
+    def test_feature_a_mosaic_gives_the_psfs_on_the_pixels_of_the_sensor(self, coded, flat, truth):
+        """Each plane has every second pixel; the places of the point make up for it, both greens together."""
+        tile = ((0, 1), (1, 2))
         generator = torch.Generator().manual_seed(0)
         images = []
-        for _ in range(8):
-            down, right = torch.randint(-2, 5, (2,), generator=generator).tolist()
-            planes = [on_pixels(fine[0.8], (down - round(9 * y), right - round(9 * x)))[0] for y, x in phases.tolist()]
-            clear = [on_pixels(flat[0.8], (down - round(9 * y), right - round(9 * x)))[1] for y, x in phases.tolist()]
-            frame = torch.stack(planes) / torch.stack(planes).max() * 0.5
-            clear = torch.stack(clear) / torch.stack(clear).max() * 0.5
-            images += point_images(frame[None], torch.ones(1), SENSOR, WINDOW, reference=clear, phases=phases)
-        found = measure_psfs({0.8: images}, CAMERA, WINDOW, CUTOFF[1]).bank.psfs
-        wanted = on_pixels(fine[0.8])[0, INSIDE, INSIDE]
-        wanted = wanted / wanted.sum()
-        assert float((found[0] - wanted).abs().sum((1, 2)).max()) < 0.02
+        for _ in range(24):
+            ninths = tuple(torch.randint(-9, 10, (2,), generator=generator).tolist())
+            frames, clear = (planes(on_pixels(fine[0.8], ninths), tile) for fine in (coded, flat))
+            frames = exposed(0.5 * frames / frames.max(), EXPOSURES, generator, 10500, 2.4, 0.003)
+            clear = exposed(0.8 * clear / clear.max(), torch.ones(1), generator, 10500, 2.4, 0.003)[0]
+            images += point_images(frames, EXPOSURES, SENSOR, WINDOW, reference=clear, tile=tile)
+        found = measure_psfs({0.8: images}, CAMERA, WINDOW, CUTOFF)
+        error = (found.bank.psfs - truth[:1]).abs().sum((2, 3))
+        assert float(error.max()) < 0.03
+        assert bool((error < 1.6 * 0.798 * found.uncertainty.sum((2, 3))).all())
+        middle = [(report.row, report.column) for report in found.reports]
+        self.assert_close(torch.tensor(middle).mean(0), torch.full((2,), SIDE // 2 * 1.0), rtol=0, atol=0.3)
 
 
 class TestMeasuredPSFs(BaseTester):
