@@ -46,7 +46,8 @@ class MeasuredPSFs:
 
     Args:
         bank: the PSFs, each summing to one: what light leaves the window is not seen and counted as none.
-        uncertainty: (D, C, P, P) standard deviation of each, of the noise in the captures.
+        uncertainty: (D, C, P, P) standard deviation of each, of the noise in the captures. What else there is, such as
+            a point that moved between the frames, shows in the misfit of the reports.
         distances: (D,) in metres, of the bank's nodes: from far to near.
         reports: of every point image.
     """

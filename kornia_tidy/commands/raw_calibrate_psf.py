@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.commands.options import add_lens_options, make_lens
 from kornia_tidy.commands.raw_options import add_dump_options, open_raw
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import SUFFIXES, read_image
-from kornia_tidy.files import replacing
+from kornia_tidy.files import check_file, replacing
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -24,10 +24,13 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Measure the PSFs of a camera from pictures of a point of light at known distances.
 At each distance the point is moved by parts of a pixel between the pictures: a
-sensor that samples too coarsely sees a PSF only in several pictures together; 8
-to 16 are good. FILES are raw files (of a mosaic each plane is measured on its own)
-or 16-bit images of linear light, black level taken off; sorted by distance, then
-by place of the point, then by exposure.
+sensor that samples too coarsely sees a PSF only in several pictures together. 16
+places are good, 24 behind a filter array; they need not be known. Several exposures
+at each place, the longer ones saturated, show the faint parts of a PSF as well.
+FILES are raw files or 16-bit images of linear light, black level taken off; sorted
+by distance, then by place of the point, then by exposure. Of a filter array's
+planes those of one colour make one PSF, on the pixels of the sensor: the bank is
+one of red, green and blue.
 """
 
 EXAMPLES = """\
@@ -41,9 +44,17 @@ examples:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
         --reference flat*.tif -o bank.safetensors --picture bank.png --fit-mask mask.npy
 
+What is printed tells how far to trust the bank: "noise" is the error to be expected,
+the sum of its moduli over the PSF's light; "residuals" of about 1 say that the
+pictures of one distance fit each other, far larger ones that something moved or
+that --full-well, --read-noise or the black level are wrong. Without --reference the
+PSF's centre of light is its centre, and what masks do to move it is not seen.
+
 In Python:
   bank = PSFBank.load("bank.safetensors")
   coded = TiDyOptics(camera=..., sensor=...).with_bank(bank)(image, depth)
+  sharp = Tikhonov()(capture, bank)  # of linear light
+  MeasuredPSFs.load("bank.safetensors").uncertainty  # and .distances, .reports of every picture
 """
 
 
@@ -63,7 +74,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT", help="bank to write, .safetensors")
     parser.add_argument("--reference", nargs="+", metavar="FILE", help="the same places with a flat mask, unsaturated")
-    parser.add_argument("--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels (default: 41)")
+    parser.add_argument("--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels of the sensor (default: 41)")
     parser.add_argument("--points", type=int, default=1, metavar="N", help="points in each picture (default: 1)")
     parser.add_argument("--picture", metavar="PNG", help="draw PSFs, uncertainties and residuals")
     parser.add_argument("--fit-mask", metavar="NPY", help="find the mask behind the PSFs and write its heights, metres")
@@ -94,9 +105,11 @@ def run(args: argparse.Namespace) -> None:
             tell("left out", f"the point at {report.distance:g} m, {where}: {report.rejected}")
     noise = (2 / torch.pi) ** 0.5 * measured.uncertainty.sum((2, 3))
     for distance, psi, own in zip(measured.distances, measured.bank.defocus, noise, strict=True):
-        used = sum(r.rejected is None for r in measured.reports if r.distance == float(distance))
+        used = [r for r in measured.reports if r.distance == float(distance) and r.rejected is None]
+        times = (sum(r.misfit or 0.0 for r in used) / len(used)) ** 0.5
         words = " ".join(f"{100 * float(x):.2g}" for x in own)
-        tell("PSF", f"{float(distance):g} m, psi {float(psi):+.2f} rad: {used} point images, noise {words} % in L1")
+        where = f"{float(distance):g} m, psi {float(psi):+.2f} rad"
+        tell("PSF", f"{where}: {len(used)} point images, residuals {times:.2g} times the noise, noise {words} % in L1")
     measured.save(args.output)
     tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     fit = None
@@ -136,6 +149,14 @@ def _check_arguments(args: argparse.Namespace) -> int:
             f"exposures at each place"
         )
     places = len(args.files) // groups
+    inputs = {check_file(path).resolve() for path in [*args.files, *(args.reference or [])]}
+    for path in (args.output, args.picture, args.fit_mask):
+        if path is not None and Path(path).resolve() in inputs:
+            raise ValueError(f"cannot write {path}: it is an input")
+    if args.fit_mask is not None:
+        check_positive("--mask-size", args.mask_size)
+        if len(args.distances) < 2:
+            raise ValueError("--fit-mask needs two distances or more: one does not tell a mask from its twin")
     if args.reference is not None and len(args.reference) != places * len(args.distances):
         raise ValueError(
             f"--reference needs one file for each of {places * len(args.distances)} places, got {len(args.reference)}"
