@@ -121,7 +121,10 @@ def resolve_psf(
     spectral_variances = torch.fft.fft2(variances)
     for down in range(finer):
         for right in range(finer):
-            own = torch.exp(2j * math.pi * frequency * down / finer), torch.exp(2j * math.pi * frequency * right / finer)
+            own = (
+                torch.exp(2j * math.pi * frequency * down / finer),
+                torch.exp(2j * math.pi * frequency * right / finer),
+            )
             between = _folded(spectrum * own[0][:, None] * own[1], side)
             ramps = torch.einsum("ay,bx->yxab", *(ramp.unflatten(0, (aliases, side)) for ramp in own)).flatten(2)
             # What an image adds to the PSF, and how its noise spreads.

@@ -117,7 +117,9 @@ def _fit(stack: _Stack, offsets: Tensor, brightness: Tensor, used: Tensor) -> _F
     for plane, channel in enumerate(stack.channels):
         image, slopes = psfs[channel].seen_from(offsets - stack.phases[plane])
         design = torch.cat([image[:, None], slopes], 1)[..., INSIDE, INSIDE].flatten(2)  # (N, 3, pixels)
-        light, variance = (x[:, plane, INSIDE, INSIDE].flatten(1) for x in (stack.light / scale, stack.variance / scale**2))
+        light, variance = (
+            x[:, plane, INSIDE, INSIDE].flatten(1) for x in (stack.light / scale, stack.variance / scale**2)
+        )
         residual = light - design[:, 0]
         weighted = design / variance[:, None]
         normal = normal + weighted @ design.mT

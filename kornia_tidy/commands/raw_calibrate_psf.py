@@ -74,7 +74,9 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT", help="bank to write, .safetensors")
     parser.add_argument("--reference", nargs="+", metavar="FILE", help="the same places with a flat mask, unsaturated")
-    parser.add_argument("--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels of the sensor (default: 41)")
+    parser.add_argument(
+        "--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels of the sensor (default: 41)"
+    )
     parser.add_argument("--points", type=int, default=1, metavar="N", help="points in each picture (default: 1)")
     parser.add_argument("--picture", metavar="PNG", help="draw PSFs, uncertainties and residuals")
     parser.add_argument("--fit-mask", metavar="NPY", help="find the mask behind the PSFs and write its heights, metres")

@@ -52,7 +52,10 @@ class TestPointImages(BaseTester):
 
     def test_feature_several_points_in_one_picture(self):
         found = point_images((spot(30, 30) + 0.8 * spot(60, 78))[None], ONCE, SENSOR, 15, points=2)
-        assert [image.place for image in found] == [pytest.approx((30, 30), abs=0.02), pytest.approx((60, 78), abs=0.02)]
+        assert [image.place for image in found] == [
+            pytest.approx((30, 30), abs=0.02),
+            pytest.approx((60, 78), abs=0.02),
+        ]
 
     def test_exception_a_point_at_the_border_has_a_fault(self):
         (image,) = point_images(spot(4, 55)[None], ONCE, SENSOR, 21)
