@@ -23,8 +23,8 @@ class ResolvedPSF:
     Args:
         spectrum: (L, L) complex; L is a whole multiple, twice the band, of the side M of the images it came of.
         band: highest frequency along either axis, in cycles per sample.
-        psf: (M, M) samples with the chief ray at the centre, M // 2.
-        variance: (M, M) of these.
+        psf: samples, as many to the image's one as asked for, the chief ray on that of the image's pixel M // 2.
+        variance: of these.
         leverage: share of an image's noise that the PSF has taken up, from 0, as in the mean of many, to 1.
     """
 
@@ -56,7 +56,9 @@ class ResolvedPSF:
         return length // (2 * self.band), _frequencies(length, self.band, self.spectrum.device)
 
 
-def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: float = 1.0) -> ResolvedPSF:
+def resolve_psf(
+    patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: float = 1.0, finer: int = 1
+) -> ResolvedPSF:
     r"""Return the PSF that explains point images at several places: least squares for all aliases of each frequency.
 
     .. math:: Y_i(f) = \sum_k H(f + k) e^{-2 \pi i (f + k) \cdot \delta_i} + n_i(f)
@@ -70,6 +72,7 @@ def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: flo
             pixel (M // 2, M // 2); within a sample or so.
         variances: (N, M, M).
         cutoff: :math:`f_c`, highest frequency that the lens passes, in cycles per sample.
+        finer: samples of the PSF to one of the images along each axis, as a mosaic's planes have only each second pixel.
 
     Returns:
         The PSF with its variance, propagated through the linear system.
@@ -114,10 +117,22 @@ def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: flo
 
     solved = (gains @ spectra.permute(1, 2, 0)[..., None])[..., 0]
     spectrum = solved.unflatten(2, (aliases, aliases)).permute(2, 0, 3, 1).reshape(length, length)
-    psf = _centred(torch.fft.ifft2(_folded(spectrum, side)).real)
-    filters = torch.fft.ifft2(gains.sum(2), dim=(0, 1)).real.permute(2, 0, 1)  # what an image adds to the PSF
-    spread = torch.fft.fft2(filters.square()) * torch.fft.fft2(variances)
-    variance = torch.fft.ifft2(spread.sum(0)).real
+    psf, variance = (torch.empty(finer * side, finer * side, dtype=torch.float64).to(patches) for _ in range(2))
+    spectral_variances = torch.fft.fft2(variances)
+    for down in range(finer):
+        for right in range(finer):
+            own = (
+                torch.exp(2j * math.pi * frequency * down / finer),
+                torch.exp(2j * math.pi * frequency * right / finer),
+            )
+            between = _folded(spectrum * own[0][:, None] * own[1], side)
+            ramps = torch.einsum("ay,bx->yxab", *(ramp.unflatten(0, (aliases, side)) for ramp in own)).flatten(2)
+            # What an image adds to the PSF, and how its noise spreads.
+            filters = torch.fft.ifft2((gains * ramps[..., None]).sum(2), dim=(0, 1)).real.permute(2, 0, 1)
+            spread = torch.fft.fft2(filters.square()) * spectral_variances
+            place = slice(down, None, finer), slice(right, None, finer)
+            psf[place] = _centred(torch.fft.ifft2(between).real)
+            variance[place] = torch.fft.ifft2(spread.sum(0)).real
     return ResolvedPSF(spectrum, band, psf, variance.clamp(min=0), leverage)
 
 

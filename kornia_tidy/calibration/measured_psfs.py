@@ -11,8 +11,9 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from kornia_tidy.calibration.point_images import MARGIN, PointImage
+from kornia_tidy.calibration.point_images import PointImage
 from kornia_tidy.calibration.registration import Registered, register
+from kornia_tidy.calibration.shrinkage import shrink
 from kornia_tidy.checks import check_depth
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.psf_bank import PSFBank
@@ -24,7 +25,7 @@ class PointReport:
 
     Args:
         distance: of the point in metres.
-        row: where its chief ray fell, in pixels.
+        row: where its chief ray fell, in pixels of the sensor.
         column: as well.
         brightness: over the mean of those used at this distance; None if it was never used.
         misfit: mean square of its residuals in units of their variance, 1 is noise; None likewise.
@@ -45,7 +46,8 @@ class MeasuredPSFs:
 
     Args:
         bank: the PSFs, each summing to one: what light leaves the window is not seen and counted as none.
-        uncertainty: (D, C, P, P) standard deviation of each, of the noise in the captures.
+        uncertainty: (D, C, P, P) standard deviation of each, of the noise in the captures. What else there is, such as
+            a point that moved between the frames, shows in the misfit of the reports.
         distances: (D,) in metres, of the bank's nodes: from far to near.
         reports: of every point image.
     """
@@ -121,12 +123,23 @@ def measure_psfs(
     Args:
         images: of each distance in metres, from :func:`point_images`.
         camera: what turns a distance into defocus.
-        window: side P of the PSFs in pixels, that of the images.
-        cutoff: highest frequency that the lens passes in each channel, in cycles per pixel, see
+        window: side P of the PSFs in pixels of the sensor, that of the images.
+        cutoff: highest frequency that the lens passes in each channel, in cycles per pixel of the sensor, see
             :func:`diffraction_cutoff`.
 
     Raises:
-        ValueError: if at some distance no image can be used.
+        ValueError: if at some distance no image can be used, or the cutoffs are not one a channel.
+
+    Example:
+        >>> from kornia_tidy import SensorNoise
+        >>> from kornia_tidy.calibration import point_images
+        >>> x, camera = torch.arange(64.0), ThinLensCamera()
+        >>> spot = lambda at: 0.8 * torch.exp(-((x[:, None] - 32) ** 2 + (x - at) ** 2) / 8)[None, None]
+        >>> sensor = SensorNoise.physical(10500, 2.4)
+        >>> points = [point_images(spot(at), torch.ones(1), sensor, 15)[0] for at in (31.8, 32.0, 32.2)]
+        >>> measured = measure_psfs({0.595: points}, camera, 15, diffraction_cutoff(camera, 530e-9))
+        >>> measured.bank.psfs.shape, round(float(measured.bank.psfs.sum()), 4)
+        (torch.Size([1, 1, 15, 15]), 1.0)
     """
     check_depth(torch.tensor(list(images)))
     nodes = sorted((float(camera.defocus(torch.tensor(z, dtype=torch.float64))), z) for z in images)
@@ -135,23 +148,42 @@ def measure_psfs(
         own = list(images[distance])
         good = [image for image in own if image.fault is None]
         reports += [
-            PointReport(distance, *image.place, None, None, image.fault) for image in own if image.fault is not None
+            PointReport(distance, *(_finer(image) * x for x in image.place), None, None, image.fault)
+            for image in own
+            if image.fault is not None
         ]
         if not good:
             faults = "; ".join(str(image.fault) for image in own) or "there is none"
             raise ValueError(f"no point image at {distance:g} m can be used: {faults}")
-        channels = len(good[0].light)
-        found = register(good, [cutoff] * channels if isinstance(cutoff, (int, float)) else cutoff)
+        channels = 1 + max(good[0].channels)
+        limits = [cutoff] * channels if isinstance(cutoff, (int, float)) else list(cutoff)
+        if len(limits) != channels:
+            raise ValueError(f"cutoff must be one number, or one for each of {channels} channels, got {limits}")
+        found = register(good, limits)
         reports += _reports(distance, good, found)
-        inside = slice(MARGIN, -MARGIN)
-        psf = torch.stack([one.psf[inside, inside] for one in found.psfs])
+        psf, variance = (
+            torch.stack([_central(getattr(one, name), good[0], window) for one in found.psfs])
+            for name in ("psf", "variance")
+        )
         total = psf.sum((1, 2))[:, None, None]
-        psfs.append((psf / total).clamp(min=0))
-        deviations.append(torch.stack([one.variance[inside, inside] for one in found.psfs]).sqrt() / total)
+        psf, variance = shrink(psf / total, variance / total**2)
+        psfs.append(psf.clamp(min=0))
+        deviations.append(variance.sqrt())
     defocus = torch.tensor([psi for psi, _ in nodes], dtype=torch.float32)
     bank = PSFBank.from_measured(torch.stack(psfs).float(), defocus)
     distances = torch.tensor([distance for _, distance in nodes], dtype=torch.float64)
     return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports))
+
+
+def _finer(image: PointImage) -> int:
+    """Pixels of the sensor to one of the image."""
+    return 1 if image.tile is None else len(image.tile)
+
+
+def _central(psf: Tensor, image: PointImage, window: int) -> Tensor:
+    """The window about the chief ray, which falls on the central pixel of the image."""
+    first = _finer(image) * (image.light.shape[-1] // 2) - window // 2
+    return psf[first : first + window, first : first + window]
 
 
 def _reports(distance: float, images: Sequence[PointImage], found: Registered) -> list[PointReport]:
@@ -159,7 +191,7 @@ def _reports(distance: float, images: Sequence[PointImage], found: Registered) -
     for n, image in enumerate(images):
         misfit = float(found.misfit[n])
         row, column = (
-            place - before + float(after)
+            _finer(image) * (place - before + float(after))
             for place, before, after in zip(image.place, image.offset, found.offsets[n], strict=True)
         )
         words = None if found.used[n] else f"its residuals are {misfit**0.5:.1f} times the noise"

@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.commands.options import add_lens_options, make_lens
 from kornia_tidy.commands.raw_options import add_dump_options, open_raw
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import SUFFIXES, read_image
-from kornia_tidy.files import replacing
+from kornia_tidy.files import check_file, replacing
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.sensor.noise import SensorNoise
+
+if TYPE_CHECKING:
+    from kornia_tidy.calibration.point_images import Tile
 
 DESCRIPTION = """\
 Measure the PSFs of a camera from pictures of a point of light at known distances.
 At each distance the point is moved by parts of a pixel between the pictures: a
-sensor that samples too coarsely sees a PSF only in several pictures together; 8
-to 16 are good. FILES are raw files (of a mosaic each plane is measured on its own)
-or 16-bit images of linear light, black level taken off; sorted by distance, then
-by place of the point, then by exposure.
+sensor that samples too coarsely sees a PSF only in several pictures together. 16
+places are good, 24 behind a filter array; they need not be known. Several exposures
+at each place, the longer ones saturated, show the faint parts of a PSF as well.
+FILES are raw files or 16-bit images of linear light, black level taken off; sorted
+by distance, then by place of the point, then by exposure. Of a filter array's
+planes those of one colour make one PSF, on the pixels of the sensor: the bank is
+one of red, green and blue.
 """
 
 EXAMPLES = """\
@@ -38,9 +44,17 @@ examples:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
         --reference flat*.tif -o bank.safetensors --picture bank.png --fit-mask mask.npy
 
+What is printed tells how far to trust the bank: "noise" is the error to be expected,
+the sum of its moduli over the PSF's light; "residuals" of about 1 say that the
+pictures of one distance fit each other, far larger ones that something moved or
+that --full-well, --read-noise or the black level are wrong. Without --reference the
+PSF's centre of light is its centre, and what masks do to move it is not seen.
+
 In Python:
   bank = PSFBank.load("bank.safetensors")
   coded = TiDyOptics(camera=..., sensor=...).with_bank(bank)(image, depth)
+  sharp = Tikhonov()(capture, bank)  # of linear light
+  MeasuredPSFs.load("bank.safetensors").uncertainty  # and .distances, .reports of every picture
 """
 
 
@@ -60,7 +74,9 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT", help="bank to write, .safetensors")
     parser.add_argument("--reference", nargs="+", metavar="FILE", help="the same places with a flat mask, unsaturated")
-    parser.add_argument("--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels (default: 41)")
+    parser.add_argument(
+        "--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels of the sensor (default: 41)"
+    )
     parser.add_argument("--points", type=int, default=1, metavar="N", help="points in each picture (default: 1)")
     parser.add_argument("--picture", metavar="PNG", help="draw PSFs, uncertainties and residuals")
     parser.add_argument("--fit-mask", metavar="NPY", help="find the mask behind the PSFs and write its heights, metres")
@@ -82,9 +98,8 @@ def run(args: argparse.Namespace) -> None:
     stages = Stages()
     with stages("measure"):
         images = _images(args, places)
-        channels = len(next(iter(images.values()))[0].light)
-        cutoff = _cutoff(camera, channels, mosaic=channels == 4)
-        measured = measure_psfs(images, camera, args.window, cutoff)
+        channels = 1 + max(next(iter(images.values()))[0].channels)
+        measured = measure_psfs(images, camera, args.window, _cutoff(camera, channels))
     tell("camera", camera.extra_repr())
     for report in measured.reports:
         if report.rejected is not None:
@@ -92,9 +107,11 @@ def run(args: argparse.Namespace) -> None:
             tell("left out", f"the point at {report.distance:g} m, {where}: {report.rejected}")
     noise = (2 / torch.pi) ** 0.5 * measured.uncertainty.sum((2, 3))
     for distance, psi, own in zip(measured.distances, measured.bank.defocus, noise, strict=True):
-        used = sum(r.rejected is None for r in measured.reports if r.distance == float(distance))
+        used = [r for r in measured.reports if r.distance == float(distance) and r.rejected is None]
+        times = (sum(r.misfit or 0.0 for r in used) / len(used)) ** 0.5
         words = " ".join(f"{100 * float(x):.2g}" for x in own)
-        tell("PSF", f"{float(distance):g} m, psi {float(psi):+.2f} rad: {used} point images, noise {words} % in L1")
+        where = f"{float(distance):g} m, psi {float(psi):+.2f} rad"
+        tell("PSF", f"{where}: {len(used)} point images, residuals {times:.2g} times the noise, noise {words} % in L1")
     measured.save(args.output)
     tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     fit = None
@@ -134,6 +151,14 @@ def _check_arguments(args: argparse.Namespace) -> int:
             f"exposures at each place"
         )
     places = len(args.files) // groups
+    inputs = {check_file(path).resolve() for path in [*args.files, *(args.reference or [])]}
+    for path in (args.output, args.picture, args.fit_mask):
+        if path is not None and Path(path).resolve() in inputs:
+            raise ValueError(f"cannot write {path}: it is an input")
+    if args.fit_mask is not None:
+        check_positive("--mask-size", args.mask_size)
+        if len(args.distances) < 2:
+            raise ValueError("--fit-mask needs two distances or more: one does not tell a mask from its twin")
     if args.reference is not None and len(args.reference) != places * len(args.distances):
         raise ValueError(
             f"--reference needs one file for each of {places * len(args.distances)} places, got {len(args.reference)}"
@@ -153,37 +178,36 @@ def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
     for distance in args.distances:
         images[distance] = []
         for _ in range(places):
-            frames, phases = zip(*[_read(next(files), args) for _ in args.exposures], strict=True)
+            frames, tiles = zip(*[_read(next(files), args) for _ in args.exposures], strict=True)
             if len({frame.shape for frame in frames}) > 1:
                 raise ValueError(f"the exposures of one place differ in size: {[tuple(f.shape) for f in frames]}")
             reference = _read(next(references), args)[0] if args.reference else None
             images[distance] += point_images(
-                torch.stack(frames), exposures, sensor, args.window, args.points, reference, phases[0]
+                torch.stack(frames), exposures, sensor, args.window, args.points, reference, tiles[0]
             )
     return images
 
 
-def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tensor]:
-    """Return linear light (C, H, W), and the place of each channel's pixels in the tile, in pixels of a channel."""
+def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tile | None]:
+    """Return linear light (C, H, W), of a mosaic its planes with the channels that its tile sees."""
     if Path(path).suffix.lower() in SUFFIXES:
-        light = read_image(path)
-        return light, torch.zeros(len(light), 2)
+        return read_image(path), None
     raw = open_raw(path, args)
     rows, columns = raw.tile
     if (rows, columns) not in {(1, 1), (2, 2)}:
         raise ValueError(f"cannot measure PSFs on {path}: its tile is {rows}x{columns}, 2x2 or none is needed")
-    planes = raw.planes()
-    if (rows, columns) == (1, 1):
-        return planes, torch.zeros(len(planes), 2)
-    return planes, torch.tensor([(row / rows, column / columns) for row in range(rows) for column in range(columns)])
+    if raw.pattern is None:
+        return raw.planes(), None
+    letters = "".join(dict.fromkeys(raw.colors))  # both greens are one channel
+    return raw.planes(), tuple(tuple(letters.index(raw.colors[color]) for color in row) for row in raw.pattern)
 
 
-def _cutoff(camera: ThinLensCamera, channels: int, mosaic: bool) -> float | list[float]:
+def _cutoff(camera: ThinLensCamera, channels: int) -> list[float]:
     """Return the highest frequency that the lens passes, at the shortest wavelength a channel may see."""
     from kornia_tidy.calibration.measured_psfs import diffraction_cutoff  # noqa: PLC0415
 
     shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)
-    return [min(4.0, diffraction_cutoff(camera, wave) * (2 if mosaic else 1)) for wave in shortest]
+    return [min(2.0, diffraction_cutoff(camera, wave)) for wave in shortest]
 
 
 def _spectrum(channels: int) -> Any:

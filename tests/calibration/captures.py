@@ -58,3 +58,11 @@ def exposed(
     electrons = electrons + read * torch.randn(electrons.shape, generator=generator)
     counts = (black + electrons / full_well * (white - black)).round().clamp(0, white)
     return (counts - black) / (white - black)
+
+
+def planes(light: Tensor, tile: tuple[tuple[int, ...], ...]) -> Tensor:
+    """What the pixels of each place of a filter array's tile see of light on the sensor, (C, H, W) to its planes."""
+    step = len(tile)
+    height, width = (size - size % step for size in light.shape[-2:])
+    places = ((row, column) for row in range(step) for column in range(step))
+    return torch.stack([light[tile[row][column], row:height:step, column:width:step] for row, column in places])
