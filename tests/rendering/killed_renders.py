@@ -30,7 +30,6 @@ def child(folder: Path, layout: Layout, rank: int, world: int, jobs: int) -> int
     if process == 0:
         code = 1
         try:
-            os.setsid()  # so that its jobs can be killed with it
             render_scenes(small_camera(), small_scenes(COUNT), folder, layout, jobs=jobs, rank=rank, world=world)
             code = 0
         except BaseException as error:
@@ -44,26 +43,30 @@ def wait(processes: list[int]) -> set[int]:
     return {os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes}
 
 
+def there(folder: Path, layout: Layout) -> int:
+    """How many folders or shards are there."""
+    return sum((folder / part.name).exists() for part in layout.parts(COUNT))
+
+
 def main(folder: Path, kills: int) -> None:
     torch.set_num_threads(1)
     chance, told = random.Random(time.time_ns()), {}
     for name, layout in (("folders", Layout()), ("shards", Layout(shard_items=4))):
         whole, killed = folder / f"{name}-whole", folder / f"{name}-killed"
-        start = time.perf_counter()
         assert wait(children(whole, layout, 1)) == {0}
-        seconds = time.perf_counter() - start
         assert wait(children(folder / f"{name}-three", layout, 3)) == {0}  # at the same time
         told[name] = []
         for kill in range(kills):
+            target = there(killed, layout) + chance.randrange(1, 4)
             processes = children(killed, layout, 1 + (kill + 1) % 3, 1 + kill % 2)
-            while kill == 0 and not (killed / layout.parts(COUNT)[0].name).exists():
-                time.sleep(0.005)  # the first kill comes in the middle
-            time.sleep(chance.uniform(0, seconds / kills))
+            deadline = time.monotonic() + 30
+            while there(killed, layout) < min(target, len(layout.parts(COUNT))) and time.monotonic() < deadline:
+                time.sleep(0.002)
+            time.sleep(chance.uniform(0, 0.02))  # into a later capture, its files, the index, or tidying up
             for process in processes:
                 os.kill(process, signal.SIGKILL)
             assert wait(processes) <= {0, -signal.SIGKILL}
-            told[name].append(sum((killed / part.name).exists() for part in layout.parts(COUNT)))
-            told[name].append(len(list(killed.glob(".*.tmp"))))
+            told[name].append(there(killed, layout))
         assert wait(children(killed, layout, 2)) == {0}
     print(json.dumps(told))
 
