@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make demo     one picture that explains the library: outputs/demo.png"
+	@echo "make demo     coded captures and what networks make of them: outputs/demo.png, reconstruction.png"
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
 	@echo "make test     the tests; ARGS='-k camera' runs some of them"
 	@echo "make lint     style, spelling and types"

@@ -23,6 +23,8 @@ class Fidelity:
     - depths between its layers: 1.5e-6 for random masks, against linear layers 1/64 rad apart (linear layers 1 rad
       apart: 4e-5); up to 1e-4 for a flat mask in focus on black and white shapes.
     - integration over sensor pixels: 5e-12, and rounding.
+    - wavelengths that the camera's spectrum does not have: the reference is at all those that it has, be they three or
+      sixty. How far they are from the spectrum they were sampled from is for who samples it.
 
     So an error against it is one against the truth down to some 2e-3. Below, it tells how well layers, points and
     precision are kept for the light within that window.
@@ -41,6 +43,8 @@ class Fidelity:
         layers: how a pixel takes its PSF from those computed: ``"nearest"``, ``"linear"``, ``"cubic"``, or
             ``"bandlimited"``, which is nearly exact while they lie closer than 2.8 rad (for 470 nm).
         layer_spacing: distance between the computed PSFs in radians of defocus.
+        wavelengths: at most so many, where the camera's spectrum has more: neighbours then stand together for one, see
+            :func:`kornia_tidy.optics.fewer_wavelengths.fewer_wavelengths`. Default: all that the spectrum has.
         window: side of the PSFs in pixels, odd. Default: measured, by the next two.
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
         max_window: largest side of the PSF window in pixels.
@@ -68,6 +72,7 @@ class Fidelity:
     pixel_tolerance: float = 2e-2
     layers: str = "linear"
     layer_spacing: float = 2.0
+    wavelengths: int | None = None
     window: int | None = None
     enclosed_energy: float = 0.8
     max_window: int = 65
@@ -85,6 +90,8 @@ class Fidelity:
         check_positive("layer_spacing", self.layer_spacing, "radians")
         if not 0 < self.enclosed_energy < 1:
             raise ValueError(f"enclosed_energy must be between 0 and 1, got {self.enclosed_energy}")
+        if self.wavelengths is not None and self.wavelengths < 1:
+            raise ValueError(f"wavelengths must be at least 1, got {self.wavelengths}")
         for name, side in (("window", self.window), ("max_window", self.max_window)):
             if side is not None and (side < 1 or side % 2 == 0):
                 raise ValueError(f"{name} must be an odd number of pixels, got {side}")

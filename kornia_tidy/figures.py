@@ -79,6 +79,43 @@ def explain(
     return figure
 
 
+def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
+    """Draw a depth map in colours that are linear in inverse depth, with a bar that names the depths in metres.
+
+    Args:
+        depth: (1, H, W) in metres, may be infinite; depths beyond the camera's range have the colours of its ends.
+        camera: its depth range is the bar's.
+
+    Returns:
+        A figure; ``figure.savefig(path, dpi=150)`` makes its longer side 1800 pixels, the bar not counted.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    height, width = depth.shape[-2:]
+    step = max(1, max(height, width) // 1800)
+    shown = depth[0, ::step, ::step].detach().cpu()
+    far, near = sorted(1 / end for end in camera.depth_range)
+    place = ((shown.reciprocal() - far) / (near - far)).clamp(0, 1).numpy()
+    scale = WIDTH / max(height, width)
+    across, up, below = max(width * scale, 3.0), height * scale, 0.45  # inches
+    figure = Figure(figsize=(across, up + below), facecolor="white")
+    axes = figure.add_axes(
+        ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
+    )
+    axes.imshow(place, cmap=DEPTH_COLORS, vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
+    axes.set_axis_off()
+    bar = figure.add_axes((0.06, 0.26 / (up + below), 0.88, 0.1 / (up + below)))
+    bar.imshow(np.linspace(0, 1, 256)[None], cmap=DEPTH_COLORS, aspect="auto", extent=(0, 1, 0, 1))
+    ticks = _depth_ticks(camera)
+    bar.set_xticks([x for x, _ in ticks], [label for _, label in ticks])
+    _quiet(bar, spines=False)
+    return figure
+
+
 def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
     """Return the PSFs of each of the first few masks shown alone, in the window of their average.
 

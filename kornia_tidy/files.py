@@ -20,15 +20,26 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         FileNotFoundError: if there is none.
         ValueError: if it is a folder or empty.
     """
+    path = check_file(path)
+    data = path.read_bytes()
+    if not data:
+        raise ValueError(f"cannot read {path}: the file is empty")
+    return data
+
+
+def check_file(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a file that is there.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is a folder.
+    """
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"cannot read {path}: it is a folder")
     if not path.exists():
         raise FileNotFoundError(f"cannot read {path}: there is no such file")
-    data = path.read_bytes()
-    if not data:
-        raise ValueError(f"cannot read {path}: the file is empty")
-    return data
+    return path
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

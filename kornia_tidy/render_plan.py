@@ -22,6 +22,7 @@ class RenderPlan:
         layers_present: PSFs computed for the scene.
         layers_total: those of the camera's whole range.
         wavelengths: PSFs computed for each layer.
+        wavelengths_total: those that the camera's spectrum has, at all of which the reference is.
         light_held: least and largest share of the light in the window over the range.
         reference_error: of the reference, against a PSF of its own for each pixel's depth.
         error_parts: what each economy adds to ``predicted_error``, by name.
@@ -37,6 +38,7 @@ class RenderPlan:
     layers_present: int
     layers_total: int
     wavelengths: int
+    wavelengths_total: int
     light_held: tuple[float, float]
     reference_error: float
     error_parts: tuple[tuple[str, float], ...]
@@ -49,20 +51,23 @@ class RenderPlan:
         reasons = {
             "layers": "PSFs between the layers",
             "window": f"light beyond {knobs.window} of {full.window} px",
+            "wavelengths": f"{self.wavelengths_total - self.wavelengths} wavelengths, merged with their neighbours",
             "points a pixel": "finer integration over pixels",
             "float32": "float64",
         }
         skipped += [f"{reasons[name]} (error {error:.1e})" for name, error in self.error_parts if error > 0]
+        every = f"{self.wavelengths} of {total}" if (total := self.wavelengths_total) > self.wavelengths else f"{total}"
+        at = f", at all {total} wavelengths of the camera's spectrum" if total > self.wavelengths else ""
         return "\n".join(
             [
                 f"{knobs.name}: error {self.predicted_error:.1e} of full scale against the reference"
                 + (", as nothing cheaper is within the tolerance" if knobs.name == full.name else ""),
                 f"  computes: {self.layers_present} of {self.layers_total} {knobs.layers} layers of defocus, for each "
-                f"PSFs at {self.wavelengths} wavelength{'s' if self.wavelengths != 1 else ''} of {knobs.window}x"
+                f"PSFs at {every} wavelength{'s' if total != 1 else ''} of {knobs.window}x"
                 f"{knobs.window} px that hold {held} of the light, in float{64 if knobs.double else 32}",
                 "  skips: " + "; ".join(skipped),
                 f"  costs: some {self.seconds:.2g} s on one core, {self.seconds / self.reference_seconds:.2%} of the "
                 f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",
-                f"  the reference itself is {self.reference_error:.1e} from a PSF of its own for each depth",
+                f"  the reference itself is {self.reference_error:.1e} from a PSF of its own for each depth{at}",
             ]
         )

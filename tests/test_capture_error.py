@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy.camera_survey import CameraSurvey
 from kornia_tidy.capture_error import (
     CONTRAST,
     LayerErrors,
@@ -25,7 +26,6 @@ from kornia_tidy.capture_error import (
     region_power,
 )
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.planning import Planner
 from kornia_tidy.scene.compositing import render
 from tests.base import BaseTester
 
@@ -50,7 +50,7 @@ class TestInterpolation(BaseTester):
 
     def test_feature_surveyed_psfs_carry_those_of_every_defocus(self):
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
-        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, Planner(optics, 3).geometry.bandwidth))
+        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, CameraSurvey(optics, 3).geometry(Fidelity()).bandwidth))
         psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
         with torch.no_grad():
             direct, known = (optics.psf_bank(3, None, at).psfs for at in (psi, tuple(nodes.tolist())))
@@ -60,7 +60,7 @@ class TestInterpolation(BaseTester):
     def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
         """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
         optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
-        assert 1.05**2 * 530 / 470 <= Planner(optics, 1).geometry.bandwidth <= 1.2 * 530 / 470
+        assert 1.05**2 * 530 / 470 <= CameraSurvey(optics, 1).geometry(Fidelity()).bandwidth <= 1.2 * 530 / 470
 
 
 class TestPower(BaseTester):
@@ -130,8 +130,8 @@ class TestLayers(BaseTester):
         """Against the capture of a point: the PSF that the camera makes of its layers."""
         fidelity = Fidelity(window=15, layers=layers, layer_spacing=1.0, stray_light="discard", double=True)
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, color_space="linear", border="zero")
-        planner, psi = Planner(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
-        weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, planner.band)
+        survey, psi = CameraSurvey(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
+        weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, survey.band)
         point = torch.zeros(1, 3, 15, 15, dtype=torch.float64)
         point[..., 7, 7] = 1
         with torch.no_grad():

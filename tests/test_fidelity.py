@@ -29,6 +29,7 @@ class TestFidelity(BaseTester):
             ("pixel_tolerance", 0.0),
             ("layer_spacing", -1.0),
             ("enclosed_energy", 1.0),
+            ("wavelengths", 0),
             ("window", 22),
             ("max_window", 0),
         ],

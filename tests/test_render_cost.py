@@ -50,7 +50,9 @@ class TestCost(BaseTester):
         with FlopCounterMode(display=False) as counter:
             optics.psf_bank(3, None, (-5.0, 0.0, 5.0))
         counted = counter.get_total_flops()
-        expected = bank_operations(Planner(optics, 3).geometry, fidelity, 3) / (2 if fidelity.double else 1)
+        expected = bank_operations(Planner(optics, 3).survey.geometry(fidelity), fidelity, 3) / (
+            2 if fidelity.double else 1
+        )
         assert expected == pytest.approx(counted, rel=0.05)
 
     def test_feature_tiles_are_those_of_the_renderer(self):

@@ -1,114 +1,176 @@
-"""`kornia-tidy demo`: one picture that explains the library, from a scene of its own or of the user's."""
+"""`kornia-tidy demo`: from a scene to a coded capture and back, as two pictures."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
+from kornia.geometry.transform import resize
 from torch import Tensor
 from tqdm import tqdm
 
 from kornia_tidy.commands.options import add_depth_options, middle_depths, read_scene, seed
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
-from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.estimate_figure import Estimate, draw_estimates
 from kornia_tidy.figures import explain, require_matplotlib
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
-from kornia_tidy.optics.phase_masks import PixelwiseMask
+from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.pretrained import load_pretrained
 from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.training.tasks import metres, nearness, split_maps
+from kornia_tidy.training.trained import TrainedSystem
 
 DESCRIPTION = """\
-Draw one picture that explains the library: a scene and its depth, five phase masks, the point spread functions that
-they make over depth alone and together, and what the camera captures with one mask and with five. Without IMAGE and
-DEPTH the scene is made by the library.
+Photograph a scene with a camera whose five phase masks were learnt together with a network, and let the network
+reconstruct from that one capture an image in focus everywhere; beside it the same with one mask and with a plain lens.
+Without IMAGE and DEPTH the scene is made by the library. The depths of IMAGE are stretched, in dioptres, over the range
+for which the masks were learnt.
 """
 
-NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
+SYSTEMS = {"plain": "edof-0", "K = 1": "edof-1", "K = 5": "edof-5"}
+LARGEST = 1024  # pixels of the longer side; larger pictures are made smaller, to keep a demonstration short
 DOTS_PER_INCH = 150
 CAPTION = (
-    "The heights of these masks are random, as before training: they throw light wide, and both captures look alike. "
-    "Gradients reach the heights, so that they can be learned. Each PSF is drawn on its own scale, as the square root "
-    "of its light."
+    "The heights of these masks were learnt together with the network that reads the captures. Both captures are taken "
+    "with them, the upper one with the first alone. Each PSF is drawn on its own scale, as the root of its light."
 )
 
 
 def add_parser(subparsers: Any) -> None:
     """Describe the command to argparse."""
-    parser = subparsers.add_parser("demo", help="one picture that explains the library", description=DESCRIPTION)
+    parser = subparsers.add_parser(
+        "demo", help="from a scene to a coded capture and back, as two pictures", description=DESCRIPTION
+    )
     parser.set_defaults(run=run)
     parser.add_argument("--image", metavar="IMAGE", help="picture of a scene (default: dead leaves, made here)")
-    parser.add_argument("--depth", metavar="DEPTH", help="its depth; focus and aperture are chosen to fit it")
+    parser.add_argument("--depth", metavar="DEPTH", help="its depth")
     add_depth_options(parser)
     parser.add_argument(
         "-o", "--output", default="outputs", metavar="FOLDER", help="made if missing (default: outputs)"
     )
     parser.add_argument("--size", type=int, default=512, metavar="PX", help="side of the scene made (default: 512)")
-    parser.add_argument("--masks", type=int, default=5, metavar="K", help="masks in one exposure (default: 5)")
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of scene, masks and noise (default: 0)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of scene and noise (default: 0)")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Simulate both captures, draw the picture and write all."""
+    """Simulate the captures, reconstruct, draw the pictures and write all."""
     if (args.image is None) != (args.depth is None):
         raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
-    if args.masks < 2:
-        raise ValueError(f"the demo compares one mask with several: --masks must be 2 or more, got {args.masks}")
     require_matplotlib()
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     stages = Stages()
     progress = tqdm(
-        total=4, desc="demo", bar_format="{desc}: {bar} {n}/{total} {postfix}", file=sys.stderr, leave=False
+        total=6, desc="demo", bar_format="{desc}: {bar} {n}/{total} {postfix}", file=sys.stderr, leave=False
     )
 
-    with torch.no_grad(), progress:
-        progress.set_postfix_str("scene")
-        with stages("scene"):
-            scene, camera = _scene_and_camera(args)
-        captures: list[Tensor] = []
-        for k in (1, args.masks):
-            progress.update()
-            progress.set_postfix_str(f"capture K={k}")
-            with stages(f"capture K={k}"):
-                masks = PixelwiseMask(k, generator=torch.Generator().manual_seed(args.seed))
-                optics = TiDyOptics(masks, camera=camera)
-                captures.append(optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(args.seed)))
-        progress.update()
-        progress.set_postfix_str("picture")
-        with stages("picture"):
-            picture = BytesIO()
-            figure = explain(scene.image, scene.depth, optics, captures[0], captures[1], CAPTION)
-            figure.savefig(picture, dpi=DOTS_PER_INCH)
-        bank = optics.psf_bank(channels=scene.image.shape[0])
+    def step(name: str) -> Any:
+        progress.update(int(bool(stages.seconds)))
+        progress.set_postfix_str(name)
+        return stages(name)
 
-    pictures = {"scene.png": scene.image, "coded_k1.png": captures[0], f"coded_k{args.masks}.png": captures[1]}
+    with torch.no_grad(), progress:
+        with step("scene"):
+            systems = {name: load_pretrained(which) for name, which in SYSTEMS.items()}
+            optics = systems["K = 5"].optics
+            camera = optics.camera
+            assert isinstance(camera, ThinLensCamera)  # which the systems were trained with
+            scene = _scene(args, camera)
+            near = nearness(camera, scene.depth)
+        estimates = []
+        for name, system in systems.items():
+            with step(name):
+                estimates.append(_estimate(name, system, scene, args.seed))
+        with step("first mask"):
+            times = DwellTimes([1.0] + [0.0] * (len(optics.masks.phase) - 1))
+            first = TiDyOptics(optics.masks, optics.camera, times, optics.sensor, optics.fidelity)
+            alone = first(scene.image, scene.depth, generator=torch.Generator().manual_seed(args.seed))
+        with step("pictures"):
+            explained, reconstructed = BytesIO(), BytesIO()
+            coded = estimates[-1].capture
+            explain(scene.image, scene.depth, optics, alone, coded, CAPTION).savefig(explained, dpi=DOTS_PER_INCH)
+            figure = draw_estimates(scene.image, near, estimates)
+            figure.savefig(reconstructed, dpi=DOTS_PER_INCH)
+        bank = optics.psf_bank()
+
+    best = estimates[-1]
+    pictures = {
+        "scene.png": scene.image,
+        "depth.png": near,
+        "coded_plain.png": estimates[0].capture,
+        "coded_k1.png": estimates[1].capture,
+        "coded_k5.png": best.capture,
+        "estimated_scene.png": best.image,
+    }
+    files = {"demo.png": explained.getvalue(), "reconstruction.png": reconstructed.getvalue()}
     with stages("write"):
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, image in pictures.items():
-            write_image(folder / name, image)
-        write_bytes(folder / "demo.png", picture.getvalue())
+        _write(folder, pictures, files)
 
     tell("scene", scene_in_words(scene))
     tell("camera", camera.extra_repr())
-    tell("masks", f"{optics.masks.extra_repr()}, noise of seed {args.seed}; K = 1 is the first of them")
+    tell("masks", f"{optics.masks.extra_repr()}, learnt in {systems['K = 5'].step} steps on dead leaves")
     tell("PSFs", light_in_words(bank, optics))
     tell("clamped", clamped_in_words(optics, scene.depth))
-    tell("wrote", f"{folder / 'demo.png'}: look at this one")
+    for estimate in estimates:
+        scores = estimate.scores(scene.image)
+        tell(
+            estimate.name,
+            f"capture {scores['capture_psnr']:.2f} dB; all in focus {scores['image_psnr']:.2f} dB, "
+            f"SSIM {scores['image_ssim']:.3f}",
+        )
+    tell("wrote", f"{folder / 'demo.png'}: how the capture comes about")
+    tell("", f"{folder / 'reconstruction.png'}: what is made of it")
     for name in pictures:
         tell("", str(folder / name))
     tell("time", stages.summary())
 
 
-def _scene_and_camera(args: argparse.Namespace) -> tuple[Scene, ThinLensCamera]:
+def _write(folder: Path, pictures: Mapping[str, Tensor], files: Mapping[str, bytes]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in pictures.items():
+        write_image(folder / name, image.clamp(0, 1))
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+
+
+def _estimate(name: str, system: TrainedSystem, scene: Scene, noise: int) -> Estimate:
+    """Photograph a scene and reconstruct it."""
+    capture = system.optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(noise))
+    maps = split_maps(system.settings.task, system.head(capture[None]))
+    return Estimate(name, capture, maps["image"][0])
+
+
+def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:
+    """Return a scene in colour whose depths fill the camera's range."""
     if args.image is None:
-        image, depth = dead_leaves(args.size, args.size, depth_range=(NEAR, FAR), seed=args.seed)
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool)), ThinLensCamera()
-    scene = read_scene(args)
-    return scene, ThinLensCamera.for_scene(middle_depths(scene.depth, scene.valid))
+        return DeadLeaves(1, args.size, args.size, depth_range=camera.depth_range, seed=args.seed).read(0)
+    image, depth, valid = read_scene(args)
+    if max(image.shape[-2:]) > LARGEST:
+        image = resize(image[None], LARGEST, side="long", antialias=True)[0].clamp(0, 1)
+        depth, valid = (
+            resize(plane[None].float(), LARGEST, side="long", interpolation="nearest")[0] for plane in (depth, valid)
+        )
+    valid = valid > 0
+    return Scene(image.expand(3, -1, -1), stretched(depth, valid, camera), valid)
+
+
+def stretched(depth: Tensor, valid: Tensor, camera: ThinLensCamera) -> Tensor:
+    """Move the depths of a scene so that they fill a camera's range, evenly in dioptres.
+
+    Example:
+        >>> depth = torch.tensor([[[2.0, 3.0, 6.0]]])
+        >>> stretched(depth, depth > 0, ThinLensCamera()).round(decimals=4)
+        tensor([[[0.2975, 0.5950,    inf]]])
+    """
+    near, far = (1 / end for end in middle_depths(depth, valid))
+    return metres(camera, ((1 / depth - far) / (near - far)))

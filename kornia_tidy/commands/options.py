@@ -63,13 +63,7 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="choose focus and aperture so that this scene's depths (its middle 99 %%) fill psi = -20 to +20",
     )
-    group.add_argument(
-        "--focal-length", type=float, default=50e-3, metavar="M", help="longer enlarges the PSF (default: 0.05)"
-    )
-    group.add_argument(
-        "--aperture-diameter", type=float, metavar="M", help="wider blurs more out of focus (default: 0.002835, f/17.6)"
-    )
-    group.add_argument("--focus-distance", type=float, metavar="M", help="depth seen sharply (default: 0.595)")
+    add_lens_options(group)
     group.add_argument(
         "--depth-range",
         type=float,
@@ -78,6 +72,17 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
         help="depths that PSFs are prepared for; others are clamped to its ends (default: half the focus distance "
         "to inf)",
     )
+
+
+def add_lens_options(group: argparse._ArgumentGroup) -> None:
+    """Add a lens and the pixels behind it, in SI units; what has no default here has that of the camera."""
+    group.add_argument(
+        "--focal-length", type=float, default=50e-3, metavar="M", help="longer enlarges the PSF (default: 0.05)"
+    )
+    group.add_argument(
+        "--aperture-diameter", type=float, metavar="M", help="wider blurs more out of focus (default: 0.002835, f/17.6)"
+    )
+    group.add_argument("--focus-distance", type=float, metavar="M", help="depth seen sharply (default: 0.595)")
     group.add_argument(
         "--pixel-pitch",
         type=float,
@@ -119,18 +124,23 @@ def make_camera(args: argparse.Namespace, scene: Scene) -> ThinLensCamera:
         ValueError: if ``--fit-depth`` comes with what it is to choose, or no lens can do what is asked.
     """
     if not args.fit_depth:
-        given = {"aperture_diameter": args.aperture_diameter, "focus_distance": args.focus_distance}
-        return ThinLensCamera(
-            focal_length=args.focal_length,
-            pixel_pitch=args.pixel_pitch,
-            depth_range=None if args.depth_range is None else tuple(args.depth_range),
-            **{name: value for name, value in given.items() if value is not None},
-        )
+        return make_lens(args, None if args.depth_range is None else tuple(args.depth_range))
     for name in ("aperture_diameter", "focus_distance", "depth_range"):
         if getattr(args, name) is not None:
             raise ValueError(f"--fit-depth chooses --{name.replace('_', '-')}: give one of the two")
     return ThinLensCamera.for_scene(
         middle_depths(scene.depth, scene.valid), focal_length=args.focal_length, pixel_pitch=args.pixel_pitch
+    )
+
+
+def make_lens(args: argparse.Namespace, depth_range: tuple[float, float] | None) -> ThinLensCamera:
+    """Return the camera named by the arguments of :func:`add_lens_options`, for a range of depths."""
+    given = {"aperture_diameter": args.aperture_diameter, "focus_distance": args.focus_distance}
+    return ThinLensCamera(
+        focal_length=args.focal_length,
+        pixel_pitch=args.pixel_pitch,
+        depth_range=depth_range,
+        **{name: value for name, value in given.items() if value is not None},
     )
 
 

@@ -18,11 +18,11 @@ from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.figures import require_matplotlib
 from kornia_tidy.files import write_bytes
-from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.systems import SYSTEMS, System, published_system
 from kornia_tidy.systems.figure import Portrait, draw_systems
 from kornia_tidy.systems.survey import survey
 from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.training.tasks import metres
 
 DESCRIPTION = """\
 List nine published optical systems and draw them side by side into one picture:
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> None:
                 seen = survey(optics)
             with stages("captures"):
                 generator = torch.Generator().manual_seed(args.seed)
-                capture = optics(image, stretched_depth(nearness, camera), generator=generator)
+                capture = optics(image, metres(camera, nearness), generator=generator)
             portraits.append(Portrait(system, optics, seen, capture))
         with stages("picture"):
             picture = BytesIO()
@@ -140,17 +140,6 @@ def table(systems: list[System]) -> list[str]:
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def stretched_depth(nearness: Tensor, camera: ThinLensCamera) -> Tensor:
-    """Return the depth in metres of places between a camera's farthest depth, 0, and its nearest, 1, in dioptres.
-
-    Example:
-        >>> stretched_depth(torch.tensor([0.0, 0.5, 1.0]), ThinLensCamera()).round(decimals=4)
-        tensor([   inf, 0.5950, 0.2975])
-    """
-    near, far = (1 / depth for depth in camera.depth_range)
-    return 1 / (far + (near - far) * nearness)
 
 
 def _chosen(args: argparse.Namespace) -> list[System]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -15,7 +16,7 @@ from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.heads import HEADS
 from kornia_tidy.training.lightning_extra import require_lightning
-from kornia_tidy.training.settings import PRECISIONS, TrainingSettings
+from kornia_tidy.training.settings import PRECISIONS, SCHEDULES, TrainingSettings
 from kornia_tidy.training.tasks import LOSSES, MAPS
 
 DESCRIPTION = """\
@@ -81,6 +82,9 @@ def add_parser(subparsers: Any) -> None:
         system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
     )
     _setting(
+        system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
+    )
+    _setting(
         system,
         "loss",
         choices=tuple(LOSSES),
@@ -103,6 +107,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(learning, "accumulate", type=int, metavar="N", help="batches in a step")
     _setting(learning, "lr", type=float, metavar="LR", help="learning rate of the network")
     _setting(learning, "lr_metres", type=float, metavar="LR", help="learning rate of the masks, metres of height")
+    _setting(learning, "schedule", choices=SCHEDULES, help="of both rates; cosine: up, then down to zero")
     _setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
     _setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
     _setting(learning, "precision", choices=PRECISIONS, help="of the network; optics stay in float32")
@@ -160,10 +165,11 @@ def run(args: argparse.Namespace) -> None:
     stored = args.resume and (folder / SETTINGS).exists()
     settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()
     settings = settings.replace(**given_settings(args))
+    say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # one of the processes speaks for all
     many = {"strategy": "ddp"} if args.devices > 1 else {}
-    tell("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
+    say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
     goes_on = args.resume and (folder / LAST).exists()
-    tell("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
+    say("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
     try:
         module = train(
             settings,
@@ -178,12 +184,16 @@ def run(args: argparse.Namespace) -> None:
             **many,
         )
     except KeyboardInterrupt:
-        tell("stopped", f"--resume -o {folder} goes on from the last checkpoint")
+        say("stopped", f"--resume -o {folder} goes on from the last checkpoint")
         raise
-    tell("camera", module.optics.extra_repr())
-    tell("wrote", f"{folder / BEST}: evaluate this one")
+    say("camera", module.optics.extra_repr())
+    say("wrote", f"{folder / BEST}: evaluate this one")
     for name in (LAST, SETTINGS, "training.csv", "validation.csv", "pictures"):
-        tell("", str(folder / name))
+        say("", str(folder / name))
+
+
+def _nothing(*_: str) -> None:
+    """Say nothing."""
 
 
 def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)

@@ -5,6 +5,7 @@ from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth
 from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches, split_frames
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
+from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
@@ -24,12 +25,14 @@ __all__ = [
     "crop",
     "dead_leaves",
     "described_folder",
+    "from_opencv",
     "paper_patches",
     "random_crop",
     "read_depth",
     "read_image",
     "read_rgbd",
     "split_frames",
+    "to_opencv",
     "write_depth",
     "write_image",
 ]

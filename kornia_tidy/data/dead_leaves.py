@@ -18,7 +18,7 @@ from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.seeds import keyed_seed
 
-PIXELS_A_LEAF, MOST_LEAVES = 25, 3000  # in scenes of a data set: more in small ones would be specks
+PIXELS_A_LEAF, MOST_LEAVES = 256, 3000  # in scenes of a data set: things of sizes as in photographs, with depth to see
 COVERAGE = 3.0  # how many leaves lie over a pixel on average; exp(-3) = 5 % of the picture shows the background
 LARGEST_RADIUS = 0.25  # of the picture's geometric mean side
 SMALLEST_LEAF = 1.0  # px: a smaller leaf would fall between pixels
@@ -109,7 +109,7 @@ class DeadLeaves(SceneDataset):
         height: rows in pixels.
         width: columns in pixels.
         depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
-        num_leaves: number of shapes in a scene. Default: one for 25 pixels, and 3000 at most.
+        num_leaves: number of shapes in a scene. Default: one for 256 pixels, and 3000 at most.
         seed: data sets of different seeds share no scene: train with one, test with another.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
 

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
+from kornia_tidy.data.metadata import with_text
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
-from kornia_tidy.files import write_bytes
+from kornia_tidy.files import replacing, write_bytes
 
 
 class DepthMap(NamedTuple):
@@ -123,21 +124,31 @@ def check_depth_options(
             raise ValueError(f"doffs_px must be finite pixels, got {doffs_px}")
 
 
-def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0) -> None:
+def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0, *, saturate: bool = False) -> None:
     """Write a depth map so that :func:`read_depth` with the same ``scale`` reads it back; whole or not at all.
 
     Args:
-        path: ``.pfm`` keeps float32; ``.png`` keeps 16-bit multiples of ``scale``.
-        depth: :math:`(1, H, W)` in metres, positive; infinity goes into a PFM only.
+        path: ``.pfm`` and ``.npy`` (H, W) keep float32; ``.png`` keeps 16-bit multiples of ``scale`` and says the
+            scale in a text.
+        depth: :math:`(1, H, W)` in metres, positive, may be infinite.
         scale: metres per stored unit; 0.001 lets a PNG hold 1 mm to 65.535 m.
+        saturate: let the largest number of a PNG mean *so far or farther*, infinity too, and the smallest, 1, *so near
+            or nearer*. Else depths that it cannot hold are an error.
 
     Raises:
         TypeError: if the depth is not a floating-point tensor.
         ValueError: if its shape, a value, the scale or the suffix is not as above, or a PNG cannot hold a value.
         FileNotFoundError: if the folder does not exist.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_depth(f"{folder}/depth.png", torch.tensor([[[0.25, float("inf")]]]), 0.001, saturate=True)
+        ...     read_depth(f"{folder}/depth.png", 0.001).depth
+        tensor([[[ 0.2500, 65.5350]]])
     """
     suffix = Path(path).suffix.lower()
-    check_choice("the suffix of a depth file", suffix, (".pfm", ".png"))
+    check_choice("the suffix of a depth file", suffix, (".pfm", ".png", ".npy"))
     check_positive("scale", scale, "metres")
     check_float_tensor("depth", depth, 3, "(1, H, W)")
     if depth.shape[0] != 1 or 0 in depth.shape:
@@ -147,12 +158,21 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0)
     if suffix == ".pfm":
         write_bytes(path, encode_pfm(stored.astype(np.float32)))
         return
+    if suffix == ".npy":
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.save(file, stored.astype(np.float32))
+        return
     units = np.rint(stored)
+    text = f"metres = value * {scale:g}"
+    if saturate:
+        np.clip(units, 1, 65535, out=units)
+        text += f"; 65535 is {65535 * scale:g} m or farther"
     outside = (units < 1) | (units > 65535)
     if outside.any():
         bad = stored[outside][0] * scale
         raise ValueError(f"a 16-bit file with scale {scale} holds {scale} to {65535 * scale:.6g} m, got {bad:.6g}")
-    write_bytes(path, cv2.imencode(suffix, units.astype(np.uint16))[1].tobytes())
+    encoded = cv2.imencode(suffix, units.astype(np.uint16))[1].tobytes()
+    write_bytes(path, with_text(encoded, {"depth_scale": f"{scale:g}", "Description": text}))
 
 
 def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -> NDArray[np.float64]:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
+from kornia_tidy.checks import check_choice
+from kornia_tidy.data.metadata import with_exif
+from kornia_tidy.data.opencv_arrays import to_opencv
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import write_bytes
 
@@ -60,20 +64,23 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
 
 
-def write_image(path: str | os.PathLike[str], image: Tensor, bits: int = 8) -> None:
+def write_image(
+    path: str | os.PathLike[str], image: Tensor, bits: int = 8, info: Mapping[str, Any] | None = None
+) -> None:
     """Write a picture as PNG, TIFF or JPEG, by the suffix of the path; whole or not at all.
 
     Args:
         path: where to; an existing file is replaced.
         image: :math:`(3, H, W)` or :math:`(1, H, W)`, encoded, in [0, 1]; values outside are clipped.
         bits: 8, or 16 for PNG and TIFF.
+        info: camera and exposure, which become EXIF; see :func:`~kornia_tidy.data.metadata.with_exif`.
 
     Raises:
         TypeError: if the image is not a floating-point tensor.
         ValueError: if its shape, a value (NaN, infinity), the bits or the suffix is not as above.
         FileNotFoundError: if the folder does not exist.
     """
-    write_bytes(path, encode_image(image, Path(path).suffix.lower(), bits))
+    write_bytes(path, with_exif(encode_image(image, Path(path).suffix.lower(), bits), info or {}))
 
 
 def encode_image(image: Tensor, suffix: str = ".png", bits: int = 8) -> bytes:
@@ -85,13 +92,7 @@ def encode_image(image: Tensor, suffix: str = ".png", bits: int = 8) -> bytes:
     """
     check_choice("the suffix of an image file", suffix, SUFFIXES)
     check_choice(f"bits of a {suffix} file", bits, (8,) if suffix in {".jpg", ".jpeg"} else (8, 16))
-    check_float_tensor("image", image, 3, "(C, H, W)")
-    if image.shape[0] not in {1, 3} or 0 in image.shape:
-        raise ValueError(f"image must have shape (3, H, W) or (1, H, W), got {tuple(image.shape)}")
-    check_finite("image", image)
-    values = image.detach().double().cpu().clamp(0, 1).mul(2**bits - 1).round().numpy()
-    rows = np.ascontiguousarray(values.transpose(1, 2, 0)[..., ::-1].astype(np.uint8 if bits == 8 else np.uint16))
-    done, encoded = cv2.imencode(suffix, rows)
+    done, encoded = cv2.imencode(suffix, to_opencv(image, np.uint8 if bits == 8 else np.uint16))
     if not done:
         raise ValueError(f"OpenCV cannot encode an image of shape {tuple(image.shape)} as {suffix}")
     return encoded.tobytes()

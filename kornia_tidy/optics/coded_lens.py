@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import copy
 import warnings
-from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, Literal, Self, overload
+from typing import Any, Literal, Self, cast, overload
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +17,9 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank
+from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
+from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
@@ -52,6 +52,9 @@ class CodedLens(nn.Module):
     """
 
     _state: int | None = None  # the one state looked through, if not all
+    _bank: PSFBank | None = None  # measured, in the place of the masks' own
+
+    _seen: Spectrum  # what PSFs are computed at: the spectrum, at no more wavelengths than the fidelity allows
 
     def __init__(
         self,
@@ -116,6 +119,10 @@ class CodedLens(nn.Module):
         """
         spectrum = self._spectrum(len(self.spectrum.weights) if channels is None else channels)
         dtype = (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
+        if self._bank is not None:
+            if states or defocus is not None:
+                raise ValueError("PSFs that were measured are known at their own defocus and for the whole exposure")
+            return self._measured_bank(spectrum, dtype)
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
         if not states:
             return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
@@ -130,6 +137,8 @@ class CodedLens(nn.Module):
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
         """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
+        if self._bank is not None:
+            return tuple(self._bank.defocus.tolist())
         lo, hi = self.camera.defocus_range
         intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
@@ -166,6 +175,29 @@ class CodedLens(nn.Module):
         other.__dict__.update(_state=state, _window=window, _memories=self._memories)  # PSFs remembered by both
         return other
 
+    def with_bank(self, bank: PSFBank) -> Self:
+        """Return this lens with PSFs that were measured in the place of its masks'. The other parts are shared.
+
+        Args:
+            bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them.
+
+        Example:
+            >>> measured = PSFBank.from_measured(torch.rand(2, 3, 5, 5), torch.tensor([-5.0, 5.0]))
+            >>> lens = CodedLens().with_bank(measured)
+            >>> lens.window, torch.equal(lens.psf_bank().psfs, measured.psfs)
+            (5, True)
+        """
+        other = self.with_fidelity(self.fidelity.replace(occlusion_states="mean"))
+        other.__dict__["_bank"] = bank
+        return other
+
+    def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
+        bank = cast("PSFBank", self._bank)
+        if bank.psfs.shape[1] != len(spectrum.weights):
+            raise ValueError(f"the measured PSFs have {bank.psfs.shape[1]} channels, not {len(spectrum.weights)}")
+        veil = None if bank.veil is None else bank.veil.to(device, dtype)
+        return PSFBank(*(x.to(device, dtype) for x in (bank.psfs, bank.defocus, bank.energy)), veil)
+
     def _sharing_parts(self) -> Self:
         other = copy.copy(self)
         for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
@@ -177,7 +209,7 @@ class CodedLens(nn.Module):
     @property
     def window(self) -> int:
         """Side of the PSFs in pixels: given by the fidelity, or measured by :meth:`fit_window`."""
-        if self._window is None and self._fixed_window:
+        if self._window is None and self._fixed_window and self._bank is None:
             self._check_layers()
             return self._fixed_window
         return self.fit_window() if self._window is None else self._window
@@ -210,6 +242,10 @@ class CodedLens(nn.Module):
         Returns:
             The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
+        if self._bank is not None:
+            energy = self._bank.energy
+            self._window, self._held = self._bank.window, (float(energy.min()), float(energy.max()))
+            return self._window
         self._check_layers()
         settings, fixed = self.fidelity, self._fixed_window
         size = fixed or min(33, settings.max_window)
@@ -238,10 +274,15 @@ class CodedLens(nn.Module):
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states, weights = self._states(torch.float32)
-        return self._build(states, weights, self.spectrum.flat(), self._pixel_step(), size, 0.1, nodes).psfs
+        return self._build(states, weights, self._seen.flat(), self._pixel_step(), size, 0.1, nodes).psfs
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; a part that shapes the PSFs makes window and pupil to be found anew."""
+        """Set an attribute; a part that shapes the PSFs makes wavelengths, window and pupil to be found anew."""
+        if name in ("spectrum", "fidelity"):
+            both = {**self.__dict__, name: value}
+            if "spectrum" in both and "fidelity" in both:
+                spectrum, most = both["spectrum"], both["fidelity"].wavelengths
+                self.__dict__["_seen"] = spectrum if most is None else fewer_wavelengths(spectrum, most)
         super().__setattr__(name, value)
         if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
             self.__dict__.update(_window=None, _pupil=None)
@@ -325,12 +366,14 @@ class CodedLens(nn.Module):
             state: index of the one state to look through. Default: the average over the exposure.
         """
         spectrum, kind = self._spectrum(channels), self.fidelity.layers
+        if self._bank is not None:
+            return self._measured_bank(spectrum, dtype, defocus.device)
         nodes = self.defocus_nodes
         if kind in ("nearest", "linear"):
-            bank = self._computed_bank(spectrum, dtype, _around(nodes, defocus), state)
+            bank = self._computed_bank(spectrum, dtype, nodes_around(nodes, defocus), state)
         else:
             spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
-            targets = _around(fine_nodes(nodes), defocus)
+            targets = nodes_around(fine_nodes(nodes), defocus)
             first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
             last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
             samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
@@ -352,7 +395,7 @@ class CodedLens(nn.Module):
 
     def _spectrum(self, channels: int) -> Spectrum:
         if channels == len(self.spectrum.weights):
-            return self.spectrum
+            return self._seen
         if channels == 1:
             return Spectrum.monochrome()
         raise ValueError(
@@ -362,15 +405,3 @@ class CodedLens(nn.Module):
 
 def _refit_window(lens: CodedLens, _: Any) -> None:
     lens.fit_window()
-
-
-def _around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
-    if torch.compiler.is_compiling():
-        return nodes
-    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-    # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad)
-    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-    return nodes[min(first, last) : last + 1]

@@ -8,9 +8,12 @@ Samples closer than :math:`\pi / \Omega` carry every depth between them.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from kornia_tidy.optics.psf_bank import PSFBank
 
@@ -114,7 +117,6 @@ def interpolated_bank(
         A bank at the targets; gradients reach the given one.
 
     Example:
-        >>> import torch
         >>> depths = torch.arange(5.0)
         >>> bank = PSFBank(depths.reshape(5, 1, 1, 1) / 10, depths, depths[:, None] / 10)
         >>> interpolated_bank(bank, (0.0, 1.0, 2.0, 3.0, 4.0), (1.5, 2.0), None).energy.flatten()
@@ -124,3 +126,15 @@ def interpolated_bank(
     matrix = interpolation_matrix(nodes[0], spacing, len(nodes), targets, band)
     psfs = (bank.psfs.new_tensor(matrix) @ bank.psfs.flatten(1)).unflatten(1, bank.psfs.shape[1:])
     return PSFBank(psfs, psfs.new_tensor(targets), psfs.sum((2, 3)))
+
+
+def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
+    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
+    if torch.compiler.is_compiling():
+        return nodes
+    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
+    # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
+    extra = int(defocus.requires_grad)
+    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
+    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
+    return nodes[min(first, last) : last + 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -90,15 +91,25 @@ class PSFBank:
         psfs = psfs + missing * psfs.sum(2, keepdim=True)
         return PSFBank(psfs.flatten(1, 2), self.defocus, self.energy)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        more: Mapping[str, Tensor] | None = None,
+        notes: Mapping[str, str] | None = None,
+    ) -> None:
         """Write the bank as safetensors, all or nothing.
+
+        Args:
+            path: where to.
+            more: what else is to lie in the file, under names with a dot in them.
+            notes: what is to be told about it in words.
 
         Raises:
             FileNotFoundError: if the folder does not exist.
         """
-        tensors = {name: getattr(self, name) for name in _FIELDS}
+        tensors = {**{name: getattr(self, name) for name in _FIELDS}, **(more or {})}
         present = {k: v.detach().cpu().contiguous() for k, v in tensors.items() if v is not None}
-        write_bytes(path, save(present, metadata={"format": _FORMAT}))
+        write_bytes(path, save(present, metadata={**(notes or {}), "format": _FORMAT}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> PSFBank:
@@ -112,7 +123,8 @@ class PSFBank:
         try:
             with safe_open(path, framework="pt", device=str(device)) as file:
                 form = (file.metadata() or {}).get("format")
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+                names = [key for key in file.keys() if "." not in key]  # noqa: SIM118 (not a dict)
+                tensors = {key: file.get_tensor(key) for key in names}
         except SafetensorError as error:
             raise ValueError(f"{path} is not a readable PSF bank: {error}") from None
         if form != _FORMAT or not {"psfs", "defocus", "energy"} <= set(tensors) <= {*_FIELDS}:

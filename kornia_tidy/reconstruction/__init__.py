@@ -5,7 +5,10 @@ from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
 from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
+from kornia_tidy.reconstruction.receptive_field import receptive_field
+from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
+from kornia_tidy.reconstruction.tiled import reconstruct_tiled
 
 __all__ = [
     "AttentionUNet",
@@ -15,7 +18,10 @@ __all__ = [
     "PhaseCam3DUNet",
     "Preconditioned",
     "ReconstructionHead",
+    "Residual",
     "Tikhonov",
     "TikhonovLayers",
     "load_midas_small",
+    "receptive_field",
+    "reconstruct_tiled",
 ]

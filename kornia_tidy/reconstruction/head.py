@@ -47,10 +47,8 @@ class ReconstructionHead(nn.Module, ABC):
         if image.shape[1] != self.in_channels:
             raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}")
         height, width = image.shape[-2:]
-        top, bottom = _margins(height, self.stride)
-        left, right = _margins(width, self.stride)
+        (left, right, top, bottom), mode = border_padding((height, width), self.stride)
         if bottom or right:
-            mode = "reflect" if bottom < height and right < width else "replicate"
             image = functional.pad(image, (left, right, top, bottom), mode)
         return self.predict(image)[..., top : top + height, left : left + width]
 
@@ -81,7 +79,15 @@ def check_count(name: str, value: int, least: int = 1) -> None:
         raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
-def _margins(size: int, multiple: int) -> tuple[int, int]:
-    """Return the pixels to add before and after ``size`` to make it a multiple."""
-    missing = -size % multiple
-    return missing // 2, missing - missing // 2
+def border_padding(size: tuple[int, int], multiple: int) -> tuple[tuple[int, int, int, int], str]:
+    """Return by how much heads continue an image on the left, right, top and bottom, and in which mode.
+
+    Example:
+        >>> border_padding((13, 32), 16)
+        ((0, 0, 1, 2), 'reflect')
+    """
+    height, width = size
+    missing_rows, missing_columns = -height % multiple, -width % multiple
+    top, left = missing_rows // 2, missing_columns // 2
+    bottom, right = missing_rows - top, missing_columns - left
+    return (left, right, top, bottom), "reflect" if bottom < height and right < width else "replicate"

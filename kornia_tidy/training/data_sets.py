@@ -15,6 +15,7 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.flying_things import FOCAL_PX, NEAREST, paper_patches, split_frames
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.patches import central_crop, random_crop
+from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.data.rgbd_folder import described_folder
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.seeds import keyed_seed
@@ -63,7 +64,7 @@ def _dead_leaves(settings: TrainingSettings, split: str, count: int | None) -> D
     counts = {"train": settings.scenes, "validation": settings.validation_scenes, "test": count or TESTED}
     depths = settings.depth_range or (0.3, math.inf)
     seed = keyed_seed(settings.seed, split)
-    return DeadLeaves(counts[split], settings.size, settings.size, depth_range=depths, seed=seed)
+    return Remembered(DeadLeaves(counts[split], settings.size, settings.size, depth_range=depths, seed=seed))
 
 
 def _flying_things(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:

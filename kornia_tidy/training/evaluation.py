@@ -167,8 +167,8 @@ def table(rows: Sequence[Row]) -> list[str]:
     Example:
         >>> for line in table([{"scene": 0, "depth_rmse": 0.25}, {"scene": 1, "depth_rmse": 0.75}]):
         ...     print(line)
-        score                      mean    lowest   highest
-        depth_rmse               0.5000    0.2500    0.7500
+        score                       mean    lowest   highest
+        depth_rmse                0.5000    0.2500    0.7500
     """
     lines = [f"{'score':<20}{'mean':>12}{'lowest':>10}{'highest':>10}"]
     for name, mean in mean_row(rows).items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import lightning.pytorch as pl
@@ -14,7 +15,7 @@ from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.scenes import Broken
-from kornia_tidy.training.settings import TrainingSettings, differences
+from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.tasks import (
     LOSSES,
     MAPS,
@@ -40,6 +41,20 @@ class Seen(NamedTuple):
     """bool (B, 1, H, W), True where depth is known."""
 
 
+def cosine_rate(progress: float, warm_up: float = 0.1) -> float:
+    """Return the factor of a learning rate at a share of a run: up from a tenth in a straight line, down as a cosine.
+
+    Source: Loshchilov and Hutter, SGDR (ICLR 2017), without restarts.
+
+    Example:
+        >>> [round(cosine_rate(share), 3) for share in (0.0, 0.1, 0.55, 1.0)]
+        [0.1, 1.0, 0.5, 0.0]
+    """
+    if progress < warm_up:
+        return 0.1 + 0.9 * progress / warm_up
+    return (1 + math.cos(math.pi * min(1.0, (progress - warm_up) / (1 - warm_up)))) / 2
+
+
 class TidyTraining(pl.LightningModule):
     """Trains a camera's masks and the network that reads its captures, by one Adam.
 
@@ -55,6 +70,7 @@ class TidyTraining(pl.LightningModule):
         lr: learning rate of the network, and of what the optics may learn besides masks.
         lr_metres: learning rate of the masks, in metres of height.
         betas: Adam's.
+        schedule: of both rates: ``"constant"``, or ``"cosine"``: up in a tenth of the run's steps, then down to zero.
         ema: decay of the network's moving average, which validation and checkpoints' readers use. 0: none.
         depth_weight: of the depth loss in the joint task.
         image_weight: of the image loss in the joint task.
@@ -81,6 +97,7 @@ class TidyTraining(pl.LightningModule):
         lr: float = 1e-4,
         lr_metres: float = 1e-8,
         betas: tuple[float, float] = (0.99, 0.999),
+        schedule: str = "constant",
         ema: float = 0.999,
         depth_weight: float = 1.0,
         image_weight: float = 1.0,
@@ -88,13 +105,14 @@ class TidyTraining(pl.LightningModule):
     ) -> None:
         super().__init__()
         check_choice("task", task, tuple(MAPS))
+        check_choice("schedule", schedule, SCHEDULES)
         check_positive("lr", lr)
         check_positive("lr_metres", lr_metres, "metres")
         self.optics = fix_window(optics)
         self.head = head
         self.average = MovingAverage(head, ema) if ema else None
         self.task, self.loss, self.settings = task, loss, settings
-        self.lr, self.lr_metres, self.betas = lr, lr_metres, betas
+        self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
         self.weights = {"depth": depth_weight, "image": image_weight}
 
     @classmethod
@@ -108,6 +126,7 @@ class TidyTraining(pl.LightningModule):
             LOSSES[settings.loss],
             lr=settings.lr,
             lr_metres=settings.lr_metres,
+            schedule=settings.schedule,
             ema=settings.ema,
             depth_weight=settings.depth_weight,
             image_weight=settings.image_weight,
@@ -153,12 +172,17 @@ class TidyTraining(pl.LightningModule):
             scores[f"val_{name}_rmse"] = errors.nanmean()
         self.log_dict(scores, batch_size=len(seen.coded), sync_dist=True, prog_bar=True)
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Return one Adam: masks in metres of height, all else at the network's rate."""
+    def configure_optimizers(self) -> Any:
+        """Return one Adam: masks in metres of height, all else at the network's rate; and its schedule, if there is."""
         groups = self.optics.parameter_groups(self.lr_metres, self.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
         groups.append({"params": list(self.head.parameters()), "lr": self.lr})
-        return torch.optim.Adam(groups, lr=self.lr, betas=self.betas)
+        adam = torch.optim.Adam(groups, lr=self.lr, betas=self.betas)
+        if self.schedule == "constant":
+            return adam
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: cosine_rate(step / max(1, steps)))
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_start(self) -> None:
         """Compute all PSFs at once: those of a fixed lens are remembered, and rounded by what is computed with them."""

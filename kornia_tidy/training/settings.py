@@ -17,6 +17,7 @@ from kornia_tidy.scene.compositing import COMPOSITING
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.training.tasks import LOSSES, MAPS
 
+SCHEDULES = ("constant", "cosine")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
 
 
@@ -39,6 +40,7 @@ class TrainingSettings:
         border: see there.
         head: name of the network, see :data:`kornia_tidy.training.heads.HEADS`.
         width: channels of its first level. None: its default; the paper's attention U-Net has 64.
+        residual: the network estimates what is to be added to the capture; for tasks with an image.
         data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
         root: folder of the data, where they are files. None: ``data/NAME``.
         size: side of the scenes in pixels; larger ones are cropped, at random for training.
@@ -47,6 +49,7 @@ class TrainingSettings:
         augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does.
         lr: learning rate of the network.
         lr_metres: learning rate of the masks in metres of height.
+        schedule: of both rates: ``"constant"``, or ``"cosine"``: up in a tenth of the steps, then down to zero.
         batch: scenes in a batch.
         accumulate: batches in a step of the optimiser.
         epochs: passes over the data.
@@ -81,6 +84,7 @@ class TrainingSettings:
     border: str = "reflect"
     head: str = "attention-unet"
     width: int | None = None
+    residual: bool = False
     data: str = "dead-leaves"
     root: str | None = None
     size: int = 278
@@ -89,6 +93,7 @@ class TrainingSettings:
     augment: bool = True
     lr: float = 1e-4
     lr_metres: float = 1e-8
+    schedule: str = "constant"
     batch: int = 32
     accumulate: int = 1
     epochs: int = 300
@@ -105,6 +110,7 @@ class TrainingSettings:
         check_choice("task", self.task, tuple(MAPS))
         check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
+        check_choice("schedule", self.schedule, SCHEDULES)
         check_choice("compositing", self.compositing, tuple(COMPOSITING))
         check_choice("border", self.border, BORDERS)
         Fidelity.preset(self.fidelity)
@@ -115,6 +121,8 @@ class TrainingSettings:
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
+        if self.residual and "image" not in MAPS[self.task]:
+            raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
         if self.patience is not None and self.patience < 1:
             raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
         if not 0 <= self.ema < 1:

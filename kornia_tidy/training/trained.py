@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.phase_masks import FresnelLens, PixelwiseMask
+from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.heads import make_head
@@ -57,7 +58,8 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 
 def build_head(settings: TrainingSettings) -> nn.Module:
     """Return the network that settings describe, its weights drawn from the global generator."""
-    return make_head(settings.head, channels_of(settings.task), settings.width)
+    head = make_head(settings.head, channels_of(settings.task), settings.width)
+    return Residual(head) if settings.residual else head
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:

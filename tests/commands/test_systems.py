@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.commands.systems import stretched_depth, table
+from kornia_tidy.commands.systems import table
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.training.tasks import metres
 from tests.base import DATA, BaseTester, needs_data
 
 
@@ -42,7 +43,7 @@ class TestSystems(BaseTester):
         for system in SYSTEMS.values():
             camera = system.camera()
             lo, hi = camera.defocus_range
-            psi = camera.defocus(stretched_depth(nearness, camera))
+            psi = camera.defocus(metres(camera, nearness))
             self.assert_close(psi, torch.tensor([lo, 0.75 * lo + 0.25 * hi, hi]), rtol=0, atol=2e-3)
 
     def test_feature_the_table_has_a_line_for_each_system_and_its_guesses(self):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from torch.utils.data import Dataset, Subset
 
 from kornia_tidy import TiDyOptics
-from kornia_tidy.data import DeadLeaves, Patches, UnreadableItemError, crop, random_crop
+from kornia_tidy.data import DeadLeaves, Patches, UnreadableItemError, central_crop, crop, random_crop
 from tests.base import BaseTester
 from tests.pipeline_samples import FAST
 
@@ -51,6 +51,13 @@ class TestCrop(BaseTester):
             assert cut[key].shape[-2:] == size
             assert torch.equal(cut[key], sample[key][:, top : top + size[0], left : left + size[1]])
         assert (cut["index"], cut["name"]) == (9, "n")
+
+    @pytest.mark.parametrize(("size", "corner"), [((5, 7), (0, 0)), ((3, 3), (1, 2)), ((2, 4), (1, 1))])
+    def test_feature_the_middle(self, size, corner):
+        sample = numbered(5, 7)
+        cut = central_crop(sample, size)
+        assert divmod(int(cut["image"][0, 0, 0]), 7) == corner
+        assert all(torch.equal(cut[key], crop(sample, *corner, *size)[key]) for key in ("image", "depth", "mask"))
 
     def test_feature_every_place_is_drawn_as_often(self):
         """4 x 3 places, 2400 draws: 200 each, and within five standard deviations of 13.5."""

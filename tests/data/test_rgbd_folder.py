@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.data import RGBDFolder, UnreadableItemError
+from kornia_tidy.data import RGBDFolder, UnreadableItemError, described_folder
 from tests.base import DATA, BaseTester, needs_data
 from tests.data.published import write_pfm
 
@@ -117,3 +117,32 @@ class TestRGBDFolder(BaseTester):
         for sample in data:
             assert sample["image"].shape == (3, 480, 640)
             assert sample["depth"][sample["mask"]].median().item() == pytest.approx(median, rel=0.3)
+
+
+class TestDescribedFolder(BaseTester):
+    def test_feature_the_folder_tells_how_depth_is_stored(self, tmp_path):
+        write(tmp_path, "a/1.png", "b/1.png", 2500)
+        (tmp_path / "rgbd.json").write_text('{"image": "a/*.png", "depth": "b/*.png", "scale": 0.001, "invalid": [9]}')
+        (sample,) = described_folder(tmp_path)
+        self.assert_close(sample["depth"].unique(), torch.tensor([2.5]))
+
+    def test_exception_without_a_description(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"there is no .*rgbd\.json: it tells which files"):
+            described_folder(tmp_path)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("{", "cannot read .*rgbd.json: Expecting"),
+            ("[1]", 'it should hold "image" and "depth" and may hold scale, kind'),
+            ('{"image": "*.png"}', 'it should hold "image" and "depth"'),
+            ('{"image": "*.png", "depth": "*_d.png", "unit": 1}', 'it should hold "image" and "depth"'),
+            ('{"image": "*.png", "depth": "*_d.png", "scale": "mm"}', "cannot read .*rgbd.json: "),
+            ('{"image": 1, "depth": 2}', "cannot read .*rgbd.json: "),
+            ('{"image": "*.png", "depth": "*_d.png", "scale": -1}', "scale must be positive"),
+        ],
+    )
+    def test_exception_a_description_that_does_not_tell_it(self, text, message, tmp_path):
+        (tmp_path / "rgbd.json").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            described_folder(tmp_path)

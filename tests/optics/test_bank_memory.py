@@ -48,7 +48,7 @@ class TestOnlyWhatTheSceneRequires(BaseTester):
         image, depth = torch.rand(1, 3, 20, 24, dtype=torch.float64), 1 / inverse
         optics.check_inputs = False  # no warning of depths beyond the range
         few = optics(image, depth)
-        with patch.object(module, "_around", lambda nodes, _: nodes):
+        with patch.object(module, "nodes_around", lambda nodes, _: nodes):
             every = optics(image, depth)
         self.assert_close(few, every, rtol=0, atol=1e-12)
 

@@ -56,6 +56,24 @@ class TestThinLensCamera(BaseTester):
         assert 1 / camera.image_distance + 1 / 0.595 == pytest.approx(1 / 50e-3)
         assert camera.image_distance / 50e-3 == pytest.approx(1.092, abs=1e-3)
 
+    @pytest.mark.parametrize("depth_range", [(0.3, math.inf), (0.5, 4.0)])
+    def test_feature_depth_is_the_inverse_of_defocus_and_infinity_is_exact(self, depth_range, dtype):
+        if dtype not in {torch.float32, torch.float64}:
+            pytest.skip("half precision rounds defocus by hundredths of a radian")
+        camera = ThinLensCamera.for_scene(depth_range)
+        depth = torch.tensor([*depth_range, 0.7, 1.3, 3.0], dtype=dtype)
+        assert camera.depth(camera.defocus(depth)).dtype == dtype
+        torch.testing.assert_close(camera.depth(camera.defocus(depth)), depth, rtol=1e-5, atol=0)
+        beyond = camera.depth(torch.tensor([-60.0], dtype=dtype))
+        assert beyond.isinf().all()
+
+    def test_feature_depth_follows_a_focus_that_has_moved(self):
+        camera = ThinLensCamera(focus_distance=torch.tensor(0.6, dtype=torch.float64))
+        with torch.no_grad():
+            camera.focus_distance.fill_(0.75)
+        depth = torch.tensor([0.4, 0.9, 5.0], dtype=torch.float64)
+        torch.testing.assert_close(camera.depth(camera.defocus(depth)).detach(), depth, rtol=1e-9, atol=0)
+
     def test_feature_resized_keeps_the_lens(self):
         camera = ThinLensCamera(depth_range=(0.3, 4.0)).resized(0.25)
         assert camera.pixel_pitch == 32e-6

@@ -6,10 +6,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.reconstruction.losses import JointLoss, gradient_loss, joint_loss, l1_loss, mse_loss, rmse_loss
+from kornia_tidy.reconstruction.losses import (
+    JointLoss,
+    gradient_loss,
+    joint_loss,
+    l1_loss,
+    mse_loss,
+    phasecam3d_loss,
+    rmse_loss,
+)
 from tests.base import BaseTester
 
-LOSSES = (mse_loss, l1_loss, rmse_loss, gradient_loss)
+LOSSES = (mse_loss, l1_loss, rmse_loss, gradient_loss, phasecam3d_loss)
 
 
 def make_maps(shape=(2, 3, 6, 7), device="cpu", dtype=torch.float64):
@@ -25,6 +33,8 @@ def by_hand(loss, prediction, target, mask) -> float:
     x, z = (value.double().cpu().numpy() for value in (prediction, target))
     seen = np.broadcast_to(mask.cpu().numpy(), z.shape)
     error = x - z
+    if loss is phasecam3d_loss:
+        return 20 * by_hand(rmse_loss, prediction, target, mask) + by_hand(gradient_loss, prediction, target, mask)
     if loss is gradient_loss:
         rows = np.array([e for e in np.diff(error, axis=2).ravel() if not np.isnan(e)])  # NaN marks an unknown pixel
         columns = np.array([e for e in np.diff(error, axis=3).ravel() if not np.isnan(e)])

@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.commands.systems import stretched_depth
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.optics import AliasingWarning, CubicMask, RadialMask, ZernikeMask
 from kornia_tidy.optics.fisher_information import crlb
 from kornia_tidy.systems import SYSTEMS, published_system
 from kornia_tidy.systems.presets import cubic_in_zernikes
 from kornia_tidy.systems.survey import contrast_transfer
+from kornia_tidy.training.tasks import metres
 from tests.base import DATA, BaseTester, needs_data
 from tests.scenes import load_scene
 
@@ -162,7 +162,7 @@ class TestPhysics(BaseTester):
         optics = preset(name, sensor=None)
         nearness = torch.where(torch.arange(44) < 20, 0.9, 0.1) + 0.1 * torch.rand(1, 1, 40, 44)
         with torch.no_grad():
-            white = optics(torch.ones(1, 3, 40, 44), stretched_depth(nearness, optics.camera))
+            white = optics(torch.ones(1, 3, 40, 44), metres(optics.camera, nearness))
         assert float((white - 1).abs().max()) < (1e-6 if name in GATHERING else 2e-5)
 
     @pytest.mark.parametrize("name", GATHERING)
@@ -170,7 +170,7 @@ class TestPhysics(BaseTester):
         optics = preset(name, sensor=None, compositing="scatter", border="circular", color_space="linear")
         image, nearness = torch.rand(1, 3, 72, 72, dtype=torch.float64), torch.rand(1, 1, 72, 72, dtype=torch.float64)
         with torch.no_grad():
-            coded = optics(image, stretched_depth(nearness, optics.camera))
+            coded = optics(image, metres(optics.camera, nearness))
         self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-6, atol=0)
 
     @pytest.mark.parametrize("name", ["tidy-1", "phasecam3d", "ikoma2021", "chang2019", "sitzmann2018"])
@@ -276,7 +276,7 @@ class TestScenes(BaseTester):
         image, nearness = scene
         optics = preset(name, color_space="linear", sensor=None)
         with torch.no_grad():
-            light = optics(image, stretched_depth(nearness, optics.camera))
+            light = optics(image, metres(optics.camera, nearness))
         assert optics.clamped_pixels == 0
         assert light.shape == image.shape
         assert float(light.mean()) == pytest.approx(float(image.mean()), rel=0.05)
@@ -287,7 +287,7 @@ class TestScenes(BaseTester):
         assert detail(light) < 0.9 * detail(image)
         noisy = preset(name, color_space="linear")
         with torch.no_grad():
-            coded = noisy(image, stretched_depth(nearness, noisy.camera))
+            coded = noisy(image, metres(noisy.camera, nearness))
         inside = (light > 0.1) & (light < 0.9)
         assert float((coded - light)[inside].std()) == pytest.approx(SYSTEMS[name].sigma, rel=0.05)
 
@@ -295,7 +295,7 @@ class TestScenes(BaseTester):
     def test_feature_gradients_reach_whatever_is_learnable(self, name):
         optics = preset(name, sensor=None, fidelity=Fidelity(window=9, layer_spacing=20.0))
         nearness = torch.where(torch.arange(20) < 10, 0.8, 0.3).expand(1, 1, 20, 20)
-        coded = optics(torch.rand(1, 3, 20, 20), stretched_depth(nearness, optics.camera))
+        coded = optics(torch.rand(1, 3, 20, 20), metres(optics.camera, nearness))
         assert coded.requires_grad == (name != "fresnel")
         if name != "fresnel":
             coded.square().mean().backward()

@@ -31,6 +31,7 @@ class TestTwoProcesses(BaseTester):
             assert done.returncode == 0, done.stderr
             assert ("MEMBER: 2/2" in done.stderr) == (processes == 2)
             states.append(read_state(folder / "last.safetensors"))
+            assert len(states[-1]["callbacks"]["SaveCheckpoints"]["random"]) == processes
         one, two = states
         assert one["global_step"] == two["global_step"] == 20
         start = (tmp_path / "1" / "training.csv").read_text()

@@ -1,0 +1,136 @@
+r"""A PSF from point images at several places between the pixels: what one image aliases, several resolve.
+
+A sensor samples a PSF too coarsely as soon as its pixels are larger than half of wavelength times f-number, so a single
+image cannot be moved by a part of a pixel. Images of one point at several places can: at each frequency of the image,
+the aliases that fall on it come with other phases in every image, and are unknowns of a small linear system.
+
+Source: Lauer, Publications of the Astronomical Society of the Pacific 111, 227 (1999).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedPSF:
+    """A PSF known between the pixels too, by its spectrum beyond the sensor's own Nyquist frequency.
+
+    Args:
+        spectrum: (L, L) complex; L is a whole multiple, twice the band, of the side M of the images it came of.
+        band: highest frequency along either axis, in cycles per sample.
+        psf: (M, M) samples with the chief ray at the centre, M // 2.
+        variance: (M, M) of these.
+        leverage: share of an image's noise that the PSF has taken up, from 0, as in the mean of many, to 1.
+    """
+
+    spectrum: Tensor
+    band: int
+    psf: Tensor
+    variance: Tensor
+    leverage: float
+
+    def seen_from(self, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what point images look like, and how they change with the place of the point.
+
+        Args:
+            offsets: (N, 2) where the chief ray falls, rows and columns from the centre of the central pixel.
+
+        Returns:
+            Images (N, M, M), and their slopes (N, 2, M, M) over the two offsets.
+        """
+        side, frequency = self._grid()
+        rows, columns = (torch.exp(-2j * math.pi * frequency * offset[:, None]) for offset in offsets.unbind(1))
+        moved = self.spectrum * rows[:, :, None] * columns[:, None, :]
+        turn = -2j * math.pi * frequency
+        three = torch.stack([moved, moved * turn[:, None], moved * turn], 1)
+        image = _centred(torch.fft.ifft2(_folded(three, side)).real)
+        return image[:, 0], image[:, 1:]
+
+    def _grid(self) -> tuple[int, Tensor]:
+        length = self.spectrum.shape[-1]
+        return length // (2 * self.band), _frequencies(length, self.band, self.spectrum.device)
+
+
+def resolve_psf(patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: float = 1.0) -> ResolvedPSF:
+    r"""Return the PSF that explains point images at several places: least squares for all aliases of each frequency.
+
+    .. math:: Y_i(f) = \sum_k H(f + k) e^{-2 \pi i (f + k) \cdot \delta_i} + n_i(f)
+
+    Few images, or images alike in place, do not fix all aliases. Those are then shared out as a lens shares its light
+    between frequencies, in proportion to a prior :math:`(1 - |f| / f_c)^2` of the image's own power.
+
+    Args:
+        patches: (N, M, M) point images, background taken off, alike in brightness.
+        offsets: :math:`\delta`, (N, 2) where the chief ray falls, rows and columns in samples from the centre of the
+            pixel (M // 2, M // 2); within a sample or so.
+        variances: (N, M, M).
+        cutoff: :math:`f_c`, highest frequency that the lens passes, in cycles per sample.
+
+    Returns:
+        The PSF with its variance, propagated through the linear system.
+
+    Convention:
+        Patches repeat at their borders: light there must have faded, or a margin be cut off afterwards.
+
+    Example:
+        >>> x = torch.arange(16.0) - 8
+        >>> offsets = torch.tensor([[0.0, -0.3], [0.25, 0.1], [-0.25, 0.35], [0.0, 0.0]])
+        >>> spot = lambda dy, dx: torch.exp(-((x[:, None] - dy) ** 2 + (x - dx) ** 2) / 2)
+        >>> images = torch.stack([spot(*offset) for offset in offsets.tolist()])
+        >>> found = resolve_psf(images, offsets, torch.full((4, 16, 16), 1e-12))
+        >>> bool((found.psf - spot(0, 0)).abs().max() < 1e-4)
+        True
+    """
+    side = patches.shape[-1]
+    band = max(1, math.ceil(cutoff))
+    aliases = 2 * band
+    length = aliases * side
+    patches, variances, offsets = patches.double(), variances.double(), offsets.double()
+    frequency = _frequencies(length, band, patches.device)
+    spectra = torch.fft.fft2(torch.fft.ifftshift(patches, dim=(-2, -1)))
+    noise = variances.mean((1, 2))  # of one pixel, alike at all frequencies
+
+    passed = (1 - torch.hypot(frequency[:, None], frequency) / cutoff).clamp(min=0).square()
+    power = spectra.abs().square().mean()
+    prior = passed / _folded(passed, side).mean() * (power - noise.mean() * side**2).clamp(min=1e-6 * float(power))
+
+    # For every frequency of the image, in units in which prior and noise are one: (side, side, N, aliases^2).
+    rows, columns = (
+        torch.exp(-2j * math.pi * frequency * offset[:, None]).unflatten(1, (aliases, side))
+        for offset in offsets.unbind(1)
+    )
+    noise_scale = noise.clamp(min=1e-30).rsqrt() / side
+    own = prior.sqrt().unflatten(1, (aliases, side)).unflatten(0, (aliases, side)).permute(1, 3, 0, 2).flatten(2)
+    phases = torch.einsum("nay,nbx->yxnab", rows, columns).flatten(3) * own[:, :, None] * noise_scale[:, None]
+    system = phases.mH @ phases + torch.eye(aliases**2).to(phases)
+    gains = torch.linalg.solve(system, phases.mH)
+    leverage = float((phases * gains.mT).sum(-1).real.mean())
+    gains = own[..., None] * gains * noise_scale  # (side, side, aliases^2, N)
+
+    solved = (gains @ spectra.permute(1, 2, 0)[..., None])[..., 0]
+    spectrum = solved.unflatten(2, (aliases, aliases)).permute(2, 0, 3, 1).reshape(length, length)
+    psf = _centred(torch.fft.ifft2(_folded(spectrum, side)).real)
+    filters = torch.fft.ifft2(gains.sum(2), dim=(0, 1)).real.permute(2, 0, 1)  # what an image adds to the PSF
+    spread = torch.fft.fft2(filters.square()) * torch.fft.fft2(variances)
+    variance = torch.fft.ifft2(spread.sum(0)).real
+    return ResolvedPSF(spectrum, band, psf, variance.clamp(min=0), leverage)
+
+
+def _frequencies(length: int, band: int, device: torch.device) -> Tensor:
+    """Frequencies of a spectrum that reaches beyond Nyquist, in cycles per sample."""
+    return torch.fft.fftfreq(length, 1 / (2 * band), dtype=torch.float64, device=device)
+
+
+def _folded(spectrum: Tensor, side: int) -> Tensor:
+    """Add up the aliases: the spectrum of the samples."""
+    aliases = spectrum.shape[-1] // side
+    return spectrum.unflatten(-1, (aliases, side)).sum(-2).unflatten(-2, (aliases, side)).sum(-3)
+
+
+def _centred(image: Tensor) -> Tensor:
+    return torch.fft.fftshift(image, dim=(-2, -1))

@@ -1,0 +1,167 @@
+"""PSFs measured over depth: a bank to render and to restore with, how sure it is, and what became of each capture."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from kornia_tidy.calibration.point_images import MARGIN, PointImage
+from kornia_tidy.calibration.registration import Registered, register
+from kornia_tidy.checks import check_depth
+from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.psf_bank import PSFBank
+
+
+@dataclass(frozen=True)
+class PointReport:
+    """What became of one point image.
+
+    Args:
+        distance: of the point in metres.
+        row: where its chief ray fell, in pixels.
+        column: as well.
+        brightness: over the mean of those used at this distance; None if it was never used.
+        misfit: mean square of its residuals in units of their variance, 1 is noise; None likewise.
+        rejected: why it was not used, or None.
+    """
+
+    distance: float
+    row: float
+    column: float
+    brightness: float | None
+    misfit: float | None
+    rejected: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPSFs:
+    """PSFs measured over depth.
+
+    Args:
+        bank: the PSFs, each summing to one: what light leaves the window is not seen and counted as none.
+        uncertainty: (D, C, P, P) standard deviation of each, of the noise in the captures.
+        distances: (D,) in metres, of the bank's nodes: from far to near.
+        reports: of every point image.
+    """
+
+    bank: PSFBank
+    uncertainty: Tensor
+    distances: Tensor
+    reports: tuple[PointReport, ...] = ()
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.bank.psfs.shape)
+        if tuple(self.uncertainty.shape) != shape:
+            raise ValueError(
+                f"uncertainty must have the shape of the PSFs, {shape}, got {tuple(self.uncertainty.shape)}"
+            )
+        if tuple(self.distances.shape) != shape[:1]:
+            raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it all as safetensors, all or nothing; :meth:`PSFBank.load` reads the bank of it.
+
+        Raises:
+            FileNotFoundError: if the folder does not exist.
+        """
+        measured = {"measured.uncertainty": self.uncertainty, "measured.distances": self.distances}
+        self.bank.save(path, measured, {"reports": json.dumps([asdict(report) for report in self.reports])})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> MeasuredPSFs:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is no PSF bank, or one that was not measured.
+        """
+        bank = PSFBank.load(path, device)
+        with safe_open(path, framework="pt", device=str(device)) as file:
+            names = {"measured.uncertainty", "measured.distances"} & set(file.keys())
+            tensors = {name.removeprefix("measured."): file.get_tensor(name) for name in names}
+            text = (file.metadata() or {}).get("reports", "")
+        try:
+            reports = tuple(PointReport(**report) for report in json.loads(text))
+            return cls(bank, reports=reports, **tensors)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
+
+
+def diffraction_cutoff(camera: ThinLensCamera, wavelength: float) -> float:
+    r"""Return the highest frequency that a lens passes, in cycles per pixel: :math:`2 R p / (\lambda s')`.
+
+    Args:
+        camera: the lens, with its aperture's radius R, image distance s' and pixel pitch p.
+        wavelength: the shortest in the channel, in metres.
+
+    Source: Goodman, Introduction to Fourier Optics, section 7.2.
+
+    Example:
+        >>> round(diffraction_cutoff(ThinLensCamera(), 530e-9), 3)
+        0.784
+    """
+    distance = float(camera.image_distance)
+    return 2 * camera.aperture_radius * camera.pixel_pitch / (wavelength * distance)
+
+
+def measure_psfs(
+    images: Mapping[float, Sequence[PointImage]],
+    camera: ThinLensCamera,
+    window: int,
+    cutoff: float | Sequence[float] = 1.0,
+) -> MeasuredPSFs:
+    """Return the PSFs that point images at known distances show.
+
+    Args:
+        images: of each distance in metres, from :func:`point_images`.
+        camera: what turns a distance into defocus.
+        window: side P of the PSFs in pixels, that of the images.
+        cutoff: highest frequency that the lens passes in each channel, in cycles per pixel, see
+            :func:`diffraction_cutoff`.
+
+    Raises:
+        ValueError: if at some distance no image can be used.
+    """
+    check_depth(torch.tensor(list(images)))
+    nodes = sorted((float(camera.defocus(torch.tensor(z, dtype=torch.float64))), z) for z in images)
+    psfs, deviations, reports = [], [], []
+    for _, distance in nodes:
+        own = list(images[distance])
+        good = [image for image in own if image.fault is None]
+        reports += [
+            PointReport(distance, *image.place, None, None, image.fault) for image in own if image.fault is not None
+        ]
+        if not good:
+            faults = "; ".join(str(image.fault) for image in own) or "there is none"
+            raise ValueError(f"no point image at {distance:g} m can be used: {faults}")
+        channels = len(good[0].light)
+        found = register(good, [cutoff] * channels if isinstance(cutoff, (int, float)) else cutoff)
+        reports += _reports(distance, good, found)
+        inside = slice(MARGIN, -MARGIN)
+        psf = torch.stack([one.psf[inside, inside] for one in found.psfs])
+        total = psf.sum((1, 2))[:, None, None]
+        psfs.append((psf / total).clamp(min=0))
+        deviations.append(torch.stack([one.variance[inside, inside] for one in found.psfs]).sqrt() / total)
+    defocus = torch.tensor([psi for psi, _ in nodes], dtype=torch.float32)
+    bank = PSFBank.from_measured(torch.stack(psfs).float(), defocus)
+    distances = torch.tensor([distance for _, distance in nodes], dtype=torch.float64)
+    return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports))
+
+
+def _reports(distance: float, images: Sequence[PointImage], found: Registered) -> list[PointReport]:
+    reports = []
+    for n, image in enumerate(images):
+        misfit = float(found.misfit[n])
+        row, column = (
+            place - before + float(after)
+            for place, before, after in zip(image.place, image.offset, found.offsets[n], strict=True)
+        )
+        words = None if found.used[n] else f"its residuals are {misfit**0.5:.1f} times the noise"
+        reports.append(PointReport(distance, row, column, float(found.brightness[n]), misfit, words))
+    return reports

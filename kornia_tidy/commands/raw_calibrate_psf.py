@@ -1,0 +1,194 @@
+"""`kornia-tidy raw calibrate-psf`: pictures of a point of light at known distances -> the camera's PSFs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.commands.options import add_lens_options, make_lens
+from kornia_tidy.commands.raw_options import add_dump_options, open_raw
+from kornia_tidy.commands.report import Stages, tell
+from kornia_tidy.data.image_files import SUFFIXES, read_image
+from kornia_tidy.files import replacing
+from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.sensor.noise import SensorNoise
+
+DESCRIPTION = """\
+Measure the PSFs of a camera from pictures of a point of light at known distances.
+At each distance the point is moved by parts of a pixel between the pictures: a
+sensor that samples too coarsely sees a PSF only in several pictures together; 8
+to 16 are good. FILES are raw files (of a mosaic each plane is measured on its own)
+or 16-bit images of linear light, black level taken off; sorted by distance, then
+by place of the point, then by exposure.
+"""
+
+EXAMPLES = """\
+examples:
+  Three distances, 8 places of the point at each:
+    kornia-tidy raw calibrate-psf d1_*.dng d2_*.dng d3_*.dng \\
+        --distances 0.35 0.6 1.5 --full-well 10500 --read-noise 2.4 -o bank.safetensors
+
+  Two exposures at each place; the same places with the modulator flat, so that it is
+  known where the chief ray falls; and the mask that makes these PSFs:
+    kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
+        --reference flat*.tif -o bank.safetensors --picture bank.png --fit-mask mask.npy
+
+In Python:
+  bank = PSFBank.load("bank.safetensors")
+  coded = TiDyOptics(camera=..., sensor=...).with_bank(bank)(image, depth)
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the subcommand to argparse."""
+    parser = subparsers.add_parser(
+        "calibrate-psf",
+        help="pictures of a point -> PSF bank",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("files", nargs="+", metavar="FILES", help="raw files, or 16-bit images of linear light")
+    parser.add_argument("--distances", type=float, nargs="+", required=True, metavar="M", help="of the point, metres")
+    parser.add_argument(
+        "--exposures", type=float, nargs="+", default=[1.0], metavar="S", help="at each place, seconds (default: one)"
+    )
+    parser.add_argument("-o", "--output", required=True, metavar="OUT", help="bank to write, .safetensors")
+    parser.add_argument("--reference", nargs="+", metavar="FILE", help="the same places with a flat mask, unsaturated")
+    parser.add_argument("--window", type=int, default=41, metavar="P", help="side of the PSFs, pixels (default: 41)")
+    parser.add_argument("--points", type=int, default=1, metavar="N", help="points in each picture (default: 1)")
+    parser.add_argument("--picture", metavar="PNG", help="draw PSFs, uncertainties and residuals")
+    parser.add_argument("--fit-mask", metavar="NPY", help="find the mask behind the PSFs and write its heights, metres")
+    parser.add_argument("--mask-size", type=int, default=23, metavar="N", help="its pixels along a side (default: 23)")
+    noise = parser.add_argument_group("noise of the sensor")
+    noise.add_argument("--full-well", type=float, required=True, metavar="E", help="electrons from black to white")
+    noise.add_argument("--read-noise", type=float, required=True, metavar="E", help="electrons")
+    add_lens_options(parser.add_argument_group("camera", "Lengths in metres."))
+    add_dump_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure the PSFs and write them."""
+    from kornia_tidy.calibration.measured_psfs import measure_psfs  # noqa: PLC0415 (only who measures waits for it)
+
+    places = _check_arguments(args)
+    camera = make_lens(args, (0.99 * min(args.distances), 1.01 * max(args.distances)))
+    stages = Stages()
+    with stages("measure"):
+        images = _images(args, places)
+        channels = len(next(iter(images.values()))[0].light)
+        cutoff = _cutoff(camera, channels, mosaic=channels == 4)
+        measured = measure_psfs(images, camera, args.window, cutoff)
+    tell("camera", camera.extra_repr())
+    for report in measured.reports:
+        if report.rejected is not None:
+            where = f"row {report.row:.1f}, column {report.column:.1f}"
+            tell("left out", f"the point at {report.distance:g} m, {where}: {report.rejected}")
+    noise = (2 / torch.pi) ** 0.5 * measured.uncertainty.sum((2, 3))
+    for distance, psi, own in zip(measured.distances, measured.bank.defocus, noise, strict=True):
+        used = sum(r.rejected is None for r in measured.reports if r.distance == float(distance))
+        words = " ".join(f"{100 * float(x):.2g}" for x in own)
+        tell("PSF", f"{float(distance):g} m, psi {float(psi):+.2f} rad: {used} point images, noise {words} % in L1")
+    measured.save(args.output)
+    tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
+    fit = None
+    if args.fit_mask is not None:
+        from kornia_tidy.calibration.phase_retrieval import retrieve_mask  # noqa: PLC0415
+        from kornia_tidy.lab.mask_files import write_heights  # noqa: PLC0415
+
+        with stages("mask"):
+            fit = retrieve_mask(measured.bank, camera, _spectrum(channels), args.mask_size)
+        for distance, left in zip(measured.distances, fit.residual, strict=True):
+            words = " ".join(f"{100 * float(x):.2g}" for x in left)
+            tell("mask", f"{float(distance):g} m: leaves {words} % in L1")
+        write_heights(args.fit_mask, fit.lens.masks.heights().detach())
+        tell("wrote", args.fit_mask)
+    if args.picture is not None:
+        from kornia_tidy.calibration.figure import draw_measured  # noqa: PLC0415
+
+        with replacing(args.picture) as temporary:
+            draw_measured(measured, fit).savefig(temporary, dpi=150, format="png")
+        tell("wrote", args.picture)
+    tell("time", stages.summary())
+
+
+def _check_arguments(args: argparse.Namespace) -> int:
+    """Refuse what cannot be, before any work; return how many places of the point there are at each distance."""
+    for path, suffix in ((args.output, ".safetensors"), (args.picture, ".png"), (args.fit_mask, ".npy")):
+        if path is not None:
+            check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
+            if not Path(path).absolute().parent.is_dir():
+                raise FileNotFoundError(f"cannot write {path}: there is no folder {Path(path).parent}")
+    if len(set(args.distances)) != len(args.distances) or not min(args.distances) > 0:
+        raise ValueError(f"--distances must be different metres above zero, got {args.distances}")
+    groups = len(args.distances) * len(args.exposures)
+    if len(args.files) % groups:
+        raise ValueError(
+            f"{len(args.files)} files do not divide into {len(args.distances)} distances with {len(args.exposures)} "
+            f"exposures at each place"
+        )
+    places = len(args.files) // groups
+    if args.reference is not None and len(args.reference) != places * len(args.distances):
+        raise ValueError(
+            f"--reference needs one file for each of {places * len(args.distances)} places, got {len(args.reference)}"
+        )
+    return places
+
+
+def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
+    """Read one place after the other, of which only the light about the points is kept."""
+    from kornia_tidy.calibration.point_images import point_images  # noqa: PLC0415
+
+    sensor = SensorNoise.physical(args.full_well, args.read_noise)
+    exposures = torch.tensor(args.exposures)
+    files = iter(args.files)
+    references = iter(args.reference or [])
+    images: dict[float, list[Any]] = {}
+    for distance in args.distances:
+        images[distance] = []
+        for _ in range(places):
+            frames, phases = zip(*[_read(next(files), args) for _ in args.exposures], strict=True)
+            if len({frame.shape for frame in frames}) > 1:
+                raise ValueError(f"the exposures of one place differ in size: {[tuple(f.shape) for f in frames]}")
+            reference = _read(next(references), args)[0] if args.reference else None
+            images[distance] += point_images(
+                torch.stack(frames), exposures, sensor, args.window, args.points, reference, phases[0]
+            )
+    return images
+
+
+def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tensor]:
+    """Return linear light (C, H, W), and the place of each channel's pixels in the tile, in pixels of a channel."""
+    if Path(path).suffix.lower() in SUFFIXES:
+        light = read_image(path)
+        return light, torch.zeros(len(light), 2)
+    raw = open_raw(path, args)
+    rows, columns = raw.tile
+    if (rows, columns) not in {(1, 1), (2, 2)}:
+        raise ValueError(f"cannot measure PSFs on {path}: its tile is {rows}x{columns}, 2x2 or none is needed")
+    planes = raw.planes()
+    if (rows, columns) == (1, 1):
+        return planes, torch.zeros(len(planes), 2)
+    return planes, torch.tensor([(row / rows, column / columns) for row in range(rows) for column in range(columns)])
+
+
+def _cutoff(camera: ThinLensCamera, channels: int, mosaic: bool) -> float | list[float]:
+    """Return the highest frequency that the lens passes, at the shortest wavelength a channel may see."""
+    from kornia_tidy.calibration.measured_psfs import diffraction_cutoff  # noqa: PLC0415
+
+    shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)
+    return [min(4.0, diffraction_cutoff(camera, wave) * (2 if mosaic else 1)) for wave in shortest]
+
+
+def _spectrum(channels: int) -> Any:
+    from kornia_tidy.optics.spectrum import Spectrum  # noqa: PLC0415
+
+    if channels not in {1, 3}:
+        raise ValueError(f"--fit-mask needs PSFs of 1 or 3 channels, these have {channels}")
+    return Spectrum.monochrome() if channels == 1 else Spectrum.rgb()

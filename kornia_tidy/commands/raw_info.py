@@ -1,0 +1,193 @@
+"""`kornia-tidy raw info`: what a camera raw file holds."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from torch import Tensor
+
+from kornia_tidy.commands.raw_options import add_dump_options, for_each_file, open_raw
+from kornia_tidy.commands.report import tell
+from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
+
+DESCRIPTION = """\
+Say what raw files hold: camera, lens and exposure; size and filter array of the
+visible area; black and white levels beside the counts that are really there;
+white balance as shot, colour matrices and orientation. Every file is decoded
+whole, so a file that is told of here can be developed.
+"""
+
+EXAMPLES = """\
+examples:
+  All files of a folder, those that fail are named at the end:
+    kornia-tidy raw info shots/*.dng
+
+  For a script, one object a file:
+    kornia-tidy raw info --json shots/*.dng > shots.json
+
+  A bare dump of counts, 16 bits each:
+    kornia-tidy raw info dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520
+
+Exit status 2 if any file failed.
+"""
+
+FLIPS = {
+    0: "is upright",
+    1: "is mirrored left to right",
+    2: "is mirrored top to bottom",
+    3: "is to be turned by 180 degrees",
+    4: "is mirrored at its diagonal",
+    5: "is to be turned by 90 degrees counter-clockwise",
+    6: "is to be turned by 90 degrees clockwise",
+    7: "is mirrored at its other diagonal",
+}
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the subcommand to argparse."""
+    parser = subparsers.add_parser(
+        "info",
+        help="say what raw files hold",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files")
+    parser.add_argument("--json", action="store_true", help="print one JSON array, an object for each file")
+    add_dump_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Say what raw files hold."""
+    objects: list[dict[str, Any]] = []
+
+    def look(path: str) -> None:
+        objects.append({"file": path})
+        try:
+            raw = open_raw(path, args)
+        except (OSError, ValueError) as error:
+            objects[-1]["error"] = str(error)
+            raise
+        objects[-1].update(as_json(raw))
+        if not args.json:
+            tell("file", path)
+            for topic, text in in_words(raw):
+                tell(topic, text)
+            print(flush=True)
+
+    try:
+        for_each_file(args.files, look)
+    finally:
+        if args.json:
+            print(json.dumps(objects, indent=2), flush=True)
+
+
+def in_words(raw: RawCapture) -> list[tuple[str, str]]:
+    """Return what a capture holds, as topics and texts.
+
+    Example:
+        >>> import torch
+        >>> for line in in_words(RawCapture.from_counts(torch.tensor([[[64, 164], [264, 1023]]]), "RGGB", 64, 1023)):
+        ...     print(*line)
+        camera unknown
+        exposure unknown
+        sensor 2 x 2 px, filter array RGGB
+        levels black 64, white 1023; counts 64 to 1023, 25 % of them at white or above
+        colour white balance unknown; no colour matrix
+        picture is upright
+    """
+    height, width = raw.counts.shape[-2:]
+    colour = f"filter array {raw.pattern_letters}" if raw.pattern else "linear RGB" if raw.colors else "monochrome"
+    low, high = (int(end) for end in raw.counts.aminmax())
+    matrices = [name for name in ("xyz_to_camera", "camera_to_srgb") if getattr(raw, name) is not None]
+    aspect = "" if raw.pixel_aspect == 1 else f"; its pixels are {raw.pixel_aspect:.4g} times as wide as high"
+    return [
+        ("camera", ", ".join(part for part in (_camera(raw.info), raw.info.lens) if part) or "unknown"),
+        ("exposure", _exposure(raw.info) or "unknown"),
+        ("sensor", f"{width} x {height} px, {colour}"),
+        (
+            "levels",
+            f"black {_levels(raw.black)}, white {raw.white:g}; counts {low} to {high}, "
+            f"{100 * _saturated(raw):.3g} % of them at white or above",
+        ),
+        ("colour", f"white balance {_balance(raw)}; {' and '.join(matrices) or 'no colour matrix'}"),
+        ("picture", FLIPS[raw.flip] + aspect),
+    ]
+
+
+def as_json(raw: RawCapture) -> dict[str, Any]:
+    """Return what a capture holds, for a program to read: SI units, None where the file says nothing."""
+
+    def plain(tensor: Tensor | None) -> list[Any] | None:
+        return None if tensor is None else tensor.tolist()
+
+    info = raw.info
+    channels, height, width = raw.counts.shape
+    low, high = (int(end) for end in raw.counts.aminmax())
+    return {
+        "make": info.make,
+        "model": info.model,
+        "lens": info.lens,
+        "iso": info.iso,
+        "exposure": info.exposure,
+        "aperture": info.aperture,
+        "focal_length": info.focal_length,
+        "timestamp": info.timestamp.isoformat() if info.timestamp else None,
+        "width": width,
+        "height": height,
+        "channels": channels,
+        "pattern": raw.pattern_letters,
+        "colors": raw.colors,
+        "black": raw.black.tolist(),
+        "white": raw.white,
+        "counts": [low, high],
+        "saturated": _saturated(raw),
+        "white_balance": plain(raw.white_balance),
+        "daylight_balance": plain(raw.daylight_balance),
+        "xyz_to_camera": plain(raw.xyz_to_camera),
+        "camera_to_srgb": plain(raw.camera_to_srgb),
+        "flip": raw.flip,
+        "pixel_aspect": raw.pixel_aspect,
+    }
+
+
+def _camera(info: RawInfo) -> str:
+    """Return the camera's name; many models repeat who made them."""
+    make, model = info.make or "", info.model or ""
+    first = make.split()[0].lower() if make else ""
+    return model if first and first in model.lower() else f"{make} {model}".strip()
+
+
+def _exposure(info: RawInfo) -> str:
+    parts = []
+    if info.exposure:
+        short = info.exposure < 0.3
+        parts.append(f"1/{1 / info.exposure:.0f} s" if short else f"{info.exposure:.3g} s")
+    if info.aperture:
+        parts.append(f"f/{info.aperture:.2g}")
+    if info.focal_length:
+        parts.append(f"{info.focal_length * 1e3:.3g} mm")
+    if info.iso:
+        parts.append(f"ISO {info.iso:.0f}")
+    if info.timestamp:
+        parts.append(str(info.timestamp))
+    return ", ".join(parts)
+
+
+def _levels(black: Tensor) -> str:
+    """Return black levels: one if all are the same, else by places."""
+    levels = black.flatten().tolist()
+    return f"{levels[0]:g}" if len(set(levels)) == 1 else " ".join(f"{level:g}" for level in levels)
+
+
+def _saturated(raw: RawCapture) -> float:
+    return float((raw.counts >= raw.white).float().mean())
+
+
+def _balance(raw: RawCapture) -> str:
+    if raw.white_balance is None:
+        return "unknown"
+    return " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, raw.white_balance.tolist(), strict=True))

@@ -1,0 +1,85 @@
+"""Options and habits that the raw subcommands share: opening a file or a bare dump, and going on after a bad one."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Sequence
+
+from kornia_tidy.sensor.raw_file import RawCapture
+
+DUMP_OPTIONS = ("pattern", "black", "white", "dtype", "byte_order")
+
+
+def add_dump_options(parser: argparse.ArgumentParser) -> None:
+    """Add what a bare dump of counts does not say of itself."""
+    group = parser.add_argument_group(
+        "bare dumps of counts",
+        "A file without a header says nothing of itself: give --size, --pattern, --black\n"
+        "and --white, and all FILES are read as such dumps, row by row.",
+    )
+    group.add_argument("--size", type=_size, metavar="WxH", help="columns x rows, such as 768x512")
+    group.add_argument(
+        "--pattern",
+        type=str.upper,
+        metavar="LETTERS",
+        help="colours of the filter array's tile, by rows: RGGB, GMYC, 36 letters for X-Trans; NONE for monochrome",
+    )
+    group.add_argument("--black", type=float, nargs="+", metavar="N", help="count without light, one or one a place")
+    group.add_argument("--white", type=float, metavar="N", help="saturation count")
+    group.add_argument("--dtype", choices=("uint8", "uint16"), help="of a count (default: uint16)")
+    group.add_argument("--byte-order", choices=("little", "big"), help="of a count (default: little)")
+
+
+def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
+    """Open a raw file, or the dump that the options describe.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it cannot be read, or the options do not describe a dump.
+    """
+    if args.size is None:
+        for name in DUMP_OPTIONS:
+            if getattr(args, name) is not None:
+                raise ValueError(f"--{name.replace('_', '-')} is for bare dumps of counts: give --size too")
+        return RawCapture.open(path)
+    for name in ("pattern", "black", "white"):
+        if getattr(args, name) is None:
+            raise ValueError(f"a bare dump of counts needs --{name}")
+    return RawCapture.open_dump(
+        path,
+        args.size,
+        None if args.pattern == "NONE" else args.pattern,
+        args.black,
+        args.white,
+        args.dtype or "uint16",
+        args.byte_order or "little",
+    )
+
+
+def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
+    """Do something with every file, whatever becomes of the others.
+
+    Raises:
+        OSError, ValueError: the mistake, if there is one file; else how many failed, each having been told by then.
+    """
+    failed = 0
+    for path in paths:
+        try:
+            work(path)
+        except (OSError, ValueError) as error:
+            if len(paths) == 1:
+                raise
+            failed += 1
+            print(f"kornia-tidy: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+    if failed:
+        raise ValueError(f"{failed} of {len(paths)} files failed")
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Return rows and columns of WIDTHxHEIGHT."""
+    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"a size is WIDTHxHEIGHT in pixels, such as 768x512, got {text!r}")
+    return int(match[2]), int(match[1])

@@ -1,0 +1,310 @@
+"""`kornia-tidy raw reconstruct`: all-in-focus pictures and depth from captures of any size."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from kornia.color import rgb_to_linear_rgb
+from torch import Tensor
+from tqdm import tqdm
+
+from kornia_tidy.commands.raw_develop import SUFFIXES, output_paths
+from kornia_tidy.commands.raw_options import add_dump_options, open_raw
+from kornia_tidy.commands.report import tell
+from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.figures import draw_depth, require_matplotlib
+from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.training.tasks import MAPS
+
+if TYPE_CHECKING:
+    from kornia_tidy.training.light_head import LightHead, Reconstruction
+
+DESCRIPTION = """\
+Let a trained network look at captures of any size, tile by tile within a memory
+budget; the tiles cannot be seen. FILES are camera raw files or pictures (PNG, TIFF,
+JPEG, NPY). Of each FILE, FOLDER gets
+  FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
+  FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
+  FILE_depth.pfm, .npy    depth in metres, float32, infinity kept
+  FILE_depth_colors.png   depth in colours, with a scale in metres
+as far as the network estimates them, and FILE.json, which says how they were made
+and is written last. Each is written whole or not at all.
+"""
+
+EXAMPLES = """\
+How a raw file becomes what the network sees: black and white levels, white balance,
+demosaicing, the camera's colours to sRGB's, clipped to [0, 1], linear; on the grid of
+the sensor, as the lens's PSFs lie there, with square pixels. Then the encoding that
+the network was trained with (sRGB's unless --color-space was linear or paper). What
+comes out is turned upright.
+
+examples:
+  All files of a folder; if interrupted, go on with --resume:
+    kornia-tidy raw reconstruct shots/*.dng --checkpoint run/best.safetensors -o depths
+
+  Two at a time, one is read and written while the other is computed:
+    kornia-tidy raw reconstruct shots/*.dng --checkpoint run/best.safetensors -o depths --jobs 2
+
+Exit status 2 if any file failed; the others are reconstructed all the same.
+"""
+
+PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".pfm", ".pgm", ".ppm"}
+PREVIEW_DPI = 150
+
+
+class Row(NamedTuple):
+    """A line of the summary."""
+
+    file: str
+    result: str
+    size: str = ""
+    seconds: float | None = None
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the subcommand to argparse."""
+    parser = subparsers.add_parser(
+        "reconstruct",
+        help="all-in-focus pictures and depth of captures",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files, or pictures")
+    parser.add_argument(
+        "--checkpoint", required=True, metavar="CHECKPOINT", help="best.safetensors or last.safetensors of a training"
+    )
+    parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="where to; made if it is not there")
+    parser.add_argument("--format", choices=tuple(SUFFIXES), default="png", help="of the 16-bit picture (default: png)")
+    parser.add_argument(
+        "--depth-unit", type=float, default=1e-3, metavar="M", help="metres a unit of FILE_depth.png (default: 0.001)"
+    )
+    parser.add_argument("--linear", action="store_true", help="pictures hold linear light (default: encoded as sRGB)")
+    parser.add_argument("--resume", action="store_true", help="skip files whose results are there and still right")
+    parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)")
+    parser.add_argument(
+        "--memory", type=_count, default=512, metavar="MIB", help="for the network's tiles, of all jobs (default: 512)"
+    )
+    parser.add_argument("--device", default="cpu", help="where the network runs, such as cuda (default: cpu)")
+    add_dump_options(parser)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Reconstruct captures."""
+    from kornia_tidy.training.light_head import LightHead, reconstruct_light  # noqa: PLC0415
+    from kornia_tidy.training.trained import load_trained  # noqa: PLC0415
+
+    system = load_trained(args.checkpoint)
+    head = LightHead(system).to(torch.device(args.device))
+    suffixes = result_suffixes(system.settings.task, args.format)
+    if "_depth_colors.png" in suffixes:
+        require_matplotlib()
+    folder = Path(args.output)
+    outputs = output_paths(args.files, folder, suffixes)
+    made_by = {
+        "checkpoint": hashlib.sha256(read_bytes(args.checkpoint)).hexdigest(),
+        "depth_unit": args.depth_unit,
+        "linear": args.linear,
+        "dump": {name: getattr(args, name) for name in ("size", "pattern", "black", "white", "dtype", "byte_order")},
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network once, for all jobs
+    tell("network", f"{system.settings.task}, head {system.settings.head!r}, {system.step} steps")
+
+    def work(path: str, progress: Callable[[int, int], None]) -> Row:
+        start = time.perf_counter()
+        said = json.loads(json.dumps({"source": _identity(path), "made_by": made_by}))
+        paths = outputs[path]
+        if args.resume and is_finished(paths, said):
+            return Row(path, "kept")
+        light, upright, info = read_light(path, args)
+        result = reconstruct_light(head, light, memory_budget=(args.memory << 20) // args.jobs, progress=progress)
+        del light
+        size = write_results(paths, result, upright, info, head, args.depth_unit)
+        write_bytes(paths[-1], (json.dumps({**said, "size": size, **_in_words(head, args)}, indent=1) + "\n").encode())
+        return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
+
+    rows = work_on_all(list(outputs), work, args.jobs)
+    failed = sum(row.result not in {"done", "kept"} for row in rows)
+    for line in table(rows):
+        print(line)
+    tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
+    if failed:
+        raise ValueError(f"{failed} of {len(rows)} files failed")
+
+
+def result_suffixes(task: str, picture: str) -> list[str]:
+    """Return what is added to a file's name for each of its results; the last says that all are there.
+
+    Example:
+        >>> result_suffixes("edof", "tiff")
+        ['.tif', '.jpg', '.json']
+    """
+    image = [SUFFIXES[picture], ".jpg"] if "image" in MAPS[task] else []
+    depth = ["_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png"] if "depth" in MAPS[task] else []
+    return [*image, *depth, ".json"]
+
+
+def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any]]:
+    """Return a capture as linear light, how to turn it upright, and what is known of camera and exposure."""
+    if args.size is None and Path(path).suffix.lower() in PICTURES:
+        picture = read_image(path)
+        return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}
+    raw: RawCapture = open_raw(path, args)
+    light = raw.to_rgb(encoded=False, upright=False)
+    return light, raw.upright, vars(raw.info)
+
+
+def write_results(
+    paths: list[Path],
+    result: Reconstruction,
+    upright: Callable[[Tensor], Tensor],
+    info: dict[str, Any],
+    head: LightHead,
+    depth_unit: float,
+) -> tuple[int, int]:
+    """Write pictures and depth by the ends of their names. Return columns and rows."""
+    image = None if result.image is None else upright(result.image)
+    depth = None if result.depth is None else upright(result.depth)
+    for path in paths:
+        if path.name.endswith("_depth_colors.png"):
+            assert depth is not None
+            drawn = BytesIO()
+            draw_depth(depth, head.camera).savefig(drawn, format="png", dpi=PREVIEW_DPI)
+            write_bytes(path, drawn.getvalue())
+        elif path.stem.endswith("_depth") and depth is not None:
+            write_depth(path, depth, depth_unit if path.suffix == ".png" else 1.0, saturate=True)
+        elif path.suffix != ".json":
+            assert image is not None
+            write_image(path, image, 8 if path.suffix == ".jpg" else 16, info)
+    height, width = next(part for part in (image, depth) if part is not None).shape[-2:]
+    return width, height
+
+
+def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
+    """Tell whether all results are there, made from the same file in the same way."""
+    if not all(path.is_file() for path in paths):
+        return False
+    try:
+        record = json.loads(paths[-1].read_bytes())
+    except ValueError:
+        return False
+    return isinstance(record, dict) and all(record.get(name) == value for name, value in said.items())
+
+
+def work_on_all(paths: list[str], work: Callable[[str, Callable[[int, int], None]], Row], jobs: int) -> list[Row]:
+    """Work on all files, some at a time, whatever becomes of the others. An interrupt ends all between two tiles.
+
+    Threads: the network is in memory once, and what takes long leaves the interpreter free.
+    """
+    stop = threading.Event()
+    lock = threading.Lock()
+    rows: dict[str, Row] = {}
+    form = "{l_bar}{bar}| {n:.2f}/{total} [{elapsed}<{remaining}]"
+    with tqdm(total=len(paths), desc="reconstruct", file=sys.stderr, leave=False, bar_format=form) as bar:
+
+        def each(path: str) -> Row:
+            shown = 0.0
+
+            def progress(done: int, tiles: int) -> None:
+                nonlocal shown
+                if stop.is_set():
+                    raise KeyboardInterrupt
+                with lock:
+                    bar.update(done / tiles - shown)
+                shown = done / tiles
+
+            if stop.is_set():
+                raise KeyboardInterrupt
+            try:
+                return work(path, progress)
+            finally:
+                with lock:
+                    bar.update(1 - shown)
+
+        with ThreadPoolExecutor(jobs, initializer=_share_cores, initargs=(jobs,)) as pool:
+            futures = {pool.submit(each, path): path for path in paths}
+            try:
+                for future in as_completed(futures):
+                    rows[futures[future]] = _row(futures[future], future)
+            except BaseException:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+                raise
+    return [rows[path] for path in paths]
+
+
+def table(rows: list[Row]) -> list[str]:
+    """Return the summary: a line a file.
+
+    Example:
+        >>> for line in table([Row("a.dng", "done", "60 x 40", 1.25), Row("bb.dng", "cannot read bb.dng: empty")]):
+        ...     print(line)
+        file    size     seconds  result
+        a.dng   60 x 40     1.25  done
+        bb.dng                    cannot read bb.dng: empty
+    """
+    files, sizes = (max(len(name), *(len(row[i]) for row in rows)) for i, name in ((0, "file"), (2, "size")))
+    lines = [f"{'file':<{files}}  {'size':<{sizes}}  seconds  result"]
+    for row in rows:
+        seconds = "" if row.seconds is None else f"{row.seconds:.2f}"
+        lines.append(f"{row.file:<{files}}  {row.size:<{sizes}}  {seconds:>7}  {row.result}")
+    return lines
+
+
+def _row(path: str, future: Future[Row]) -> Row:
+    """What became of a file; a mistake in one is a line of the table."""
+    try:
+        return future.result()
+    except Exception as error:
+        sentence = " ".join(str(error).split()) or type(error).__name__
+        with tqdm.external_write_mode(file=sys.stderr):
+            print(f"kornia-tidy: error: {sentence}", file=sys.stderr, flush=True)
+        return Row(path, sentence)
+
+
+def _identity(path: str) -> dict[str, Any]:
+    """What tells that a file is the one that was reconstructed."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    state = Path(path).stat()
+    return {"file": Path(path).name, "bytes": state.st_size, "modified": state.st_mtime_ns}
+
+
+def _in_words(head: LightHead, args: argparse.Namespace) -> dict[str, str]:
+    """What a person wants to know of the results."""
+    unit, (near, far) = args.depth_unit, head.camera.depth_range
+    words = {"image": "all in focus, 16 bits, encoded as sRGB"} if "image" in MAPS[head.task] else {}
+    if "depth" in MAPS[head.task]:
+        words["depth_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or farther"
+        words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
+    return words
+
+
+def _share_cores(jobs: int) -> None:
+    if jobs > 1:
+        torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
+
+
+def _as_it_is(image: Tensor) -> Tensor:
+    return image
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is wanted, got {text!r}")
+    return int(text)

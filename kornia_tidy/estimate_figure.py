@@ -1,0 +1,110 @@
+"""A picture of reconstructions: what cameras captured of a scene, what networks made of it, and where that errs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.figures import ACCENT, DEPTH_COLORS, FAINT, LABEL, TITLE, require_matplotlib
+from kornia_tidy.reconstruction.metrics import psnr, ssim
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
+COLUMN, MARGIN = 2.3, 0.3  # inches
+HEADINGS = ("the scene", "capture", "its error, x3", "all-in-focus estimate", "its error, x3")
+
+
+class Estimate(NamedTuple):
+    """What one camera and its network made of a scene; maps are (C, H, W)."""
+
+    name: str
+    capture: Tensor
+    image: Tensor
+
+    def scores(self, image: Tensor) -> dict[str, float]:
+        """Return PSNR (dB) of capture and image, and SSIM of the image, against the scene."""
+        truth = image[None]
+        return {
+            "capture_psnr": float(psnr(self.capture[None], truth)),
+            "image_psnr": float(psnr(self.image[None].clamp(0, 1), truth)),
+            "image_ssim": float(ssim(self.image[None].clamp(0, 1), truth)),
+        }
+
+
+def draw_estimates(image: Tensor, nearness: Tensor, estimates: Sequence[Estimate]) -> Figure:
+    """Draw a row for each camera: the capture, the all-in-focus image that a network makes of it, and where they err.
+
+    Args:
+        image: the scene in focus, (3, H, W) in [0, 1].
+        nearness: its depth, (1, H, W), 0 at the far and 1 at the near end of the cameras' range.
+        estimates: of two cameras or more, from top to bottom; beside the first stands the scene, beside the second
+            its depth.
+
+    Returns:
+        A figure; ``figure.savefig(path, dpi=150)`` makes it some 1800 pixels wide.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+        ValueError: if there are fewer than two estimates.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    if len(estimates) < 2:
+        raise ValueError(f"the picture compares two estimates or more, got {len(estimates)}")
+    row = COLUMN * image.shape[-2] / image.shape[-1] + 0.35
+    height = 0.7 + row * len(estimates)
+    figure = Figure(figsize=(len(HEADINGS) * COLUMN + 2 * MARGIN, height), facecolor="white")
+    axes = figure.subplots(len(estimates), len(HEADINGS), squeeze=False)
+    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
+    figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus", fontsize=14)
+    for y, estimate in enumerate(estimates):
+        scores = estimate.scores(image)
+        pictures = [
+            (estimate.capture, f"{scores['capture_psnr']:.1f} dB"),
+            ((estimate.capture - image).abs() * ERROR_SCALE, ""),
+            (estimate.image, f"{scores['image_psnr']:.1f} dB, SSIM {scores['image_ssim']:.2f}"),
+            ((estimate.image - image).abs() * ERROR_SCALE, ""),
+        ]
+        for x, (picture, words) in enumerate(pictures, start=1):
+            _show(axes[y][x], picture, words, HEADINGS[x] if y == 0 else "")
+        axes[y][1].text(
+            0.03,
+            0.95,
+            estimate.name,
+            fontsize=TITLE,
+            color="white",
+            weight="bold",
+            va="top",
+            transform=axes[y][1].transAxes,
+            bbox={"facecolor": ACCENT, "linewidth": 0, "pad": 2},
+        )
+        scene = (image, "") if y == 0 else (_in_colors(nearness), "its depth; bright is near")
+        if y < 2:
+            _show(axes[y][0], *scene, HEADINGS[0] if y == 0 else "")
+        else:
+            axes[y][0].set_axis_off()
+    return figure
+
+
+def _in_colors(nearness: Tensor) -> Tensor:
+    from matplotlib import colormaps  # noqa: PLC0415
+
+    return torch.from_numpy(colormaps[DEPTH_COLORS](nearness[0].cpu().clamp(0, 1).numpy())[..., :3]).permute(2, 0, 1)
+
+
+def _show(axes: Axes, picture: Tensor, words: str, heading: str) -> None:
+    axes.imshow(picture.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy(), interpolation="antialiased")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_xlabel(words, fontsize=LABEL, color=FAINT, labelpad=2)
+    if heading:
+        axes.set_title(heading, fontsize=TITLE, color=ACCENT, weight="bold", loc="left")

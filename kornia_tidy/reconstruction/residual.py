@@ -1,0 +1,55 @@
+"""What a network adds to a capture: it need not learn to copy what the capture shows already."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class Residual(nn.Module):
+    """Add the capture to a network's last maps, its estimate of the all-in-focus image.
+
+    It begins as the identity, whatever the network's weights: the last convolution starts at zero. So training starts
+    from the capture's error, and short trainings improve on the capture instead of learning to copy it.
+
+    Args:
+        network: any that ends in a convolution; its last maps are the image.
+        channels: of the image.
+
+    Shape:
+        - image: (B, C, H, W), as the network takes it.
+        - output: as the network's.
+
+    Raises:
+        ValueError: if the network does not end in a convolution, or has fewer maps than the image has channels.
+
+    Source: He et al., Deep Residual Learning (CVPR 2016); Zhang et al., Beyond a Gaussian Denoiser (TIP 2017), for
+    estimating the residual of an image; zero to begin with, as Goyal et al. (2017), section 5.1.
+
+    Example:
+        >>> from kornia_tidy.reconstruction import AttentionUNet
+        >>> head = Residual(AttentionUNet(out_channels=4, width=4)).eval()
+        >>> capture = torch.rand(1, 3, 20, 30)
+        >>> depth, image = head(capture).split([1, 3], 1)
+        >>> bool((image == capture).all()), bool((depth == 0).all())
+        (True, True)
+    """
+
+    def __init__(self, network: nn.Module, channels: int = 3) -> None:
+        super().__init__()
+        last = list(network.modules())[-1]
+        if not isinstance(last, nn.Conv2d) or last.out_channels < channels:
+            raise ValueError(
+                f"a residual needs a network that ends in a convolution to {channels} maps or more, "
+                f"{type(network).__name__} ends in {last}"
+            )
+        self.network, self.channels = network, channels
+        with torch.no_grad():
+            for parameter in last.parameters():
+                parameter.zero_()
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return the maps, the capture added to the last ones."""
+        maps = self.network(image)
+        others = maps.shape[1] - self.channels
+        return torch.cat([maps[:, :others], maps[:, others:] + image], 1)

@@ -1,0 +1,179 @@
+"""Names of camera and lens, exposure and black levels from the tags of a raw file, whatever nonsense these hold.
+
+LibRaw's Python package does not tell who built the camera, nor a black level that differs between places of a large
+tile. The decoding process runs this file, so it imports nothing but the standard library.
+
+Source: TIFF 6.0, section 2; Exif 2.32, 4.6; DNG 1.7, BlackLevel; Canon's CRW by P. Harvey's notes on its format.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from datetime import datetime
+from typing import Any
+
+TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 7: "s", 10: "ii", 11: "f", 12: "d", 13: "I"}  # of TIFF's fields
+SUB_DIRECTORIES = (0x014A, 0x8769)  # SubIFDs, Exif
+MOST_DIRECTORIES, MOST_ENTRIES, MOST_BYTES = 32, 512, 1 << 16
+
+TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
+NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
+TIMES = (0x9003, 0x0132)
+SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL = 0x00FE, 0xC612, 0xC619, 0xC61A
+STORED = ((0x0111, 0x0117), (0x0144, 0x0145))  # where strips and tiles begin, and their lengths
+QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
+CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
+
+Directory = dict[int, tuple[Any, ...]]
+
+
+def camera_tags(data: bytes) -> dict[str, Any]:
+    """Return what the tags of a raw file say, by name: see RawInfo. What is not there, or makes no sense, is left out.
+
+    Units: seconds, metres; the timestamp is an ISO 8601 string.
+    """
+    directories = list(tiff_directories(data))
+    found: dict[str, Any] = {}
+    for name, tags in TEXTS.items():
+        found[name] = next((text for values in _values(directories, tags) if (text := _text(values))), None)
+    for name, tags in NUMBERS.items():
+        found[name] = next((n for values in _values(directories, tags) if (n := _number(values)) is not None), None)
+    if found["focal_length"] is not None:
+        found["focal_length"] *= 1e-3
+    found["timestamp"] = next((t for values in _values(directories, TIMES) if (t := _time(_text(values)))), None)
+    if data[6:14] == b"HEAPCCDR":
+        found["make"], found["model"] = _ciff_names(data)
+    if data[:4] in QUICKTAKE:
+        found["make"], found["model"] = "Apple", QUICKTAKE[data[:4]]
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def black_tile(data: bytes) -> list[list[float]] | None:
+    """Return the black levels of a DNG that repeats them over more than 2x2 pixels, by rows; None if it does not."""
+    for directory in tiff_directories(data):
+        rows, columns = (directory.get(BLACK_REPEAT) or (1, 1))[:2]
+        levels = directory.get(BLACK_LEVEL, ())
+        if max(rows, columns) > 2 and len(levels) == rows * columns and all(map(math.isfinite, levels)):
+            return [list(levels[row * columns : (row + 1) * columns]) for row in range(rows)]
+    return None
+
+
+def missing_bytes(data: bytes) -> int:
+    """Return how many bytes of a DNG's picture lie beyond the end of the file; LibRaw may leave lost tiles empty."""
+    directories = list(tiff_directories(data))
+    if not directories or DNG_VERSION not in directories[0]:
+        return 0
+    whole = [directory for directory in directories if directory.get(SUBFILE_TYPE, (0,))[0] == 0]
+    ends = [
+        offset + length
+        for directory in whole
+        for offsets, lengths in STORED
+        for offset, length in zip(directory.get(offsets, ()), directory.get(lengths, ()), strict=False)
+    ]
+    return max(0, max(ends, default=0) - len(data))
+
+
+def tiff_directories(data: bytes) -> Iterator[Directory]:
+    """Yield the directories of a TIFF-like file as values by tag: the first, those below it, those that follow.
+
+    Also those of the Exif blocks inside a RAF file's preview and a CR3 file's boxes. A hostile file cannot make this
+    slow: each directory is read once, and their number and sizes are bounded.
+    """
+    left = MOST_DIRECTORIES
+    for base in _tiff_headers(data):
+        order = "<" if data[base : base + 2] == b"II" else ">"
+        waiting, seen = [_unpack(data, f"{order}I", base + 4, base)], set()
+        while waiting and left:
+            offset = waiting.pop(0)
+            if not offset or offset[0] in seen:
+                continue
+            seen.add(offset[0])
+            left -= 1
+            directory, following = _directory(data, base, order, offset[0])
+            waiting += [(below,) for tag in SUB_DIRECTORIES for below in directory.get(tag, ()) if type(below) is int]
+            waiting.append(following)
+            yield directory
+
+
+def _tiff_headers(data: bytes) -> list[int]:
+    """Return where a TIFF header may begin."""
+    places = [0] + [data.find(mark, 0, 1 << 16) + 4 for mark in (b"CMT1", b"CMT2")]
+    places.append(data.find(b"Exif\0\0", 0, 1 << 12) + 6)
+    return [
+        place for place in places if data[place : place + 2] in {b"II", b"MM"} and data[place + 6 : place + 8] != b"HE"
+    ]
+
+
+def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directory, tuple[Any, ...]]:
+    start = base + offset
+    count = min((_unpack(data, f"{order}H", start) or (0,))[0], MOST_ENTRIES)
+    directory: Directory = {}
+    for entry in range(start + 2, start + 2 + 12 * count, 12):
+        tag, kind, number = _unpack(data, f"{order}HHI", entry) or (0, 0, 0)
+        if kind not in TYPES or tag in directory:
+            continue
+        code = TYPES[kind]
+        size = number * struct.calcsize(f"={code}")
+        if not 0 < size <= MOST_BYTES:
+            continue
+        place = _unpack(data, f"{order}I", entry + 8) if size > 4 else (entry + 8 - base,)
+        letters = f"{number}s" if code == "s" else code * number
+        values = _unpack(data, order + letters, base + place[0]) if place else ()
+        if len(code) == 2:
+            values = tuple(a / b if b else math.nan for a, b in zip(values[::2], values[1::2], strict=True))
+        directory[tag] = values
+    return directory, _unpack(data, f"{order}I", start + 2 + 12 * count)
+
+
+def _unpack(data: bytes, layout: str, offset: int, least: int = 0) -> tuple[Any, ...]:
+    """Return the values that lie at an offset, none where the file ends before."""
+    if offset < least or offset + struct.calcsize(layout) > len(data):
+        return ()
+    return struct.unpack_from(layout, data, offset)
+
+
+def _values(directories: list[Directory], tags: tuple[int, ...]) -> Iterator[tuple[Any, ...]]:
+    return (directory[tag] for tag in tags for directory in directories if tag in directory)
+
+
+def _text(values: tuple[Any, ...]) -> str | None:
+    """Return what can be printed of a text, without what follows its first zero."""
+    if not values or not isinstance(values[0], bytes):
+        return None
+    text = values[0].split(b"\0")[0].decode("utf-8", "ignore")
+    return " ".join("".join(c for c in text if c.isprintable()).split())[:128] or None
+
+
+def _number(values: tuple[Any, ...]) -> float | None:
+    if not values or isinstance(values[0], bytes):
+        return None
+    return float(values[0]) if 0 < values[0] < 1e9 else None
+
+
+def _time(text: str | None) -> str | None:
+    try:
+        return datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S").isoformat()  # by the camera's clock
+    except ValueError:
+        return None
+
+
+def _ciff_names(data: bytes) -> tuple[str | None, str | None]:
+    """Return make and model from the heaps of Canon's CRW: each ends with where its list of records begins."""
+    waiting = [((_unpack(data, "<I", 2) or (0,))[0], len(data))]
+    for _ in range(MOST_DIRECTORIES):
+        if not waiting:
+            break
+        start, end = waiting.pop(0)
+        table = start + (_unpack(data, "<I", end - 4) or (0,))[0]
+        count = min((_unpack(data, "<H", table) or (0,))[0], MOST_ENTRIES)
+        for entry in range(table + 2, table + 2 + 10 * count, 10):
+            kind, size, offset = _unpack(data, "<HII", entry) or (0, 0, 0)
+            if kind == CIFF_NAMES:
+                names = data[start + offset : start + offset + min(size, MOST_BYTES)]
+                make, model = [*names.split(b"\0"), b"", b""][:2]
+                return _text((make,)), _text((model,))
+            if kind >> 8 in CIFF_HEAPS:
+                waiting.append((start + offset, start + offset + size))
+    return None, None

@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from kornia_tidy.sensor.photon_transfer import PhotonTransfer, TransferLine
+from kornia_tidy.sensor.transfer_curve import CurvePoint
+from kornia_tidy.transfer_figure import draw_transfer
+from tests.base import BaseTester
+
+LINE = TransferLine(2.0, 0.01, 6.0, 0.1, 0.01, 0.999, 10000)
+POINTS = tuple(CurvePoint(name, m, m / 2 + 9.1, 1000) for name in "RG" for m in (0.0, 10.0, 500.0))
+RESULT = PhotonTransfer("Acme One", 100.0, "single", 512.0, 4095.0, LINE, {"R": LINE}, POINTS)
+
+
+class TestDrawTransfer(BaseTester):
+    def test_feature_all_points_and_the_line_are_drawn(self):
+        straight, limits = draw_transfer(RESULT).axes
+        drawn = [tuple(map(float, xy)) for c in straight.containers for xy in zip(*c[0].get_data(), strict=True)]
+        assert sorted(drawn) == sorted((point.level, point.variance) for point in POINTS)
+        lines = {line.get_label(): line for line in straight.lines}
+        level, variance = lines["photon transfer"].get_data()
+        assert variance == pytest.approx(level / 2 + 9 + 1 / 12)
+        _, bent = lines["with fixed pattern"].get_data()
+        assert bent - variance == pytest.approx((0.01 * level) ** 2)
+        assert (limits.get_xscale(), limits.get_yscale()) == ("log", "log")
+
+    def test_feature_says_the_numbers(self):
+        words = " ".join(text.get_text() for text in draw_transfer(RESULT).texts)
+        for word in ("Acme One, ISO 100", "gain 2 ± 0.01", "read noise 6 ± 0.1", "R² 0.9990", "a single picture"):
+            assert word in words
+
+    def test_exception_no_points(self):
+        with pytest.raises(ValueError, match="the calibration has no points"):
+            draw_transfer(replace(RESULT, points=()))
