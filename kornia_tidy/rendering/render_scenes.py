@@ -9,13 +9,12 @@ from __future__ import annotations
 import copy
 import io
 import itertools
+import multiprocessing
 import os
 import tarfile
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -174,7 +173,7 @@ def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[C
         batch_size=None,
         sampler=indices,
         num_workers=0 if jobs == 1 else jobs,
-        worker_init_fn=partial(_end_with, os.getpid()),
+        worker_init_fn=_end_with_parent,
         generator=torch.Generator().manual_seed(0),  # or it would draw from the global one
     )
     for index, files in zip(indices, loader, strict=True):
@@ -183,13 +182,13 @@ def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[C
         yield item_key(index), files
 
 
-def _end_with(parent: int, _: int) -> None:
+def _end_with_parent(_: int) -> None:
     """End this process with the one that writes: if that is killed, it would wait for ever to hand over a capture."""
 
     def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
+        if parent := multiprocessing.parent_process():
+            parent.join()
+            os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
