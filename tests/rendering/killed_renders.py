@@ -76,7 +76,7 @@ def render_killed(after: int, moment: float, *args, **options) -> None:
 
     def each(*_: int) -> None:
         if next(steps) == after:
-            signal.setitimer(signal.ITIMER_PROF, moment)
+            signal.setitimer(signal.ITIMER_PROF, moment) if moment else kill()
 
     render(*args, **options, each=each)
 
@@ -85,14 +85,12 @@ def go_on(folder: Path, layout: Layout, chance: random.Random, kills: int) -> li
     """Kill processes by turns, one, two or three, with one job or two; return how many parts were there after each."""
     there = []
     for turn in range(kills):
-        world = 1 + turn % 3
-        children = [
-            partial(
-                render_killed, chance.randrange(4, 8), chance.uniform(1e-4, 0.03), folder, layout, rank, world,
-                jobs=1 + turn % 2,
-            )
-            for rank in range(world)
-        ]  # fmt: skip
+        world, jobs = 1 + turn % 3, 1 + turn % 2
+        children = []
+        for rank in range(world):
+            moment = chance.uniform(1e-4, 0.01) if jobs == 1 else 0.0  # who has jobs does little but wait for them
+            after = chance.randrange(4, 8) // world
+            children.append(partial(render_killed, after, moment, folder, layout, rank, world, jobs=jobs))
         codes, ended = run(children)
         assert ended, "a process outlived the one that it renders for"
         assert codes <= {0, *KILLED}, codes
