@@ -58,8 +58,9 @@ def claim(folder: Path, own: Mapping[str, Any]) -> None:
         ValueError: if it holds anything else; what differs is named.
     """
     path = folder / CONDITIONS
-    if not path.exists():
-        if any(not other.name.startswith(".") for other in folder.iterdir()):
+    others = any(not other.name.startswith(".") for other in folder.iterdir())
+    if not path.exists():  # looked for last: a process that has just begun here writes it before anything else
+        if others:
             raise ValueError(f"{folder} holds files that are no captures: choose another folder")
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in own.items())
         write_bytes(path, f"{{\n{lines}\n}}\n".encode())

@@ -9,10 +9,10 @@ from __future__ import annotations
 import copy
 import io
 import itertools
+import multiprocessing
 import os
 import tarfile
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -184,12 +184,11 @@ def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[C
 
 def _end_with_parent(_: int) -> None:
     """End this process with the one that writes: if that is killed, it would wait for ever to hand over a capture."""
-    parent = os.getppid()
 
     def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
+        if parent := multiprocessing.parent_process():
+            parent.join()
+            os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 

@@ -1,6 +1,8 @@
-"""Render by several processes that are killed at random moments, and go on by others; told as JSON. Run by test_resume.
+"""Render by processes that are killed in the middle, and go on by others; told as JSON. Run by test_resume.
 
-Children are forks of this process, so that only it waits for imports.
+Nothing here waits for a moment on the clock: a process that is to be killed ends itself, as abruptly as SIGKILL does,
+after a number of captures and a random time of its own on the processor. Children are forks of this process, so that
+only it waits for imports.
 """
 
 from __future__ import annotations
@@ -8,9 +10,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import select
 import signal
 import sys
 import time
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,20 +23,37 @@ import torch
 from kornia_tidy.rendering import Layout, render_scenes
 from tests.rendering.samples import small_camera, small_scenes
 
-COUNT = 30
+COUNT, PATIENCE = 20, 60.0  # s that nobody waits for unless a process is left over
+FORMS = {"folders": Layout(), "shards": Layout(shard_items=3)}
+KILLED = {-signal.SIGKILL, -signal.SIGPROF}
+
+Children = Sequence[Callable[[], object]]
 
 
-def children(folder: Path, layout: Layout, world: int, jobs: int = 1) -> list[int]:
-    return [child(folder, layout, rank, world, jobs) for rank in range(world)]
+def run(children: Children) -> tuple[set[int], bool]:
+    """Run each in a process at the same time; return their exit codes, and whether their own processes ended too.
+
+    All hold a pipe open that ends with the last of them.
+    """
+    last, held = os.pipe()
+    processes = [_fork(child) for child in children]
+    os.close(held)
+    codes = {os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes}
+    ended = bool(select.select([last], [], [], PATIENCE)[0])
+    os.close(last)
+    if not ended:
+        for process in processes:
+            os.killpg(process, signal.SIGKILL)
+    return codes, ended
 
 
-def child(folder: Path, layout: Layout, rank: int, world: int, jobs: int) -> int:
+def _fork(child: Callable[[], object]) -> int:
     process = os.fork()
     if process == 0:
         code = 1
         try:
-            os.setsid()  # so that its jobs can be killed with it
-            render_scenes(small_camera(), small_scenes(COUNT), folder, layout, jobs=jobs, rank=rank, world=world)
+            os.setpgid(0, 0)
+            child()
             code = 0
         except BaseException as error:
             print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
@@ -40,32 +62,78 @@ def child(folder: Path, layout: Layout, rank: int, world: int, jobs: int) -> int
     return process
 
 
-def wait(processes: list[int]) -> set[int]:
-    return {os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes}
+def kill() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def render(folder: Path, layout: Layout, rank: int = 0, world: int = 1, **options) -> None:
+    render_scenes(small_camera(), small_scenes(COUNT), folder, layout, rank=rank, world=world, **options)
+
+
+def render_killed(after: int, moment: float, *args, **options) -> None:
+    """Render until so many captures have come, and for a time on the processor more."""
+    steps = iter(range(1, COUNT + 1))
+
+    def each(*_: int) -> None:
+        if next(steps) == after:
+            signal.setitimer(signal.ITIMER_PROF, moment) if moment else kill()
+
+    render(*args, **options, each=each)
+
+
+def go_on(folder: Path, layout: Layout, chance: random.Random, kills: int) -> list[int]:
+    """Kill processes by turns, one, two or three, with one job or two; return how many parts were there after each."""
+    there = []
+    for turn in range(kills):
+        world, jobs = 1 + turn % 3, 1 + turn % 2
+        children = []
+        for rank in range(world):
+            moment = chance.uniform(1e-4, 0.01) if jobs == 1 else 0.0  # who has jobs does little but wait for them
+            after = chance.randrange(4, 8) // world
+            children.append(partial(render_killed, after, moment, folder, layout, rank, world, jobs=jobs))
+        codes, ended = run(children)
+        assert ended, "a process outlived the one that it renders for"
+        assert codes <= {0, *KILLED}, codes
+        assert turn or not codes & {0}, "the first turn was to be killed"
+        there.append(sum((folder / part.name).exists() for part in layout.parts(COUNT)))
+    assert run([partial(render, folder, layout, rank, 2) for rank in range(2)]) == ({0}, True)
+    return there
+
+
+def bereave(folder: Path) -> dict[str, bool]:
+    """Kill a process that has others render for it; return whether those ended, by the moment of the kill.
+
+    Each capture is too large for a pipe to take two, so that they would wait for ever to hand the next one over.
+    """
+
+    def killed_after_forks(forks: int) -> None:
+        count = iter(range(1, forks + 1))
+        os.register_at_fork(after_in_parent=lambda: next(count) == forks and kill())
+        render(folder / "forks", Layout(floats=True), jobs=2)
+
+    def killed_at_a_capture() -> None:
+        render(folder / "capture", Layout(floats=True), jobs=2, each=lambda *_: kill())
+
+    moments = {
+        "first fork": partial(killed_after_forks, 1),
+        "second fork": partial(killed_after_forks, 2),
+        "first capture": killed_at_a_capture,
+    }
+    told = {}
+    for name, child in moments.items():
+        codes, told[name] = run([child])
+        assert codes == {-signal.SIGKILL}, f"{name}: {codes}"
+    return told
 
 
 def main(folder: Path, kills: int) -> None:
     torch.set_num_threads(1)
-    chance, told = random.Random(time.time_ns()), {}
-    for name, layout in (("folders", Layout()), ("shards", Layout(shard_items=4))):
-        whole, killed = folder / f"{name}-whole", folder / f"{name}-killed"
-        start = time.perf_counter()
-        assert wait(children(whole, layout, 1)) == {0}
-        seconds = time.perf_counter() - start
-        assert wait(children(folder / f"{name}-three", layout, 3)) == {0}  # at the same time
-        told[name] = []
-        for kill in range(kills):
-            processes = children(killed, layout, 1 + (kill + 1) % 3, 1 + kill % 2)
-            while kill == 0 and not (killed / layout.parts(COUNT)[0].name).exists():
-                time.sleep(0.005)  # the first kill comes in the middle
-            time.sleep(chance.uniform(0, seconds / kills))
-            for process in processes:
-                os.kill(process, signal.SIGKILL)
-            assert wait(processes) <= {0, -signal.SIGKILL}
-            told[name].append(sum((killed / part.name).exists() for part in layout.parts(COUNT)))
-            told[name].append(len(list(killed.glob(".*.tmp"))))
-        assert wait(children(killed, layout, 2)) == {0}
-    print(json.dumps(told))
+    chance, there = random.Random(time.time_ns()), {}
+    for name, layout in FORMS.items():
+        assert run([partial(render, folder / f"{name}-whole", layout)]) == ({0}, True)
+        assert run([partial(render, folder / f"{name}-three", layout, rank, 3) for rank in range(3)]) == ({0}, True)
+        there[name] = go_on(folder / f"{name}-killed", layout, chance, kills)
+    print(json.dumps({"there": there, "ended": bereave(folder)}))
 
 
 if __name__ == "__main__":

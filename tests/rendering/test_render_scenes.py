@@ -91,6 +91,20 @@ class TestRenderScenes(BaseTester):
         assert contents(tmp_path) == contents(folder)
         assert not list(tmp_path.glob(".*"))
 
+    def test_feature_another_process_may_begin_while_this_one_does(self, whole, tmp_path, monkeypatch):
+        folder, layout = whole
+        exists, others = Path.exists, iter(range(1))
+
+        def late(path, **options):
+            there = exists(path, **options)
+            if path.name == "render.json" and next(others, None) is not None:
+                render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=1, world=2)
+            return there
+
+        monkeypatch.setattr(Path, "exists", late)
+        render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=0, world=2)
+        assert contents(tmp_path) == contents(folder)
+
     def test_feature_another_seed_is_another_noise(self, whole, tmp_path):
         folder, layout = whole
         render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=8)

@@ -5,24 +5,36 @@ import subprocess
 import sys
 from pathlib import Path
 
-from kornia_tidy.rendering import Layout
+import pytest
+
 from tests.base import BaseTester
-from tests.rendering.killed_renders import COUNT
+from tests.rendering.killed_renders import COUNT, FORMS
 from tests.rendering.samples import contents
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """The folder that processes were killed over, and what they tell."""
+    folder = tmp_path_factory.mktemp("killed")
+    command = [sys.executable, "-m", "tests.rendering.killed_renders", str(folder), "3"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder, json.loads(done.stdout)
+
+
 class TestResume(BaseTester):
-    def test_feature_processes_killed_at_random_moments_end_with_the_bytes_of_one_undisturbed(self, tmp_path):
+    @pytest.mark.parametrize("name", FORMS)
+    def test_feature_processes_killed_at_random_moments_end_with_the_bytes_of_one_undisturbed(self, name, killed):
         """One, two and three processes by turns, with one job or two; and three at once that nobody kills."""
-        command = [sys.executable, "-m", "tests.rendering.killed_renders", str(tmp_path), "3"]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
-        assert done.returncode == 0, done.stderr
-        told = json.loads(done.stdout)
-        for name, layout in (("folders", Layout()), ("shards", Layout(shard_items=4))):
-            parts = len(layout.parts(COUNT))
-            assert any(0 < there < parts for there in told[name][::2]), f"no kill came in the middle: {told[name]}"
-            whole = contents(tmp_path / f"{name}-whole")
-            assert contents(tmp_path / f"{name}-three") == whole
-            assert contents(tmp_path / f"{name}-killed") == whole, f"killed when parts were there: {told[name]}"
+        folder, told = killed
+        there = told["there"][name]
+        assert 0 < there[0] < len(FORMS[name].parts(COUNT)), f"the first kill did not come in the middle: {there}"
+        whole = contents(folder / f"{name}-whole")
+        assert contents(folder / f"{name}-three") == whole
+        assert contents(folder / f"{name}-killed") == whole, f"killed when parts were there: {there}"
+
+    def test_feature_jobs_do_not_outlive_the_process_that_is_killed(self, killed):
+        """While they start, and while they wait to hand over a capture; else they would for ever."""
+        assert killed[1]["ended"] == {"first fork": True, "second fork": True, "first capture": True}
