@@ -49,6 +49,7 @@ def seen_whole(head, light):
 
 @pytest.mark.slow
 class TestLargeCapture(BaseTester):
+    @pytest.mark.timeout(1200)
     def test_feature_24_megapixels_take_two_gibibytes_and_show_no_seam(self, capture):
         """On two threads. A strip from end to end crosses every cut of the tiles, wherever these are."""
         command = [sys.executable, "-m", "kornia_tidy.cli", "raw", "reconstruct", str(capture), "--head", "edof-5"]
