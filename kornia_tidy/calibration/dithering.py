@@ -72,7 +72,7 @@ def resolve_psf(
             pixel (M // 2, M // 2); within a sample or so.
         variances: (N, M, M).
         cutoff: :math:`f_c`, highest frequency that the lens passes, in cycles per sample.
-        finer: samples of the PSF to one of the images along each axis, as a mosaic's planes have only each second pixel.
+        finer: samples of the PSF to one of the images along each axis, as a mosaic's planes have every second pixel.
 
     Returns:
         The PSF with its variance, propagated through the linear system.

@@ -143,16 +143,6 @@ def retrieve_mask(
         ValueError: if the PSFs are at one depth alone, or of other channels than the spectrum.
 
     Source: Cheng and Wyant, Applied Optics 24(6) 804 (1985), for heights from phases at several wavelengths.
-
-    Example:
-        >>> generator, camera = torch.Generator().manual_seed(0), ThinLensCamera()
-        >>> shown = PixelwiseMask(1, 7, generator=generator)
-        >>> lens = CodedLens(shown, camera, None, Fidelity("small", window=13), Spectrum.monochrome())
-        >>> with torch.no_grad():
-        ...     bank = lens.psf_bank(defocus=[-6.0, 0.0, 6.0])
-        >>> fit = retrieve_mask(bank, camera, Spectrum.monochrome(), 7, 60, generator=generator)
-        >>> bool(fit.residual.max() < 0.05)
-        True
     """
     if len(measured.defocus) < 2:
         raise ValueError("a mask is found of PSFs at two depths or more: one does not tell it from its twin")

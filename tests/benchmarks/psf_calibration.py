@@ -77,7 +77,7 @@ def calibrate(
 
 
 def scores(whole: Tensor, truth: Tensor, measured: Tensor) -> list[float]:
-    """PSNR of Tikhonov with each of the PSFs, of a capture made with the whole one, at the true window's best weight."""
+    """PSNR of Tikhonov with each of the PSFs, of a capture made with the whole one, at the best weight."""
     scene = dead_leaves(192, 192, num_leaves=300, seed=1)[0][None]
     radius = whole.shape[-1] // 2
     blurred = conv2d(pad(scene, (radius,) * 4, mode="circular"), whole.flip(-2, -1)[:, None], groups=3)
@@ -100,8 +100,10 @@ def main() -> None:
     parser.add_argument("--distances", type=float, nargs="+", default=list(DISTANCES))
     parser.add_argument("--places", type=int, default=16)
     args = parser.parse_args()
-    print("| masks | filters | full well, read | distance, m | psi | light held | places used | L1, % | said, % | true bank, dB | measured, dB | whole, dB |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    names = "masks, filters, full well and read, distance in m, psi, light held, places used"
+    names += ", L1 in %, said in %, true bank in dB, measured less true, measured less whole"
+    columns = names.split(", ")
+    print("|", " | ".join(columns), "|\n" + "|---" * len(columns) + "|")
     for name in args.systems:
         for distance in args.distances:
             coded, flat = light_of(systems()[name], distance), light_of(systems()["plain lens"], distance)

@@ -67,6 +67,11 @@ class TestRetrieveMask(BaseTester):
         fit = retrieve_mask(bank, ThinLensCamera(), GREEN, 11, iterations=120, generator=generator)
         assert float(fit.residual.max()) < 0.02
 
+    def test_exception_one_depth(self):
+        bank = PSFBank.from_measured(torch.rand(1, 1, 9, 9), torch.zeros(1))
+        with pytest.raises(ValueError, match="PSFs at two depths or more"):
+            retrieve_mask(bank, ThinLensCamera(), GREEN, 11)
+
     @pytest.mark.parametrize("waves", [1.0, 2.5])
     def test_feature_one_height_of_several_wavelengths(self, waves):
         generator = torch.Generator().manual_seed(0)
