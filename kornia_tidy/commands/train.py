@@ -164,6 +164,10 @@ def run(args: argparse.Namespace) -> None:
     for name in ("devices", "save_every"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be 1 or more, got {getattr(args, name)}")
+    if (started := os.environ.get("WORLD_SIZE", str(args.devices))) != str(args.devices):
+        raise ValueError(
+            f"--devices must be the number of processes that torchrun started, WORLD_SIZE={started}, got {args.devices}"
+        )
     folder = Path(args.output)
     stored = args.resume and (folder / SETTINGS).exists()
     settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import time
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from kornia_tidy.files import write_bytes
 from kornia_tidy.training.pictures import draw_pictures
 from kornia_tidy.training.random_state import own_random_state, random_states, set_random_state
 
@@ -183,5 +185,6 @@ def drop_rows_after(path: Path, step: int) -> None:
         heading, *rows = list(csv.reader(file)) or [[]]
     place = heading.index("step") if "step" in heading else 0
     kept = [row for row in rows if len(row) == len(heading) and row[place].isdigit() and int(row[place]) <= step]
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([heading, *kept])
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([heading, *kept])
+    write_bytes(path, text.getvalue().encode())

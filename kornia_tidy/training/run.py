@@ -80,9 +80,9 @@ def train(
     module.settings.write(folder / SETTINGS)
     data = SceneData(scenes, validation, settings.batch, settings.seed, settings.augment, workers)
     callbacks: list[pl.Callback] = [
-        SaveCheckpoints(folder, save_every, patience=settings.patience),
         WriteLog(folder),
         DrawPictures(folder / "pictures"),
+        SaveCheckpoints(folder, save_every, patience=settings.patience),  # last: no run goes on after a missing line
     ]
     if progress:
         callbacks.append(pl.callbacks.TQDMProgressBar(leave=False))

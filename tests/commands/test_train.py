@@ -62,6 +62,13 @@ class TestTrain(BaseTester):
         assert main(["train", *SMALL, *options, "-o", str(tmp_path / "run")]) == 2
         assert sentence in capsys.readouterr().err
 
+    def test_exception_processes_of_torchrun_that_devices_does_not_tell(self, tmp_path, monkeypatch, capsys):
+        """Each would train by itself, and overwrite what the others write."""
+        monkeypatch.setenv("WORLD_SIZE", "2")
+        assert main(["train", *SMALL, "-o", str(tmp_path / "run")]) == 2
+        assert "number of processes that torchrun started, WORLD_SIZE=2, got 1" in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
+
     def test_exception_without_lightning_is_one_sentence_before_any_work(self, tmp_path, monkeypatch, capsys):
         monkeypatch.setitem(sys.modules, "lightning.pytorch", None)
         assert main(["train", "-o", str(tmp_path / "run")]) == 2

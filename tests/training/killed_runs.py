@@ -1,6 +1,7 @@
-"""Train in child processes that are killed at random moments and go on; told as JSON. Run by test_resume.py.
+"""Train in child processes that are killed and go on; told as JSON. Run by test_resume.py.
 
-Children are forks of this process, so that only it waits for imports.
+Nothing here waits for a moment on the clock: a child kills itself on the way into a call that is chosen at random, or
+after a random time of its own on the processor. Children are forks of this process, so that only it waits for imports.
 """
 
 from __future__ import annotations
@@ -12,18 +13,22 @@ import signal
 import sys
 import time
 import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
 
-from kornia_tidy.training import heads, run
+from kornia_tidy.training import callbacks, heads, run
+from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.state_file import read_state
 
 SETTINGS = TrainingSettings(
-    task="joint", masks=2, width=4, size=64, scenes=20, validation_scenes=2, batch=2, accumulate=2, epochs=4, window=23,
-    head="dropout", lr=1e-3, seed=3,
+    task="joint", masks=2, width=4, size=64, scenes=20, validation_scenes=2, batch=2, accumulate=2, epochs=3,
+    pretrain_epochs=1, window=23, head="dropout", lr=1e-3, seed=3,
 )  # fmt: skip
 
 
@@ -38,11 +43,12 @@ class DropoutHead(heads.PlainHead):
         return super().forward(self.noise(self.norm(image)))
 
 
-def child(folder: Path) -> int:
+def child(folder: Path, moment: Callable[[], object] = bool) -> int:
     process = os.fork()
     if process == 0:
         code = 1
         try:
+            moment()
             run.train(SETTINGS, folder, resume=True, save_every=1)
             code = 0
         except BaseException as error:
@@ -52,36 +58,51 @@ def child(folder: Path) -> int:
     return process
 
 
+def die_at(owner: Any, name: str, call: int) -> None:
+    """Let this process be killed by the so manyth call of a function, before that does anything."""
+    function, calls = getattr(owner, name), iter(range(1, call + 1))
+
+    def fatal(*args: Any, **kwargs: Any) -> Any:
+        if next(calls) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*args, **kwargs)
+
+    setattr(owner, name, fatal)
+
+
 def wait(process: int) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
 
-def main(folder: Path, kills: int) -> None:
+def main(folder: Path) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DeprecationWarning)  # of fork in a process that has threads
     heads.HEADS["dropout"] = "__main__:DropoutHead"
     assert wait(child(folder / "whole")) == 0
-    chance, killed_at = random.Random(time.time_ns()), []
-    for kill in range(kills):
-        done, room = reached(folder), 19 // kills
-        process = child(folder / "killed")
-        target = min(done + chance.randrange(1, room), 20)
-        while reached(folder) < target:
-            time.sleep(0.005)
-            assert not os.waitid(os.P_PID, process, os.WEXITED | os.WNOHANG | os.WNOWAIT), "it ended by itself"
-        time.sleep(chance.uniform(0, 0.05))  # into a later step, a save of it, or validation
-        os.kill(process, signal.SIGKILL)
-        assert wait(process) in {0, -signal.SIGKILL}, f"kill {kill} came too late for a run that failed"
-        killed_at.append(reached(folder))
+    chance = random.Random(time.time_ns())
+    moments = {
+        "pretraining": partial(die_at, TidyTraining, "training_step", chance.randrange(1, 11)),
+        "between the stages": partial(die_at, TidyTraining, "from_settings", 2),
+        "a step": partial(die_at, TidyTraining, "training_step", chance.randrange(1, 8)),
+        "a line of the log": partial(die_at, callbacks, "append_row", chance.randrange(1, 4)),
+        "a file written but not in its place": partial(die_at, Path, "replace", chance.randrange(4, 8)),
+        "validation": partial(die_at, TidyTraining, "validation_step", 1),
+        "anywhere": partial(signal.setitimer, signal.ITIMER_PROF, chance.uniform(0.01, 1.0)),
+    }
+    reached = {}
+    for name, moment in moments.items():
+        code = wait(child(folder / "killed", moment))
+        assert code in {-signal.SIGKILL, -signal.SIGPROF} or (name == "anywhere" and code == 0), f"{name}: {code}"
+        reached[name] = step(folder / "killed")
     assert wait(child(folder / "killed")) == 0
-    print(json.dumps(killed_at))
+    print(json.dumps(reached))
 
 
-def reached(folder: Path) -> int:
-    """The step of the last checkpoint of the run that is killed."""
-    last = folder / "killed" / "last.safetensors"
-    return read_state(last)["global_step"] if last.exists() else 0
+def step(folder: Path) -> int | None:
+    """The step of a run's last checkpoint; None if it has none."""
+    last = folder / "last.safetensors"
+    return read_state(last)["global_step"] if last.exists() else None
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]))

@@ -31,18 +31,23 @@ def lines(path):
 
 class TestResume(BaseTester):
     def test_feature_a_run_killed_at_random_moments_ends_bit_for_bit_where_an_undisturbed_one_does(self, tmp_path):
-        """Masks, network with dropout and batch normalisation, moving average, Adam, generators, counters, logs."""
+        """Masks, network with dropout and batch normalisation, moving average, Adam, generators, counters, logs.
+
+        Killed while it pretrains, between the stages, in a step, writing the log or a checkpoint, and in validation.
+        """
         script = ROOT / "tests" / "training" / "killed_runs.py"
         done = subprocess.run(
-            [sys.executable, str(script), str(tmp_path), "3"], capture_output=True, text=True, cwd=ROOT, check=False
+            [sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=False
         )
         assert done.returncode == 0, done.stderr
         steps = json.loads(done.stdout)
-        assert any(0 < step < 20 for step in steps), f"no kill came in the middle of the run: {steps}"
-        whole, killed = (tmp_path / name for name in ("whole", "killed"))
-        for name in ("last.safetensors", "best.safetensors"):
-            one, other = leaves(read_state(whole / name)), leaves(read_state(killed / name))
-            assert one["/global_step"] == (20 if name.startswith("last") else one["/global_step"])
-            assert one == other, f"killed at steps {steps}"
-        for name in ("training.csv", "validation.csv"):
-            assert lines(whole / name) == lines(killed / name)
+        assert steps["pretraining"] is steps["between the stages"] is None
+        assert 0 < steps["validation"] < 15, f"no kill came in the middle of the run: {steps}"
+        for stage in (".", "pretrain"):
+            whole, killed = (tmp_path / name / stage for name in ("whole", "killed"))
+            for name in ("last.safetensors", "best.safetensors"):
+                one, other = leaves(read_state(whole / name)), leaves(read_state(killed / name))
+                assert name.startswith("best") or one["/global_step"] == (15 if stage == "." else 5)
+                assert one == other, f"{stage}, killed at steps {steps}"
+            for name in ("training.csv", "validation.csv"):
+                assert lines(whole / name) == lines(killed / name), f"{stage}, killed at steps {steps}"
