@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.figures import ACCENT, DEPTH_COLORS, FAINT, LABEL, TITLE, require_matplotlib
-from kornia_tidy.reconstruction.metrics import psnr, ssim
+from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,37 +17,44 @@ if TYPE_CHECKING:
 
 ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
 COLUMN, MARGIN = 2.3, 0.3  # inches
-HEADINGS = ("the scene", "capture", "its error, x3", "all-in-focus estimate", "its error, x3")
+HEADINGS = ("the scene", "capture", "all-in-focus estimate", "its error, x3", "depth estimate", "its error, x3")
 
 
 class Estimate(NamedTuple):
-    """What one camera and its network made of a scene; maps are (C, H, W)."""
+    """What one camera and its network made of a scene; maps are (C, H, W), depth as nearness in [0, 1]."""
 
     name: str
     capture: Tensor
     image: Tensor
+    nearness: Tensor
 
-    def scores(self, image: Tensor) -> dict[str, float]:
-        """Return PSNR (dB) of capture and image, and SSIM of the image, against the scene."""
+    def scores(self, image: Tensor, nearness: Tensor, known: Tensor | None = None) -> dict[str, float]:
+        """Return PSNR (dB) of capture and image, SSIM of the image, and RMSE of the nearness where it is known."""
         truth = image[None]
         return {
             "capture_psnr": float(psnr(self.capture[None], truth)),
             "image_psnr": float(psnr(self.image[None].clamp(0, 1), truth)),
             "image_ssim": float(ssim(self.image[None].clamp(0, 1), truth)),
+            "depth_rmse": float(
+                rmse(self.nearness[None].clamp(0, 1), nearness[None], None if known is None else known[None])
+            ),
         }
 
 
-def draw_estimates(image: Tensor, nearness: Tensor, estimates: Sequence[Estimate]) -> Figure:
-    """Draw a row for each camera: the capture, the all-in-focus image that a network makes of it, and where they err.
+def draw_estimates(
+    image: Tensor, nearness: Tensor, estimates: Sequence[Estimate], known: Tensor | None = None
+) -> Figure:
+    """Draw a row for each camera: the capture, image and depth that a network makes of it, and where they err.
 
     Args:
         image: the scene in focus, (3, H, W) in [0, 1].
         nearness: its depth, (1, H, W), 0 at the far and 1 at the near end of the cameras' range.
         estimates: of two cameras or more, from top to bottom; beside the first stands the scene, beside the second
             its depth.
+        known: bool (1, H, W), True where the depth is known. None: everywhere.
 
     Returns:
-        A figure; ``figure.savefig(path, dpi=150)`` makes it some 1800 pixels wide.
+        A figure; ``figure.savefig(path, dpi=150)`` makes it some 2200 pixels wide.
 
     Raises:
         ImportError: if matplotlib is missing.
@@ -63,14 +70,15 @@ def draw_estimates(image: Tensor, nearness: Tensor, estimates: Sequence[Estimate
     figure = Figure(figsize=(len(HEADINGS) * COLUMN + 2 * MARGIN, height), facecolor="white")
     axes = figure.subplots(len(estimates), len(HEADINGS), squeeze=False)
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
-    figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus", fontsize=14)
+    figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus, and how far it is", fontsize=14)
     for y, estimate in enumerate(estimates):
-        scores = estimate.scores(image)
+        scores = estimate.scores(image, nearness, known)
         pictures = [
             (estimate.capture, f"{scores['capture_psnr']:.1f} dB"),
-            ((estimate.capture - image).abs() * ERROR_SCALE, ""),
             (estimate.image, f"{scores['image_psnr']:.1f} dB, SSIM {scores['image_ssim']:.2f}"),
             ((estimate.image - image).abs() * ERROR_SCALE, ""),
+            (_in_colors(estimate.nearness), f"RMSE {scores['depth_rmse']:.3f} of the range"),
+            ((estimate.nearness - nearness).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
         ]
         for x, (picture, words) in enumerate(pictures, start=1):
             _show(axes[y][x], picture, words, HEADINGS[x] if y == 0 else "")

@@ -21,23 +21,25 @@ def scene():
 class TestDrawEstimates(BaseTester):
     def test_smoke_the_picture_has_a_row_an_estimate(self):
         image, nearness = scene()
-        estimates = [Estimate(f"K = {k}", image, image) for k in (1, 3, 5)]
+        estimates = [Estimate(f"K = {k}", image, image, nearness) for k in (1, 3, 5)]
         figures = [draw_estimates(image, nearness, estimates[:count]) for count in (2, 3)]
         assert figures[1].get_figheight() > figures[0].get_figheight()
-        assert sum(axes.axison for axes in figures[1].axes) == 14  # the third row needs no scene beside it
+        assert sum(axes.axison for axes in figures[1].axes) == 17  # the third row needs no scene beside it
         stored = BytesIO()
         figures[0].savefig(stored, dpi=50)
         assert np.asarray(Image.open(stored)).std() > 10
 
     def test_feature_scores(self):
-        image, _ = scene()
-        estimate = Estimate("K = 5", image - 0.1, image * 0.5 + 0.25)
-        scores = estimate.scores(image)
+        image, nearness = scene()
+        estimate = Estimate("K = 5", image - 0.1, image * 0.5 + 0.25, nearness * 0.5)
+        scores = estimate.scores(image, nearness)
         assert scores["capture_psnr"] == pytest.approx(20, abs=1e-3)
         error = (image * 0.5 - 0.25).square().mean()
         assert scores["image_psnr"] == pytest.approx(-10 * float(error.log10()), abs=1e-3)
 
+        assert scores["depth_rmse"] == pytest.approx(float((nearness * 0.5).square().mean().sqrt()), rel=1e-5)
+
     def test_exception_one_estimate_is_no_comparison(self):
         image, nearness = scene()
         with pytest.raises(ValueError, match="compares two estimates or more, got 1"):
-            draw_estimates(image, nearness, [Estimate("K = 5", image, image)])
+            draw_estimates(image, nearness, [Estimate("K = 5", image, image, nearness)])

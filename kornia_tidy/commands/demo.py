@@ -31,12 +31,12 @@ from kornia_tidy.training.trained import TrainedSystem
 
 DESCRIPTION = """\
 Photograph a scene with a camera whose five phase masks were learnt together with a network, and let the network
-reconstruct from that one capture an image in focus everywhere; beside it the same with one mask and with a plain lens.
-Without IMAGE and DEPTH the scene is made by the library. The depths of IMAGE are stretched, in dioptres, over the range
-for which the masks were learnt.
+reconstruct from that one capture an image in focus everywhere and the depth of every pixel; beside it the same with one
+mask and with a plain lens. Without IMAGE and DEPTH the scene is made by the library. The depths of IMAGE are stretched,
+in dioptres, over the range for which the masks were learnt.
 """
 
-SYSTEMS = {"plain": "edof-0", "K = 1": "edof-1", "K = 5": "edof-5"}
+SYSTEMS = {"plain": "joint-0", "K = 1": "joint-1", "K = 5": "joint-5"}
 LARGEST = 1024  # pixels of the longer side; larger pictures are made smaller, to keep a demonstration short
 DOTS_PER_INCH = 150
 CAPTION = (
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
             explained, reconstructed = BytesIO(), BytesIO()
             coded = estimates[-1].capture
             explain(scene.image, scene.depth, optics, alone, coded, CAPTION).savefig(explained, dpi=DOTS_PER_INCH)
-            figure = draw_estimates(scene.image, near, estimates)
+            figure = draw_estimates(scene.image, near, estimates, scene.valid)
             figure.savefig(reconstructed, dpi=DOTS_PER_INCH)
         bank = optics.psf_bank()
 
@@ -111,6 +111,7 @@ def run(args: argparse.Namespace) -> None:
         "coded_k1.png": estimates[1].capture,
         "coded_k5.png": best.capture,
         "estimated_scene.png": best.image,
+        "estimated_depth.png": best.nearness,
     }
     files = {"demo.png": explained.getvalue(), "reconstruction.png": reconstructed.getvalue()}
     with stages("write"):
@@ -122,11 +123,11 @@ def run(args: argparse.Namespace) -> None:
     tell("PSFs", light_in_words(bank, optics))
     tell("clamped", clamped_in_words(optics, scene.depth))
     for estimate in estimates:
-        scores = estimate.scores(scene.image)
+        scores = estimate.scores(scene.image, near, scene.valid)
         tell(
             estimate.name,
             f"capture {scores['capture_psnr']:.2f} dB; all in focus {scores['image_psnr']:.2f} dB, "
-            f"SSIM {scores['image_ssim']:.3f}",
+            f"SSIM {scores['image_ssim']:.3f}; depth RMSE {scores['depth_rmse']:.3f} of the range",
         )
     tell("wrote", f"{folder / 'demo.png'}: how the capture comes about")
     tell("", f"{folder / 'reconstruction.png'}: what is made of it")
@@ -147,7 +148,7 @@ def _estimate(name: str, system: TrainedSystem, scene: Scene, noise: int) -> Est
     """Photograph a scene and reconstruct it."""
     capture = system.optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(noise))
     maps = split_maps(system.settings.task, system.head(capture[None]))
-    return Estimate(name, capture, maps["image"][0])
+    return Estimate(name, capture, maps["image"][0], maps["depth"][0])
 
 
 def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:

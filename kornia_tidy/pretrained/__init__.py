@@ -15,7 +15,7 @@ from kornia_tidy.training.state_file import read_state, write_state
 from kornia_tidy.training.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
-PRETRAINED = ("edof-5", "edof-1", "edof-0")
+PRETRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0")
 """Task and number of masks; 0 is a plain lens, for comparison."""
 
 

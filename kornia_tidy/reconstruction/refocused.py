@@ -19,8 +19,8 @@ def inverse_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
     .. math:: w_k = D \, \mathcal{F}^{-1} \left[ \frac{\bar{H}_k}{\gamma + \sum_j |H_j|^2} \right]
 
     :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov_layers` with PSFs of one channel, times their number: at its
-    own depth a texture comes out most like itself, at others blurred or ringing. Being cut off, they see no farther than PSFs
-    reach, so that a picture can be reconstructed in tiles.
+    own depth a texture comes out most like itself, at others blurred or ringing. Being cut off, they see no farther
+    than PSFs reach, so that a picture can be reconstructed in tiles.
 
     Args:
         psfs: (D, P, P) with P odd.

@@ -156,6 +156,16 @@ class TestCheckpoint(BaseTester):
         assert system.settings == module.settings
         assert system.step == 2
 
+    def test_feature_a_network_that_refocuses_looks_through_the_masks_as_they_were_learnt(self, tmp_path):
+        module, run = made(refocus=2), trainer(tmp_path)
+        before = module.optics.masks.phase.detach().clone()
+        run.fit(module, SceneLoader(DeadLeaves(2, 48, 48), 1))
+        run.save_checkpoint(tmp_path / "a.safetensors")
+        system = load_trained(tmp_path / "a.safetensors")
+        assert not torch.equal(module.optics.masks.phase, before)
+        coded = module.eval().see(batch()).coded
+        assert torch.equal(system.head(coded), module(coded))
+
     def test_feature_weights_go_into_objects_of_ones_own(self, saved):
         module, path = saved
         optics, head = TiDyOptics(PixelwiseMask(2)), made().head
