@@ -166,8 +166,8 @@ def measure_psfs(
         misfit = float(found.misfit[found.used].mean())
         if not misfit <= MOST_MISFIT:
             raise ValueError(
-                f"the PSFs found at {distance:g} m do not explain their captures: residuals are {misfit**0.5:.1f} times "
-                f"the noise, at most {MOST_MISFIT**0.5:g} are allowed"
+                f"the PSFs found at {distance:g} m do not explain their captures: residuals are {misfit**0.5:.1f} "
+                f"times the noise, at most {MOST_MISFIT**0.5:g} are allowed"
             )
         reports += _reports(distance, good, found)
         psf, variance = (
