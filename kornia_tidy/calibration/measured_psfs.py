@@ -18,6 +18,8 @@ from kornia_tidy.checks import check_depth
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.psf_bank import PSFBank
 
+MOST_MISFIT = 25.0  # residuals of five times the noise: more is no PSF of these captures
+
 
 @dataclass(frozen=True)
 class PointReport:
@@ -128,7 +130,8 @@ def measure_psfs(
             :func:`diffraction_cutoff`.
 
     Raises:
-        ValueError: if at some distance no image can be used, or the cutoffs are not one a channel.
+        ValueError: if at some distance no image can be used, the PSFs found leave residuals of five times the noise
+            and more, or the cutoffs are not one a channel.
 
     Example:
         >>> from kornia_tidy import SensorNoise
@@ -160,6 +163,12 @@ def measure_psfs(
         if len(limits) != channels:
             raise ValueError(f"cutoff must be one number, or one for each of {channels} channels, got {limits}")
         found = register(good, limits)
+        misfit = float(found.misfit[found.used].mean())
+        if not misfit <= MOST_MISFIT:
+            raise ValueError(
+                f"the PSFs found at {distance:g} m do not explain their captures: residuals are {misfit**0.5:.1f} "
+                f"times the noise, at most {MOST_MISFIT**0.5:g} are allowed"
+            )
         reports += _reports(distance, good, found)
         psf, variance = (
             torch.stack([_central(getattr(one, name), good[0], window) for one in found.psfs])

@@ -121,7 +121,8 @@ def _fit(stack: _Stack, offsets: Tensor, brightness: Tensor, used: Tensor) -> _F
             x[:, plane, INSIDE, INSIDE].flatten(1) for x in (stack.light / scale, stack.variance / scale**2)
         )
         residual = light - design[:, 0]
-        weighted = design / variance[:, None]
+        # White noise, as resolve_psf takes it: other weights are not minimized by both steps, and need not converge.
+        weighted = design / variance.mean(1)[:, None, None]
         normal = normal + weighted @ design.mT
         right = right + (weighted @ residual[..., None])[..., 0]
         misfit = misfit + (residual.square() / variance).mean(1) / count

@@ -61,6 +61,7 @@ class TestFitMasks(BaseTester):
 
 
 class TestRetrieveMask(BaseTester):
+    @pytest.mark.slow
     def test_feature_noise_is_found_from_nothing(self):
         generator = torch.Generator().manual_seed(0)
         bank = bank_of(PixelwiseMask(1, 11, generator=generator), (-9.0, -3.0, 3.0, 9.0))
