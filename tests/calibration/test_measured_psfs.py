@@ -160,16 +160,6 @@ class TestMeasurePSFs(BaseTester):
         middle = [(report.row, report.column) for report in found.reports]
         self.assert_close(torch.tensor(middle).mean(0), torch.full((2,), SIDE // 2 * 1.0), rtol=0, atol=0.3)
 
-    def test_feature_a_sharp_point_on_every_second_pixel_too(self):
-        """Nearly all light of a lens in focus falls on one pixel of a plane: brightness and places must converge."""
-        sharp = point_light(PixelwiseMask(1, initial="flat"), 0.0, SIDE, Spectrum.monochrome(), CAMERA)
-        images = of_a_mosaic(sharp, sharp, ((0, 0), (0, 0)), 6)
-        found = measure_psfs({0.595: images}, CAMERA, WINDOW, CUTOFF[1])
-        wanted = on_pixels(sharp)[:, INSIDE, INSIDE]
-        error = float((found.bank.psfs[0] - wanted / wanted.sum()).abs().sum())
-        assert error < 0.05
-        assert max(report.misfit for report in found.reports) < 3
-
     def test_exception_psfs_that_do_not_explain_their_captures(self, images):
         """Images of two distances given as of one: too few to say which is the odd one."""
         mixed = images[0.5][:2] + images[0.8][:1]
