@@ -40,6 +40,7 @@ def encode_dng(raw: RawCapture) -> bytes:
     Source: Adobe, Digital Negative Specification 1.4; Exif 2.3.
 
     Example:
+        >>> import torch
         >>> raw = RawCapture.from_counts(torch.tensor([[[64, 164], [264, 1064]]]), "GBRG", black=64, white=1064)
         >>> encode_dng(raw)[-8:] == bytes([64, 0, 164, 0, 8, 1, 40, 4])
         True
