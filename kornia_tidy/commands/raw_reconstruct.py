@@ -47,7 +47,8 @@ and is written last. Each is written whole or not at all.
 
 A network reads what one lens makes of a scene: HEAD is that which was trained with the
 masks of the camera. With the library come edof-5, edof-1 (five masks, one) and edof-0
-(a plain lens), for a 50 mm f/17.6 lens focused at 0.6 m on pixels of 8 um.
+(a plain lens) for the picture, and joint-5, joint-1, joint-0 for picture and depth, all
+for a 50 mm f/17.6 lens focused at 0.6 m on pixels of 8 um.
 """
 
 EXAMPLES = """\

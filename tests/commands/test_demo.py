@@ -13,7 +13,7 @@ from kornia_tidy.data.image_files import read_image, write_image
 from tests.base import BaseTester
 
 NAMES = {"demo.png", "reconstruction.png", "scene.png", "depth.png", "coded_k1.png", "coded_k5.png"}
-NAMES |= {"coded_plain.png", "estimated_scene.png"}
+NAMES |= {"coded_plain.png", "estimated_scene.png", "estimated_depth.png"}
 
 
 class TestDemo(BaseTester):

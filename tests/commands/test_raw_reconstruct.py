@@ -19,7 +19,7 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.commands import raw_reconstruct
 from kornia_tidy.data import read_depth, read_image
-from kornia_tidy.pretrained import load_pretrained
+from kornia_tidy.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.sensor.dng_file import encode_dng
 from kornia_tidy.sensor.raw_file import RawCapture
 from kornia_tidy.sensor.raw_simulation import simulate_raw
@@ -194,7 +194,7 @@ class TestRawReconstruct(BaseTester):
         assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-6
         with pytest.raises(SystemExit):
             main(["raw", "reconstruct", "--help"])
-        assert "--head HEAD edof-5, edof-1, edof-0, or a checkpoint" in " ".join(capsys.readouterr().out.split())
+        assert f"--head HEAD {', '.join(PRETRAINED)}, or a checkpoint" in " ".join(capsys.readouterr().out.split())
 
     def test_feature_dumps_are_developed_linearly(self, tmp_path):
         """A grey mosaic of 25 % light: what the network sees is 0.25 in all three colours, but for one dead pixel."""
@@ -230,7 +230,7 @@ class TestRawReconstruct(BaseTester):
             ([[*files, twin], weights, folder], "would both become"),
             ([files, weights, folder.parent], "it is an input"),
             ([files, files[0], folder], "is no checkpoint of kornia_tidy"),
-            ([files, "edof-7", folder], "--head is edof-5, edof-1, edof-0, or a checkpoint: there is no file edof-7"),
+            ([files, "edof-7", folder], f"--head is {', '.join(PRETRAINED)}, or a checkpoint: there is no file edof-7"),
             ([files, wide, folder, "--memory", "1"], "the smallest tile of this head"),
         ):
             assert reconstruct(*words) == 2

@@ -35,8 +35,8 @@ SETTINGS = TrainingSettings(
 class DropoutHead(heads.PlainHead):
     """A network that draws from torch's global generator, and keeps statistics."""
 
-    def __init__(self, out_channels: int = 3, width: int = 4) -> None:
-        super().__init__(out_channels, width)
+    def __init__(self, in_channels: int = 3, out_channels: int = 3, width: int = 4) -> None:
+        super().__init__(in_channels, out_channels, width)
         self.noise, self.norm = nn.Dropout(0.2), nn.BatchNorm2d(3)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
