@@ -210,7 +210,7 @@ def _table(figure: Figure, optics: TiDyOptics, camera: ThinLensCamera) -> None:
         figure,
         psf_x[0],
         5.6,
-        "what a point of white light becomes on the sensor; sharpest at ψ = 0",
+        "what a point of white light becomes on the sensor; a plain lens is sharpest at ψ = 0",
         LABEL,
         color=FAINT,
     )
