@@ -73,7 +73,8 @@ def add_parser(subparsers: Any) -> None:
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
-    _setting(system, "start", choices=STARTS, help="heights of the masks at first; Fisher masks suit depth")
+    _setting(system, "start", choices=STARTS, help="heights of the masks at first; Fisher suits depth, sweep edof")
+    _setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
     _setting(
         system,
         "head",

@@ -1,16 +1,22 @@
-"""What the paper's sequences of masks start from: noise, a mask designed for depth, and mixtures of the two."""
+"""What sequences of masks start from: noise, a mask designed for depth, mixtures of the two, and lenses."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.phase_masks import PixelwiseMask, ZernikeMask
+from kornia_tidy.optics.phase_masks.base import mask_axes
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
-STARTS = ("noise", "fisher, noise", "fisher, noisy fishers", "3 fishers, 2 noisy")
+STARTS = ("noise", "fisher, noise", "fisher, noisy fishers", "3 fishers, 2 noisy", "focal sweep")
 
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
+SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; each of the five is sharp at a depth of its own
+SWEEP_NOISE = 6e-8  # m; without it masks stay round
 
 # What design_fisher_mask(seed=3) found: radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
 # fmt: off
@@ -52,16 +58,18 @@ def fisher_mask(size: int = 23) -> Tensor:
 
 
 def initial_heights(start: str, generator: torch.Generator | None = None) -> Tensor:
-    """Return the five masks that a sequence of the paper starts from.
+    """Return the five masks that a sequence starts from.
 
     Args:
-        start: one of the paper's four:
+        start: one of the paper's four, or of our own for extended depth of field:
 
             - ``"noise"``: each uniform on [0, 1.2e-6] m.
             - ``"fisher, noise"``: the first the Fisher mask, the others such noise.
             - ``"fisher, noisy fishers"``: Fisher masks turned by a quarter each, all but the first with noise added,
               normal of mean 5.35e-7 and standard deviation 3.05e-7 m.
             - ``"3 fishers, 2 noisy"``: the same, with noise on the last two.
+            - ``"focal sweep"``: lenses focused at a defocus of 0, -8, 8, -16 and 16 rad, with normal noise of
+              6e-8 m.
         generator: source of the noise.
 
     Returns:
@@ -76,7 +84,8 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
           deviation of PhaseCam3D's published heights.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), the ablation of initial masks, which ranks them for depth (RMSE 0.0254,
-    0.0329, 0.0271 and 0.0207 in this order).
+    0.0329, 0.0271 and 0.0207 in this order); Nagahara et al., Flexible Depth of Field
+    Photography (ECCV 2008), for the sweep of focus.
 
     Example:
         >>> from kornia_tidy.optics import PixelwiseMask
@@ -88,6 +97,11 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(5, 23, 23, generator=generator, dtype=torch.float64)
     if start == "noise":
         return uniform
+    if start == "focal sweep":
+        y, x = mask_axes(23)
+        defocus = torch.tensor(SWEEP, dtype=torch.float64)[:, None, None] * (x**2 + y**2)
+        noise = SWEEP_NOISE * torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
+        return noise - defocus * REFERENCE_WAVELENGTH / (2 * math.pi * 0.5)  # an index of 1.5
     fisher = fisher_mask()
     if start == "fisher, noise":
         return torch.cat([fisher[None], uniform[1:]])

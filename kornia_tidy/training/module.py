@@ -14,6 +14,7 @@ from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.average import MovingAverage
+from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.tasks import (
@@ -116,9 +117,18 @@ class TidyTraining(pl.LightningModule):
         self.weights = {"depth": depth_weight, "image": image_weight}
 
     @classmethod
-    def from_settings(cls, settings: TrainingSettings) -> TidyTraining:
-        """Return the module that settings describe; the network's weights come from the global generator."""
+    def from_settings(cls, settings: TrainingSettings, *, design: bool = True, progress: bool = False) -> TidyTraining:
+        """Return the module that settings describe; the network's weights come from the global generator.
+
+        Args:
+            settings: of camera, network and learning.
+            design: design masks if the settings say so; in vain where masks are loaded next.
+            progress: show a progress bar of that.
+        """
         optics = build_optics(settings)
+        if design and settings.design and settings.masks:
+            design_masks(optics, settings.design, progress=progress)
+            optics.fidelity = optics.fidelity.replace(window=settings.window)  # that of the masks as they are now
         return cls(
             optics,
             build_head(settings),

@@ -70,8 +70,10 @@ def train(
         stage = {"head_from": head_from, "save_every": save_every, "workers": workers, "progress": progress}
         train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
         head_from = folder / "pretrain" / LAST
+    if checkpoint is not None:  # its masks are on their way already, and the window was measured before they left
+        settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
-    module = TidyTraining.from_settings(settings)
+    module = TidyTraining.from_settings(settings, design=checkpoint is None, progress=progress)
     assert module.settings is not None
     if head_from is not None and checkpoint is None:
         load_weights(head_from, head=module.head)

@@ -31,6 +31,9 @@ class TrainingSettings:
         masks: number K of learnable masks; 0 is a fixed Fresnel lens.
         start: heights that masks have at first, the first K of those that
             :func:`~kornia_tidy.optics.initial_masks.initial_heights` knows by this name; of noise as many as wanted.
+        design: gradient steps that bring the masks near the best for the task before training, without scenes or
+            network, see :func:`~kornia_tidy.training.designed.design_masks`; only for edof. 0: none. A fixed lens
+            stays as it is.
         focal_length: of the lens in metres.
         pixel_pitch: of the sensor in metres.
         depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default
@@ -79,6 +82,7 @@ class TrainingSettings:
     task: str = "edof"
     masks: int = 5
     start: str = "noise"
+    design: int = 0
     focal_length: float = 50e-3
     pixel_pitch: float = 8e-6
     depth_range: tuple[float, float] | None = None
@@ -124,7 +128,7 @@ class TrainingSettings:
         for name in ("focal_length", "pixel_pitch", "lr", "lr_metres"):
             check_positive(name, getattr(self, name))
         least = {"masks": 0, "size": 1, "scenes": 1, "validation_scenes": 1, "batch": 1, "accumulate": 1, "epochs": 1}
-        for name, lowest in {**least, "pretrain_epochs": 0, "refocus": 0, "seed": 0}.items():
+        for name, lowest in {**least, "pretrain_epochs": 0, "refocus": 0, "design": 0, "seed": 0}.items():
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
@@ -133,6 +137,8 @@ class TrainingSettings:
             raise ValueError(f"start {self.start!r} has five masks, got masks={self.masks}; 'noise' has any number")
         if self.residual and "image" not in MAPS[self.task]:
             raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
+        if self.design and self.task != "edof":
+            raise ValueError(f"masks can be designed before training for the task 'edof' only, got {self.task!r}")
         if self.patience is not None and self.patience < 1:
             raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
         if not 0 <= self.ema < 1:

