@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask
-from kornia_tidy.optics.initial_masks import STARTS, fisher_mask, initial_heights
+from kornia_tidy.optics.coded_lens import CodedLens
+from kornia_tidy.optics.initial_masks import STARTS, SWEEP, fisher_mask, initial_heights
 from kornia_tidy.optics.mask_design import design_fisher_mask
 from tests.base import BaseTester
 
@@ -62,6 +63,14 @@ class TestInitialHeights(BaseTester):
         self.assert_close(noise[clean:].mean((1, 2)), torch.full((5 - clean,), 5.35e-7), rtol=0, atol=5e-8)
         self.assert_close(noise[clean:].std((1, 2)), torch.full((5 - clean,), 3.05e-7), rtol=0, atol=3e-8)
         assert len({round(float(one.sum()), 12) for one in noise[clean:]}) == 5 - clean  # each its own
+
+    def test_feature_each_of_a_sweep_is_sharp_at_its_own_defocus(self):
+        depths = torch.arange(-20.0, 21.0).tolist()
+        sharpest = []
+        for heights in drawn("focal sweep"):
+            psfs = CodedLens(PixelwiseMask(initial=heights[None])).psf_bank(1, defocus=depths).psfs
+            sharpest.append(depths[int(psfs.amax((1, 2, 3)).argmax())])
+        self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; noise
 
     def test_exception_unknown_start(self):
         with pytest.raises(ValueError, match=r"start must be one of 'noise', 'fisher, noise', .*, got 'tetrapod'"):

@@ -162,6 +162,8 @@ class TestSettings(BaseTester):
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
             ({"start": "fisher, noise", "masks": 6}, "start 'fisher, noise' has five masks, got masks=6; 'noise' has"),
+            ({"design": -1}, "design must be a whole number of at least 0, got -1"),
+            ({"design": 5, "task": "joint"}, "designed before training for the task 'edof' only, got 'joint'"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
         ],

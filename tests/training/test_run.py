@@ -49,7 +49,15 @@ class TestTrain(BaseTester):
         losses = [float(row["val_loss"]) for row in rows(tmp_path / "validation.csv")]
         assert losses[-1] < 0.8 * losses[0]
 
-    @pytest.mark.parametrize("changes", [{}, {"masks": 0}, {"refocus": 3, "start": "fisher, noise"}])
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {},
+            {"masks": 0},
+            {"refocus": 3, "start": "fisher, noise"},
+            {"task": "edof", "design": 3, "start": "focal sweep", "window": None, "fidelity": "draft"},
+        ],
+    )
     def test_feature_more_epochs_go_on_as_if_asked_for_at_first(self, changes, tmp_path):
         settings = SETTINGS.replace(**changes)
         whole = train(settings, tmp_path / "a").state_dict()
