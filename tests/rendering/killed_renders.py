@@ -21,6 +21,7 @@ from pathlib import Path
 import torch
 
 from kornia_tidy.rendering import Layout, render_scenes
+from tests.forks import fork, wait
 from tests.rendering.samples import small_camera, small_scenes
 
 COUNT, PATIENCE = 20, 60.0  # s that nobody waits for unless a process is left over
@@ -36,30 +37,15 @@ def run(children: Children) -> tuple[set[int], bool]:
     All hold a pipe open that ends with the last of them.
     """
     last, held = os.pipe()
-    processes = [_fork(child) for child in children]
+    processes = [fork(child) for child in children]
     os.close(held)
-    codes = {os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes}
+    codes = {wait(process) for process in processes}
     ended = bool(select.select([last], [], [], PATIENCE)[0])
     os.close(last)
     if not ended:
         for process in processes:
             os.killpg(process, signal.SIGKILL)
     return codes, ended
-
-
-def _fork(child: Callable[[], object]) -> int:
-    process = os.fork()
-    if process == 0:
-        code = 1
-        try:
-            os.setpgid(0, 0)
-            child()
-            code = 0
-        except BaseException as error:
-            print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        finally:
-            os._exit(code)
-    return process
 
 
 def kill() -> None:

@@ -25,6 +25,7 @@ from kornia_tidy.training import callbacks, heads, run
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.state_file import read_state
+from tests.forks import fork, wait
 
 SETTINGS = TrainingSettings(
     task="joint", masks=2, width=4, size=64, scenes=20, validation_scenes=2, batch=2, accumulate=2, epochs=3,
@@ -44,18 +45,13 @@ class DropoutHead(heads.PlainHead):
 
 
 def child(folder: Path, moment: Callable[[], object] = bool) -> int:
-    process = os.fork()
-    if process == 0:
-        code = 1
-        try:
-            moment()
-            run.train(SETTINGS, folder, resume=True, save_every=1)
-            code = 0
-        except BaseException as error:
-            print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        finally:
-            os._exit(code)
-    return process
+    """Train in a fork that something may happen to; return its exit code."""
+
+    def trained() -> None:
+        moment()
+        run.train(SETTINGS, folder, resume=True, save_every=1)
+
+    return wait(fork(trained))
 
 
 def die_at(owner: Any, name: str, call: int) -> None:
@@ -70,15 +66,11 @@ def die_at(owner: Any, name: str, call: int) -> None:
     setattr(owner, name, fatal)
 
 
-def wait(process: int) -> int:
-    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-
-
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DeprecationWarning)  # of fork in a process that has threads
     heads.HEADS["dropout"] = "__main__:DropoutHead"
-    assert wait(child(folder / "whole")) == 0
+    assert child(folder / "whole") == 0
     chance = random.Random(time.time_ns())
     moments = {
         "pretraining": partial(die_at, TidyTraining, "training_step", chance.randrange(1, 11)),
@@ -91,10 +83,10 @@ def main(folder: Path) -> None:
     }
     reached = {}
     for name, moment in moments.items():
-        code = wait(child(folder / "killed", moment))
+        code = child(folder / "killed", moment)
         assert code in {-signal.SIGKILL, -signal.SIGPROF} or (name == "anywhere" and code == 0), f"{name}: {code}"
         reached[name] = step(folder / "killed")
-    assert wait(child(folder / "killed")) == 0
+    assert child(folder / "killed") == 0
     print(json.dumps(reached))
 
 

@@ -35,10 +35,8 @@ class TestResume(BaseTester):
 
         Killed while it pretrains, between the stages, in a step, writing the log or a checkpoint, and in validation.
         """
-        script = ROOT / "tests" / "training" / "killed_runs.py"
-        done = subprocess.run(
-            [sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=False
-        )
+        command = [sys.executable, "-m", "tests.training.killed_runs", str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
         assert done.returncode == 0, done.stderr
         steps = json.loads(done.stdout)
         assert steps["pretraining"] is steps["between the stages"] is None
