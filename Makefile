@@ -12,7 +12,7 @@ READY := $(VENV)/.ready
 help:
 	@echo "make demo     coded captures and what networks make of them: outputs/demo.png, reconstruction.png"
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
-	@echo "make test     the tests; ARGS='-k camera' runs some of them"
+	@echo "make test     the tests, a process for each core; ARGS='-k camera' runs some of them, ARGS='-n0' in one process"
 	@echo "make lint     style, spelling and types"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
@@ -25,7 +25,7 @@ demo: $(READY)
 	@$(BIN)/kornia-tidy demo $(if $(IMAGE),--image '$(IMAGE)') $(if $(DEPTH),--depth '$(DEPTH)') $(ARGS)
 
 test: $(READY)
-	@$(BIN)/python -m pytest $(ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 --dist=loadfile $(ARGS)
 
 lint: $(READY)
 	@$(BIN)/ruff check
