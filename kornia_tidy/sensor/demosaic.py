@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -12,10 +11,11 @@ import torch
 from kornia.color import CFA, raw_to_rgb
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
+from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.sensor.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
 from kornia_tidy.sensor.filter_array import Tile
 from kornia_tidy.sensor.raw_color import srgb_from_xyz
+from kornia_tidy.sensor.whole_numbers import in_whole_numbers
 
 # kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
 BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
@@ -27,7 +27,8 @@ LIBRAW = {
     "X-Trans": ("markesteijn",),
 }
 LARGEST_FACTOR = 100.0  # from sRGB to any camera: more is no camera, and would not fit a field
-ROWS_AT_ONCE = 64  # what is between two steps then stays in the processor's cache
+# DCB and DHT pass over a picture again and again, Markesteijn's squares of 512 pixels are not all alike.
+LIBRAW_LOCAL, LIBRAW_REACH = ("linear", "vng", "ppg", "ahd"), 8  # rows: AHD's 5 at a border are bilinear, and 3 beyond
 LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # pixels of the shorter side that it takes
 
 METHODS = (
@@ -192,7 +193,7 @@ def _opencv(mosaic: Tensor, letters: str, name: str) -> Tensor:
     check_choice("the filter array of demosaicing by OpenCV", letters, tuple(BAYER))
     suffix, bits = OPENCV[name]
     code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names begin at the corner
-    return _in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits)
+    return in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits, 3)
 
 
 def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None) -> Tensor:
@@ -222,7 +223,7 @@ def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tenso
             )
 
     wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
-    image = _in_whole_numbers(wide, postprocess, 16)
+    image = in_whole_numbers(wide, postprocess, 16, len(colors), LIBRAW_REACH if name in LIBRAW_LOCAL else None)
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 
 
@@ -234,28 +235,3 @@ def _matrix_fields(to_srgb: Tensor | None) -> list[Field]:
         inverse = torch.eye(3, dtype=torch.float64)
     from_xyz = inverse @ srgb_from_xyz()
     return [(50721, SRATIONAL, from_xyz.flatten().tolist()), (50778, SHORT, [D65])]
-
-
-def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray], bits: int) -> Tensor:
-    """Compute (H, W) -> (H, W, C) in unsigned integers of 8 or 16 bits that span the mosaic's range, 0 and 1."""
-    check_finite("mosaic", mosaic)
-    values = mosaic.detach().to("cpu", torch.promote_types(mosaic.dtype, torch.float32))
-    least, most = torch.aminmax(values)
-    low, high = min(0.0, float(least)), max(1.0, float(most))
-    step = (high - low) / (2**bits - 1)
-    counts = np.empty(values.shape, np.uint8 if bits == 8 else np.uint16)
-    for top in range(0, values.shape[1], ROWS_AT_ONCE):
-        rows = slice(top, top + ROWS_AT_ONCE)
-        counts[:, rows] = (values[:, rows] - low).div_(step).round_().numpy()
-    images = []
-    for plane in counts:
-        colors = compute(plane).transpose(2, 0, 1)
-        image = np.empty(colors.shape, values.numpy().dtype)  # NumPy's large pages are touched in half the time
-        for top in range(0, image.shape[1], ROWS_AT_ONCE):
-            rows = slice(top, top + ROWS_AT_ONCE)
-            for color, own in zip(colors[:, rows], image[:, rows], strict=True):
-                np.multiply(color, step, out=own, casting="same_kind")
-        if low:
-            image += low
-        images.append(torch.from_numpy(image))
-    return (images[0][None] if len(images) == 1 else torch.stack(images)).to(mosaic)

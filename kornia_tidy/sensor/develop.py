@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from kornia_tidy.checks import check_choice, check_finite
-from kornia_tidy.sensor.demosaic import BAYER, ROWS_AT_ONCE, demosaic
+from kornia_tidy.sensor.demosaic import BAYER, demosaic
 from kornia_tidy.sensor.filter_array import tiled
 from kornia_tidy.sensor.raw_color import adapted_to_srgb, assumed_camera_to_srgb, camera_to_srgb
+from kornia_tidy.sensor.whole_numbers import ROWS_AT_ONCE
 
 if TYPE_CHECKING:
     from kornia_tidy.sensor.raw_file import RawCapture
