@@ -6,14 +6,17 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_finite
 
-ROWS_AT_ONCE = 64  # what is between two steps then stays in the processor's cache
-LARGEST_BAND = 1 << 21  # pixels, 8 bytes each in LibRaw: malloc keeps that much, the system would give it anew each time
+ROWS_AT_ONCE = 16  # what is between two steps then stays in the processor's cache
+LARGEST_BAND = (
+    1 << 21
+)  # pixels, 8 bytes each in LibRaw: malloc keeps that much, the system would give it anew each time
 
 FEWEST_ROWS = 64  # of a band: what it computes twice at its edges is then a quarter at most
 
@@ -22,21 +25,21 @@ def in_whole_numbers(
     mosaic: Tensor,
     compute: Callable[[np.ndarray], np.ndarray],
     bits: int,
-    colors: int,
+    matrix: Tensor,
     reach: int | None = None,
 ) -> Tensor:
-    """Return what ``compute`` makes of mosaics in unsigned integers that span their range, 0 and 1.
+    """Return the colours that ``compute`` makes of mosaics, in unsigned integers that span their range, 0 and 1.
 
     Args:
         mosaic: (N, H, W), finite.
         compute: (rows, W) to (rows, W, colors), unsigned integers; called by several threads at once.
         bits: 8 or 16.
-        colors: how many come back.
+        matrix: (C, colors) with which colours are multiplied on their way back.
         reach: rows, an even number, beyond which nothing changes what a row becomes; bands of rows are then computed
             side by side, and the result is the same. None: only all at once.
 
     Returns:
-        (N, colors, H, W) like ``mosaic``.
+        (N, C, H, W) like ``mosaic``.
 
     Raises:
         ValueError: if the mosaic is not finite.
@@ -48,14 +51,16 @@ def in_whole_numbers(
     step = (high - low) / (2**bits - 1)
     height, width = tensor.shape[-2:]
     # PyTorch's memory: NumPy asks for large pages, and where these are scarce, each is taken from the host anew.
-    image = torch.empty(len(tensor), colors, height, width, dtype=tensor.dtype)
+    image = torch.empty(len(tensor), len(matrix), height, width, dtype=tensor.dtype)
+    factors = matrix.detach().double().cpu().numpy()
+    back = np.hstack([step * factors, low * factors.sum(1, keepdims=True)])  # from whole numbers, and 1
     edges = [0, height] if reach is None else band_edges(height, width, torch.get_num_threads())
 
     def work(place: tuple[int, tuple[int, int]]) -> None:
         index, (top, bottom) = place
         first, last = max(top - (reach or 0), 0), min(bottom + (reach or 0), height)
         counts = _counts(tensor[index, first:last].numpy(), low, step, bits)
-        _restore(compute(counts)[top - first : bottom - first], image[index, :, top:bottom].numpy(), low, step)
+        _restore(compute(counts)[top - first : bottom - first], back, image[index, :, top:bottom].numpy())
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         for _ in threads.map(work, itertools.product(range(len(tensor)), itertools.pairwise(edges))):
@@ -85,9 +90,8 @@ def _counts(values: np.ndarray, low: float, step: float, bits: int) -> np.ndarra
     return counts
 
 
-def _restore(counts: np.ndarray, image: np.ndarray, low: float, step: float) -> None:
+def _restore(counts: np.ndarray, back: np.ndarray, image: np.ndarray) -> None:
+    """Write (C, rows, W) of whole numbers (rows, W, colors)."""
     for top in range(0, len(counts), ROWS_AT_ONCE):
         rows = slice(top, top + ROWS_AT_ONCE)
-        for color, values in enumerate(image[:, rows]):
-            np.multiply(counts[rows, :, color], step, out=values, casting="same_kind")
-            values += low
+        cv2.split(cv2.transform(counts[rows].astype(image.dtype), back), list(image[:, rows]))
