@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,7 +19,7 @@ LARGEST_BAND = (
     1 << 21
 )  # pixels, 8 bytes each in LibRaw: malloc keeps that much, the system would give it anew each time
 
-FEWEST_ROWS = 64  # of a band: what it computes twice at its edges is then a quarter at most
+FEWEST_ROWS = 64  # of a band: what it computes beyond its edges is then a third of it at most
 
 
 def in_whole_numbers(
@@ -44,13 +45,14 @@ def in_whole_numbers(
     Raises:
         ValueError: if the mosaic is not finite.
     """
-    check_finite("mosaic", mosaic)
     tensor = mosaic.detach().to("cpu", torch.promote_types(mosaic.dtype, torch.float32))
     low, high = (float(end) for end in torch.aminmax(tensor))
+    if not math.isfinite(high - low):
+        check_finite("mosaic", mosaic)  # says which value
     low, high = min(0.0, low), max(1.0, high)
     step = (high - low) / (2**bits - 1)
     height, width = tensor.shape[-2:]
-    # PyTorch's memory: NumPy asks for large pages, and where these are scarce, each is taken from the host anew.
+    # PyTorch's memory: NumPy asks for large pages, which where memory is in pieces cost up to seven times as much.
     image = torch.empty(len(tensor), len(matrix), height, width, dtype=tensor.dtype)
     factors = matrix.detach().double().cpu().numpy()
     back = np.hstack([step * factors, low * factors.sum(1, keepdims=True)])  # from whole numbers, and 1
@@ -69,15 +71,17 @@ def in_whole_numbers(
 
 
 def band_edges(height: int, width: int, threads: int) -> list[int]:
-    """Return where bands of rows begin, at even rows, and where the last ends: not too large, and as many as threads.
+    """Return where bands of rows begin and where the last ends: not too large, and as many as threads or a multiple.
+
+    Rows that are restored together stay together, so that the last bit of a value does not depend on the bands.
 
     Example:
         >>> band_edges(2176, 4128, threads=2), band_edges(120, 4128, threads=2)
-        ([0, 362, 724, 1088, 1450, 1812, 2176], [0, 120])
+        ([0, 352, 720, 1088, 1440, 1808, 2176], [0, 120])
     """
     bands = -(-height * width // LARGEST_BAND)
     bands = max(1, min(-(-bands // threads) * threads, height // FEWEST_ROWS))
-    return [2 * (height * band // (2 * bands)) for band in range(bands)] + [height]
+    return [ROWS_AT_ONCE * (height * band // (ROWS_AT_ONCE * bands)) for band in range(bands)] + [height]
 
 
 def _counts(values: np.ndarray, low: float, step: float, bits: int) -> np.ndarray:
