@@ -15,10 +15,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_finite
 
 ROWS_AT_ONCE = 16  # what is between two steps then stays in the processor's cache
-LARGEST_BAND = (
-    1 << 21
-)  # pixels, 8 bytes each in LibRaw: malloc keeps that much, the system would give it anew each time
-
+LARGEST_BAND = 1 << 21  # pixels, 16 MB in LibRaw: malloc keeps that for the next band, the system gives it anew
 FEWEST_ROWS = 64  # of a band: what it computes beyond its edges is then a third of it at most
 
 
