@@ -10,7 +10,19 @@ from torch import Tensor
 
 from kornia_tidy.calibration.measured_psfs import MeasuredPSFs
 from kornia_tidy.calibration.phase_retrieval import MaskFit
-from kornia_tidy.figures import FAINT, INK, LABEL, PHASE_COLORS, SMALL, TITLE, require_matplotlib
+from kornia_tidy.figures.style import (
+    ACCENT,
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    LABEL,
+    PHASE_COLORS,
+    RED,
+    SMALL,
+    TITLE,
+    require_matplotlib,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,7 +30,7 @@ if TYPE_CHECKING:
 
 MOST_COLUMNS = 9  # distances drawn
 CELL = 1.25  # inches
-CHANNELS = {1: ("",), 3: ("#c0392b", "#2e8b57", "#2563eb")}
+CHANNELS = {1: ("",), 3: (RED, GREEN, BLUE)}
 
 
 def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
@@ -109,7 +121,7 @@ def _noise_chart(axes: Axes, measured: MeasuredPSFs, fit: MaskFit | None) -> Non
 def _misfit_chart(axes: Axes, measured: MeasuredPSFs) -> None:
     """Every point image's residuals, those left out marked."""
     known = [(n, report) for n, report in enumerate(measured.reports) if report.misfit is not None]
-    for color, rejected in ((INK, False), ("#c2410c", True)):
+    for color, rejected in ((INK, False), (ACCENT, True)):
         shown = [(n, report.misfit) for n, report in known if (report.rejected is not None) == rejected]
         axes.plot([n for n, _ in shown], [misfit for _, misfit in shown], ".", color=color, markersize=4)
     used = sum(report.rejected is None for report in measured.reports)

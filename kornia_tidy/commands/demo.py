@@ -19,8 +19,8 @@ from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.estimate_figure import Estimate, draw_estimates
 from kornia_tidy.figures import explain, require_matplotlib
+from kornia_tidy.figures.estimates import Estimate, draw_estimates
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.modulator import DwellTimes

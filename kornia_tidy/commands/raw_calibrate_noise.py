@@ -116,8 +116,8 @@ def in_words(result: PhotonTransfer) -> list[tuple[str, str]]:
 
 
 def _draw(result: PhotonTransfer, path: Path) -> None:
+    from kornia_tidy.figures.transfer import draw_transfer  # noqa: PLC0415
     from kornia_tidy.files import write_bytes  # noqa: PLC0415
-    from kornia_tidy.transfer_figure import draw_transfer  # noqa: PLC0415
 
     picture = BytesIO()
     draw_transfer(result).savefig(picture, dpi=DOTS_PER_INCH, format=path.suffix[1:])

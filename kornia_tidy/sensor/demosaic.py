@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -12,10 +11,11 @@ import torch
 from kornia.color import CFA, raw_to_rgb
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
+from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.sensor.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
 from kornia_tidy.sensor.filter_array import Tile
 from kornia_tidy.sensor.raw_color import srgb_from_xyz
+from kornia_tidy.sensor.whole_numbers import ROWS_AT_ONCE, in_whole_numbers
 
 # kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
 BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
@@ -27,7 +27,8 @@ LIBRAW = {
     "X-Trans": ("markesteijn",),
 }
 LARGEST_FACTOR = 100.0  # from sRGB to any camera: more is no camera, and would not fit a field
-ROWS_AT_ONCE = 64  # what is between two steps then stays in the processor's cache
+# DCB and DHT pass over a picture again and again, Markesteijn's squares of 512 pixels are not all alike.
+LIBRAW_LOCAL, LIBRAW_REACH = ("linear", "vng", "ppg", "ahd"), 8  # rows: AHD's 5 at a border are bilinear, and 3 beyond
 LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # pixels of the shorter side that it takes
 
 METHODS = (
@@ -82,6 +83,36 @@ def demosaic(
         >>> rgb[:, 1, 2]
         tensor([0.9000, 0.5000, 0.1000])
     """
+    return _demosaic(mosaic, pattern, colors, method, to_srgb, None)
+
+
+def demosaic_to_srgb(mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor) -> Tensor:
+    """Return a mosaic in linear sRGB, (..., 3, H, W): what :func:`demosaic` returns, multiplied by ``to_srgb``.
+
+    One pass over the picture where it comes back from whole numbers. The arguments are those of :func:`demosaic`,
+    ``to_srgb`` (3, colours).
+
+    Example:
+        >>> matrix = torch.tensor([[1.0, 0, 0], [0, 0.5, 0], [0, 0.5, 0.5]])
+        >>> mosaic = torch.tensor([[[0.9, 0.5, 0.9, 0.5], [0.5, 0.1, 0.5, 0.1]]])
+        >>> demosaic_to_srgb(mosaic, ((0, 1), (3, 2)), "RGBG", "bilinear", matrix)[:, 1, 2]
+        tensor([0.9000, 0.2500, 0.3000])
+    """
+    return _demosaic(mosaic, pattern, colors, method, to_srgb, to_srgb)
+
+
+def mixed(image: Tensor, matrix: Tensor) -> Tensor:
+    """Return (..., 3, H, W) of an image (..., colours, H, W), in its own memory where it has room, times a matrix."""
+    result = image if image.shape[-3] == 3 else image.new_empty(*image.shape[:-3], 3, *image.shape[-2:])
+    for top in range(0, image.shape[-2], ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        result[..., rows, :] = torch.einsum("ij,...jhw->...ihw", matrix.to(image), image[..., rows, :])
+    return result
+
+
+def _demosaic(
+    mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor | None, mixture: Tensor | None
+) -> Tensor:
     check_choice("method of demosaicing", method, METHODS)
     check_float_tensor("mosaic", mosaic.reshape(-1, *mosaic.shape[-2:]), 3, "(..., 1, H, W)")
     if mosaic.ndim < 3 or mosaic.shape[-3] != 1:
@@ -96,12 +127,17 @@ def demosaic(
     letters = "".join(names[index] for row in tile for index in row)
     if method in {"bilinear", "half"}:
         image = (bilinear if method == "bilinear" else binned)(flat, tile)
-    elif library == "libraw":
-        image = _libraw(flat, letters, names, name, to_srgb)
+    elif library == "kornia":
+        image = _kornia(flat, letters, names)
     else:
-        image = _kornia(flat, letters) if library == "kornia" else _opencv(flat, letters, name)
-        if names != "RGB":
-            image = image[:, ["RGB".index(letter) for letter in names]]
+        matrix = torch.eye(len(names)) if mixture is None else mixture
+        if library == "libraw":
+            image = _libraw(flat, letters, names, name, to_srgb, matrix)
+        else:
+            image = _opencv(flat, letters, names, name, matrix)
+        mixture = None
+    if mixture is not None:
+        image = mixed(image, mixture)
     return image.reshape(*mosaic.shape[:-3], *image.shape[-3:])
 
 
@@ -180,22 +216,24 @@ def _holds_all(tile: Tile, side: int, step: int) -> bool:
     )
 
 
-def _kornia(mosaic: Tensor, letters: str) -> Tensor:
+def _kornia(mosaic: Tensor, letters: str, colors: str) -> Tensor:
     check_choice("the filter array of demosaicing by kornia", letters, tuple(BAYER))
     if mosaic.shape[-2] % 2 or mosaic.shape[-1] % 2:
         raise ValueError(f"demosaicing by kornia needs even height and width, got {tuple(mosaic.shape[-2:])}")
     values = mosaic if mosaic.dtype == torch.float64 else mosaic.float()
-    return raw_to_rgb(values[:, None], BAYER[letters]).to(mosaic.dtype)
+    image = raw_to_rgb(values[:, None], BAYER[letters]).to(mosaic.dtype)
+    return image if colors == "RGB" else image[:, ["RGB".index(letter) for letter in colors]]
 
 
-def _opencv(mosaic: Tensor, letters: str, name: str) -> Tensor:
+def _opencv(mosaic: Tensor, letters: str, colors: str, name: str, matrix: Tensor) -> Tensor:
     check_choice("the filter array of demosaicing by OpenCV", letters, tuple(BAYER))
     suffix, bits = OPENCV[name]
     code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names begin at the corner
-    return _in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits)
+    matrix = matrix[:, [colors.index(letter) for letter in "RGB"]]
+    return in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits, matrix)
 
 
-def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None) -> Tensor:
+def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
     import rawpy  # noqa: PLC0415  (only who asks for it loads a C++ library)
 
     kind = "Bayer" if letters in BAYER else "four-colour" if len(colors) == 4 else "X-Trans"
@@ -222,7 +260,7 @@ def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tenso
             )
 
     wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
-    image = _in_whole_numbers(wide, postprocess, 16)
+    image = in_whole_numbers(wide, postprocess, 16, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 
 
@@ -234,28 +272,3 @@ def _matrix_fields(to_srgb: Tensor | None) -> list[Field]:
         inverse = torch.eye(3, dtype=torch.float64)
     from_xyz = inverse @ srgb_from_xyz()
     return [(50721, SRATIONAL, from_xyz.flatten().tolist()), (50778, SHORT, [D65])]
-
-
-def _in_whole_numbers(mosaic: Tensor, compute: Callable[[np.ndarray], np.ndarray], bits: int) -> Tensor:
-    """Compute (H, W) -> (H, W, C) in unsigned integers of 8 or 16 bits that span the mosaic's range, 0 and 1."""
-    check_finite("mosaic", mosaic)
-    values = mosaic.detach().to("cpu", torch.promote_types(mosaic.dtype, torch.float32))
-    least, most = torch.aminmax(values)
-    low, high = min(0.0, float(least)), max(1.0, float(most))
-    step = (high - low) / (2**bits - 1)
-    counts = np.empty(values.shape, np.uint8 if bits == 8 else np.uint16)
-    for top in range(0, values.shape[1], ROWS_AT_ONCE):
-        rows = slice(top, top + ROWS_AT_ONCE)
-        counts[:, rows] = (values[:, rows] - low).div_(step).round_().numpy()
-    images = []
-    for plane in counts:
-        colors = compute(plane).transpose(2, 0, 1)
-        image = np.empty(colors.shape, values.numpy().dtype)  # NumPy's large pages are touched in half the time
-        for top in range(0, image.shape[1], ROWS_AT_ONCE):
-            rows = slice(top, top + ROWS_AT_ONCE)
-            for color, own in zip(colors[:, rows], image[:, rows], strict=True):
-                np.multiply(color, step, out=own, casting="same_kind")
-        if low:
-            image += low
-        images.append(torch.from_numpy(image))
-    return (images[0][None] if len(images) == 1 else torch.stack(images)).to(mosaic)

@@ -189,7 +189,9 @@ def _counts(result: IO[bytes], shape: list[int]) -> Tensor:
     if result.seek(0, SEEK_END) - start != 2 * height * width * channels:
         raise ValueError
     mapped = np.memmap(result, dtype=np.uint16, mode="r", offset=start, shape=(height, width, channels))
-    return torch.from_numpy(np.ascontiguousarray(mapped.transpose(2, 0, 1), dtype=np.int32))
+    counts = torch.empty(channels, height, width, dtype=torch.int32)  # small pages, see whole_numbers.py
+    counts.numpy()[:] = mapped.transpose(2, 0, 1)
+    return counts
 
 
 def _sentence(header: dict[str, Any], memory_limit: int) -> str:

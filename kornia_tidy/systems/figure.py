@@ -12,7 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.figures import ACCENT, DEPTH_COLORS, FAINT, INK, PHASE_COLORS, depth_at, require_matplotlib
+from kornia_tidy.figures.depth import depth_at
+from kornia_tidy.figures.style import (
+    ACCENT,
+    BLUE,
+    DEPTH_COLORS,
+    FAINT,
+    GREEN,
+    INK,
+    PHASE_COLORS,
+    RED,
+    require_matplotlib,
+)
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.phase_masks import central_square
 from kornia_tidy.systems.survey import Survey
@@ -25,7 +36,7 @@ if TYPE_CHECKING:
 
 HEADLINE, TITLE, LABEL, SMALL = 17, 10, 7.5, 6.5  # pt
 COLUMNS = 7  # PSFs of a system
-CHANNELS = ("#c0392b", "#2e8b57", "#2563eb")
+CHANNELS = (RED, GREEN, BLUE)
 
 # Inches, from the lower left corner; a system is a row.
 LEFT, WORDS, CELL, GAP = 0.35, 2.75, 1.0, 0.05

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from kornia_tidy.figures import FAINT, INK, require_matplotlib
+from kornia_tidy.figures.style import FAINT, INK, open_chart, require_matplotlib
 from kornia_tidy.tradeoff.files import TradeRun, value_in_words
 from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, PRESET
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
@@ -84,13 +84,9 @@ def _frame(axes: Axes, run: TradeRun, floor: float) -> None:
     axes.set_ylim(floor / 1.6, 2 * max(2 * floor, *(row.rmse for row in run.rows)))
     axes.set_xlabel("time of a capture, PSF bank and rendering, ms", fontsize=LABEL, color=INK)
     axes.set_ylabel("error: RMSE of the noise-free linear capture, full scale 1", fontsize=LABEL, color=INK)
-    axes.grid(which="major", color="#e8ecef", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(which="both", labelsize=LABEL, labelcolor=INK, color=FAINT)
+    open_chart(axes, LABEL)
     axes.xaxis.set_major_formatter(_plain)
     axes.xaxis.set_minor_formatter(_minor(math.log10(max(times) / min(times))))
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
     if any(row.rmse == 0 for row in run.rows):
         axes.axhline(floor, color=FAINT, linewidth=0.6, linestyle=(0, (2, 3)), zorder=1)
         axes.annotate(

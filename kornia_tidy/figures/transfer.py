@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kornia_tidy.figures import FAINT, INK, require_matplotlib
+from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, open_chart, require_matplotlib
 from kornia_tidy.sensor.photon_transfer import ROUNDING, PhotonTransfer
 
 if TYPE_CHECKING:
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = {
-    "R": "#c0392b",
-    "G": "#2e8b57",
-    "B": "#2563eb",
+    "R": RED,
+    "G": GREEN,
+    "B": BLUE,
     "C": "#0e9aa7",
     "M": "#b0338f",
     "Y": "#c79a00",
-    "L": "#1c2733",
+    "L": INK,
 }
 TITLE, LABEL, SMALL = 12, 9, 7.5  # pt
 WIDTH, HEIGHT = 10.5, 5.0  # inches
@@ -54,10 +54,7 @@ def draw_transfer(result: PhotonTransfer) -> Figure:
     _variance(straight, result, levels)
     _noise(limits, result, levels[1:])
     for axes in (straight, limits):
-        axes.grid(which="major", color="#e8ecef", linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.tick_params(which="both", labelsize=LABEL, labelcolor=INK, color=FAINT)
-        axes.spines[["top", "right"]].set_visible(False)
+        open_chart(axes, LABEL)
         axes.legend(fontsize=SMALL, frameon=False, loc="upper left")
     _titles(figure, result)
     return figure

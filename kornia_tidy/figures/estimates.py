@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_tidy.figures import ACCENT, DEPTH_COLORS, FAINT, LABEL, TITLE, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, DEPTH_COLORS, FAINT, LABEL, TITLE, require_matplotlib
 from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Pictures for people: the library explained at a glance. Drawn with matplotlib, which is imported only here."""
+"""The library explained at a glance, in one picture: a scene, masks, their PSFs over depth, coded captures."""
 
 from __future__ import annotations
 
@@ -9,6 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.figures.depth import depth_at, depth_bar, metres
+from kornia_tidy.figures.style import (
+    ACCENT,
+    DEPTH_COLORS,
+    FAINT,
+    INK,
+    LABEL,
+    PHASE_COLORS,
+    SMALL,
+    TITLE,
+    quiet,
+    require_matplotlib,
+)
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.phase_masks import central_square
@@ -19,24 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK, FAINT, ACCENT = "#1c2733", "#66727f", "#c2410c"
-DEPTH_COLORS, PHASE_COLORS = "inferno", "twilight"
-TITLE, LABEL, SMALL = 9.5, 7.5, 6.5  # pt
 WIDTH, HEIGHT = 12.0, 6.6  # inches; 150 dots an inch make 1800 x 990 pixels
-TICK_DEPTHS = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 7, 10, 20, 50, math.inf)  # m
 MOST_ROWS = 5  # masks drawn
-
-
-def require_matplotlib() -> None:
-    """Raise one clear sentence if matplotlib is missing.
-
-    Raises:
-        ImportError: if it is.
-    """
-    try:
-        import matplotlib.figure  # noqa: F401, PLC0415
-    except ImportError:
-        raise ImportError("pictures need matplotlib: pip install 'kornia-tidy[plot]'") from None
 
 
 def explain(
@@ -79,43 +76,6 @@ def explain(
     return figure
 
 
-def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
-    """Draw a depth map in colours that are linear in inverse depth, with a bar that names the depths in metres.
-
-    Args:
-        depth: (1, H, W) in metres, may be infinite; depths beyond the camera's range have the colours of its ends.
-        camera: its depth range is the bar's.
-
-    Returns:
-        A figure; ``figure.savefig(path, dpi=150)`` makes its longer side 1800 pixels, the bar not counted.
-
-    Raises:
-        ImportError: if matplotlib is missing.
-    """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    height, width = depth.shape[-2:]
-    step = max(1, max(height, width) // 1800)
-    shown = depth[0, ::step, ::step].detach().cpu()
-    far, near = sorted(1 / end for end in camera.depth_range)
-    place = ((shown.reciprocal() - far) / (near - far)).clamp(0, 1).numpy()
-    scale = WIDTH / max(height, width)
-    across, up, below = max(width * scale, 3.0), height * scale, 0.45  # inches
-    figure = Figure(figsize=(across, up + below), facecolor="white")
-    axes = figure.add_axes(
-        ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
-    )
-    axes.imshow(place, cmap=DEPTH_COLORS, vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
-    axes.set_axis_off()
-    bar = figure.add_axes((0.06, 0.26 / (up + below), 0.88, 0.1 / (up + below)))
-    bar.imshow(np.linspace(0, 1, 256)[None], cmap=DEPTH_COLORS, aspect="auto", extent=(0, 1, 0, 1))
-    ticks = _depth_ticks(camera)
-    bar.set_xticks([x for x, _ in ticks], [label for _, label in ticks])
-    _quiet(bar, spines=False)
-    return figure
-
-
 def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
     """Return the PSFs of each of the first few masks shown alone, in the window of their average.
 
@@ -142,17 +102,6 @@ def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
             alone.modulator = DwellTimes([float(k == other) for other in range(count)])
             banks.append(alone.psf_bank())
     return banks
-
-
-def depth_at(defocus: float, camera: ThinLensCamera) -> float:
-    """Return the depth in metres that has a defocus in radians; infinity for that of infinity and beyond.
-
-    Example:
-        >>> round(depth_at(0.0, ThinLensCamera()), 3)
-        0.595
-    """
-    depth = float(camera.depth(torch.tensor(defocus, dtype=torch.float64)))
-    return depth if depth < 1e9 else math.inf
 
 
 # ---------------------------------------------------------------------- the four parts, from left to right
@@ -189,11 +138,7 @@ def _scene(figure: Figure, image: Tensor, depth: Tensor, camera: ThinLensCamera)
     colors = torch.from_numpy(colormaps[DEPTH_COLORS](nearness[0].cpu().numpy())).permute(2, 0, 1)
     axes = _picture(figure, (SCENE_X, LOWER), colors, "its depth; bright is near")
     bounds = axes.get_position(original=False)  # of the picture, not of its box
-    bar = figure.add_axes((bounds.x0, 0.44 / HEIGHT, bounds.width, 0.09 / HEIGHT))
-    bar.imshow(np.linspace(0, 1, 256)[None], cmap=DEPTH_COLORS, aspect="auto", extent=(0, 1, 0, 1))
-    ticks = _depth_ticks(camera)
-    bar.set_xticks([x for x, _ in ticks], [label for _, label in ticks])
-    _quiet(bar, spines=False)
+    depth_bar(figure.add_axes((bounds.x0, 0.44 / HEIGHT, bounds.width, 0.09 / HEIGHT)), camera)
 
 
 def _table(figure: Figure, optics: TiDyOptics, camera: ThinLensCamera) -> None:
@@ -270,7 +215,7 @@ def _column_header(figure: Figure, x: float, defocus: float, camera: ThinLensCam
     lo, hi = camera.defocus_range
     color = colormaps[DEPTH_COLORS]((defocus - lo) / (hi - lo))
     _rectangle(figure, (x, 4.99), (x + CELL, 5.05), facecolor=color, linewidth=0)
-    _text(figure, x + CELL / 2, 5.36, f"{_metres(depth_at(defocus, camera))} m", LABEL, weight="bold", center=True)
+    _text(figure, x + CELL / 2, 5.36, f"{metres(depth_at(defocus, camera))} m", LABEL, weight="bold", center=True)
     psi = "0" if abs(defocus) < 0.05 else f"{defocus:+.2g}".replace("-", "\N{MINUS SIGN}")
     _text(figure, x + CELL / 2, 5.17, f"ψ = {psi}", SMALL, color=FAINT, center=True)
 
@@ -284,7 +229,7 @@ def _mask(figure: Figure, x: float, y: float, optics: TiDyOptics, k: int) -> Non
     axes.imshow(
         phase.where(light > 0, math.nan).numpy(), cmap=PHASE_COLORS, vmin=0, vmax=2 * math.pi, interpolation="nearest"
     )
-    _quiet(axes)
+    quiet(axes)
     axes.text(0.02, 0.98, str(k + 1), fontsize=SMALL, color=INK, va="top", transform=axes.transAxes)
 
 
@@ -292,7 +237,7 @@ def _phase_bar(figure: Figure) -> None:
     bar = figure.add_axes((TABLE_X / WIDTH, 0.44 / HEIGHT, CELL / WIDTH, 0.09 / HEIGHT))
     bar.imshow(np.linspace(0, 1, 256)[None], cmap=PHASE_COLORS, aspect="auto", extent=(0, 1, 0, 1))
     bar.set_xticks([0, 1], ["0", "2π"])
-    _quiet(bar, spines=False)
+    quiet(bar, spines=False)
     _text(figure, TABLE_X + CELL + 0.1, 0.45, "phase", SMALL, color=FAINT)
 
 
@@ -312,24 +257,13 @@ def _picture(
     axes.imshow(pixels.permute(1, 2, 0).numpy(), interpolation="antialiased")
     axes.set_anchor("NW" if y == UPPER else "SW")
     axes.apply_aspect()
-    _quiet(axes, spines=False)
+    quiet(axes, spines=False)
     _text(figure, x, axes.get_position(original=False).y1 * HEIGHT + 0.07, title, LABEL, color=FAINT)
     return axes
 
 
 def _axes(figure: Figure, x: float, y: float, side: float) -> Axes:
     return figure.add_axes((x / WIDTH, y / HEIGHT, side / WIDTH, side / HEIGHT))
-
-
-def _quiet(axes: Axes, spines: bool = True) -> None:
-    """Take the ticks away where nobody set any, and soften the rest."""
-    if axes.get_xlim() != (0, 1):
-        axes.set_xticks([])
-    axes.set_yticks([])
-    axes.tick_params(labelsize=SMALL, length=2, width=0.5, pad=1.5, color=FAINT, labelcolor=FAINT)
-    for spine in axes.spines.values():
-        spine.set_visible(spines)
-        spine.set(linewidth=0.5, color=FAINT)
 
 
 def _text(
@@ -367,19 +301,3 @@ def _rectangle(figure: Figure, lower: tuple[float, float], upper: tuple[float, f
 
     (x0, y0), (x1, y1) = lower, upper
     figure.add_artist(Rectangle((x0 / WIDTH, y0 / HEIGHT), (x1 - x0) / WIDTH, (y1 - y0) / HEIGHT, **style))
-
-
-def _depth_ticks(camera: ThinLensCamera) -> list[tuple[float, str]]:
-    """Return places on the depth bar (0 far, 1 near) and their labels, far enough apart to be read."""
-    near, far = camera.depth_range
-    span = 1 / near - 1 / far
-    ticks: list[tuple[float, str]] = []
-    for depth in sorted({*TICK_DEPTHS, near, far}, key=lambda d: (d not in (near, far), -d)):
-        place = (1 / depth - 1 / far) / span
-        if -1e-9 <= place <= 1 + 1e-9 and all(abs(place - other) > 0.12 for other, _ in ticks):
-            ticks.append((place, _metres(depth)))
-    return [(place, f"{label} m" if place == max(p for p, _ in ticks) else label) for place, label in ticks]
-
-
-def _metres(depth: float) -> str:
-    return "∞" if math.isinf(depth) else f"{depth:.2g}"

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import math
 import sys
 
 import pytest
 import torch
 
-from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.figures import HEIGHT, WIDTH, depth_at, explain
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.figures.explained import HEIGHT, WIDTH, explain
 from tests.base import BaseTester
 
 QUICK = Fidelity(window=23, layer_spacing=6.67)
@@ -66,11 +65,3 @@ class TestExplain(BaseTester):
     def test_exception_camera_without_metres(self):
         with pytest.raises(TypeError, match="got DefocusRange"):
             figure_of(TiDyOptics(PixelwiseMask(2), camera=DefocusRange(), fidelity=QUICK))
-
-
-class TestDepthAt(BaseTester):
-    @pytest.mark.parametrize("depth", [0.3, 0.595, 2.0, math.inf])
-    def test_feature_inverts_the_cameras_defocus(self, depth):
-        camera = ThinLensCamera()
-        defocus = float(camera.defocus(torch.tensor(depth, dtype=torch.float64)))
-        assert depth_at(defocus, camera) == pytest.approx(depth, rel=1e-9)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kornia_tidy.estimate_figure import Estimate, draw_estimates
+from kornia_tidy.figures.estimates import Estimate, draw_estimates
 from tests.base import BaseTester
 
 

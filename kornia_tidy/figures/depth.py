@@ -1,0 +1,94 @@
+"""Depth in pictures: maps in colours that are linear in inverse depth, the bar that names metres."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_tidy.figures.style import DEPTH_COLORS, quiet, require_matplotlib
+from kornia_tidy.optics.camera import ThinLensCamera
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LONGER_SIDE = 12.0  # inches; 150 dots an inch make 1800 pixels
+TICK_DEPTHS = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 7, 10, 20, 50, math.inf)  # m
+
+
+def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
+    """Draw a depth map in colours that are linear in inverse depth, with a bar that names the depths in metres.
+
+    Args:
+        depth: (1, H, W) in metres, may be infinite; depths beyond the camera's range have the colours of its ends.
+        camera: its depth range is the bar's.
+
+    Returns:
+        A figure; ``figure.savefig(path, dpi=150)`` makes its longer side 1800 pixels, the bar not counted.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    height, width = depth.shape[-2:]
+    step = max(1, max(height, width) // 1800)
+    shown = depth[0, ::step, ::step].detach().cpu()
+    far, near = sorted(1 / end for end in camera.depth_range)
+    place = ((shown.reciprocal() - far) / (near - far)).clamp(0, 1).numpy()
+    scale = LONGER_SIDE / max(height, width)
+    across, up, below = max(width * scale, 3.0), height * scale, 0.45  # inches
+    figure = Figure(figsize=(across, up + below), facecolor="white")
+    axes = figure.add_axes(
+        ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
+    )
+    axes.imshow(place, cmap=DEPTH_COLORS, vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
+    axes.set_axis_off()
+    depth_bar(figure.add_axes((0.06, 0.26 / (up + below), 0.88, 0.1 / (up + below))), camera)
+    return figure
+
+
+def depth_at(defocus: float, camera: ThinLensCamera) -> float:
+    """Return the depth in metres that has a defocus in radians; infinity for that of infinity and beyond.
+
+    Example:
+        >>> round(depth_at(0.0, ThinLensCamera()), 3)
+        0.595
+    """
+    depth = float(camera.depth(torch.tensor(defocus, dtype=torch.float64)))
+    return depth if depth < 1e9 else math.inf
+
+
+def depth_bar(axes: Axes, camera: ThinLensCamera) -> None:
+    """Draw the colours of a camera's depth range, far to near, with some depths in metres below."""
+    axes.imshow(np.linspace(0, 1, 256)[None], cmap=DEPTH_COLORS, aspect="auto", extent=(0, 1, 0, 1))
+    ticks = depth_ticks(camera)
+    axes.set_xticks([x for x, _ in ticks], [label for _, label in ticks])
+    quiet(axes, spines=False)
+
+
+def depth_ticks(camera: ThinLensCamera) -> list[tuple[float, str]]:
+    """Return places on the depth bar (0 far, 1 near) and their labels, far enough apart to be read."""
+    near, far = camera.depth_range
+    span = 1 / near - 1 / far
+    ticks: list[tuple[float, str]] = []
+    for depth in sorted({*TICK_DEPTHS, near, far}, key=lambda d: (d not in (near, far), -d)):
+        place = (1 / depth - 1 / far) / span
+        if -1e-9 <= place <= 1 + 1e-9 and all(abs(place - other) > 0.12 for other, _ in ticks):
+            ticks.append((place, metres(depth)))
+    return [(place, f"{label} m" if place == max(p for p, _ in ticks) else label) for place, label in ticks]
+
+
+def metres(depth: float) -> str:
+    """Return a depth in two digits, without its unit.
+
+    Example:
+        >>> metres(0.595), metres(math.inf)
+        ('0.59', '∞')
+    """
+    return "∞" if math.isinf(depth) else f"{depth:.2g}"

@@ -1,0 +1,44 @@
+"""How pictures look: inks, letters, colour maps, ticks. Drawn with matplotlib, imported only when a picture is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+INK, FAINT, ACCENT = "#1c2733", "#66727f", "#c2410c"
+DEPTH_COLORS, PHASE_COLORS = "inferno", "twilight"
+TITLE, LABEL, SMALL = 9.5, 7.5, 6.5  # pt
+RED, GREEN, BLUE = "#c0392b", "#2e8b57", "#2563eb"  # a camera's channels
+
+
+def require_matplotlib() -> None:
+    """Raise one clear sentence if matplotlib is missing.
+
+    Raises:
+        ImportError: if it is.
+    """
+    try:
+        import matplotlib.figure  # noqa: F401, PLC0415
+    except ImportError:
+        raise ImportError("pictures need matplotlib: pip install 'kornia-tidy[plot]'") from None
+
+
+def quiet(axes: Axes, spines: bool = True) -> None:
+    """Take the ticks away where nobody set any, and soften the rest."""
+    if axes.get_xlim() != (0, 1):
+        axes.set_xticks([])
+    axes.set_yticks([])
+    axes.tick_params(labelsize=SMALL, length=2, width=0.5, pad=1.5, color=FAINT, labelcolor=FAINT)
+    for spine in axes.spines.values():
+        spine.set_visible(spines)
+        spine.set(linewidth=0.5, color=FAINT)
+
+
+def open_chart(axes: Axes, label_size: float) -> None:
+    """Lay a faint grid behind a chart, open at the top and the right; ``label_size`` is that of its ticks, in pt."""
+    axes.grid(which="major", color="#e8ecef", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(which="both", labelsize=label_size, labelcolor=INK, color=FAINT)
+    axes.spines[["top", "right"]].set_visible(False)
