@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-STEPS = 5  # of conjugate gradients
+STEPS = 16  # of conjugate gradients
 REACH = 1  # pixels
 
 
