@@ -153,6 +153,22 @@ def resolve_psf(
     return ResolvedPSF(spectrum, band, psf, variance.clamp(min=0), leverage)
 
 
+def most_aliases(cutoff: float) -> int:
+    """Return how many frequencies that a lens passes fall together at most: so many images tell them apart.
+
+    Args:
+        cutoff: the highest that it passes, in cycles per sample.
+
+    Example:
+        >>> [most_aliases(cutoff) for cutoff in (0.5, 0.784, 2.08)]  # a lens well sampled, one not, behind a mosaic
+        [1, 4, 16]
+    """
+    reach = math.ceil(cutoff)
+    shifts = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    squares = (torch.linspace(0, 0.5, 33, dtype=torch.float64)[:, None] + shifts).square()
+    return int((squares[:, None, :, None] + squares[:, None] < cutoff**2).sum((2, 3)).max())
+
+
 def _with_weights(solved: Tensor, phases: Tensor, seen: Tensor, weights: Tensor) -> Tensor:
     """Go from the solution for white noise towards that for weights of each pixel, by conjugate gradients.
 

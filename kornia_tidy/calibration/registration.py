@@ -65,7 +65,9 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
                 break
         odd = _odd_one(stack, offsets, brightness, used, fit)
         if odd is None:
-            return Registered(stack.resolve(offsets, brightness, used, final=True), brightness, offsets, fit.misfit, used)
+            return Registered(
+                stack.resolve(offsets, brightness, used, final=True), brightness, offsets, fit.misfit, used
+            )
         used[odd] = False
 
 

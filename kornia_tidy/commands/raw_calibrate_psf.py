@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.commands.options import add_lens_options, make_lens
-from kornia_tidy.commands.raw_options import add_dump_options, open_raw
+from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, open_raw
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import SUFFIXES, read_image
 from kornia_tidy.files import check_file, replacing
@@ -140,8 +140,8 @@ def _check_arguments(args: argparse.Namespace) -> int:
     for path, suffix in ((args.output, ".safetensors"), (args.picture, ".png"), (args.fit_mask, ".npy")):
         if path is not None:
             check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
-            if not Path(path).absolute().parent.is_dir():
-                raise FileNotFoundError(f"cannot write {path}: there is no folder {Path(path).parent}")
+    inputs = [*args.files, *(args.reference or [])]
+    check_outputs([args.output, args.picture, args.fit_mask], inputs)
     if len(set(args.distances)) != len(args.distances) or not min(args.distances) > 0:
         raise ValueError(f"--distances must be different metres above zero, got {args.distances}")
     groups = len(args.distances) * len(args.exposures)
@@ -151,10 +151,8 @@ def _check_arguments(args: argparse.Namespace) -> int:
             f"exposures at each place"
         )
     places = len(args.files) // groups
-    inputs = {check_file(path).resolve() for path in [*args.files, *(args.reference or [])]}
-    for path in (args.output, args.picture, args.fit_mask):
-        if path is not None and Path(path).resolve() in inputs:
-            raise ValueError(f"cannot write {path}: it is an input")
+    for path in inputs:
+        check_file(path)
     if args.fit_mask is not None:
         check_positive("--mask-size", args.mask_size)
         if len(args.distances) < 2:
