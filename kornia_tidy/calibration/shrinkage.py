@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -15,8 +17,9 @@ def shrink(psf: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     .. math:: \hat{h}_n = \hat{h}_{n+1} + g \, (m_n - \hat{h}_{n+1}), \qquad g = \frac{s^2}{s^2 + \bar{v}_n}
 
     with :math:`m_n` the means of ever smaller neighbourhoods down to the pixel itself, :math:`v_n` the variance of
-    their noise, and :math:`s^2` the mean square of what they differ by, less that of the noise, or zero. Bright structure
-    keeps its noise, for its g is near one; empty parts get the mean of a wide neighbourhood, so that no light is lost.
+    their noise, and :math:`s^2` the mean square of what they differ by, less that of the noise, or zero. Bright
+    structure keeps its noise, for its g is near one; empty parts get the mean of a wide neighbourhood, so that no light
+    is lost.
 
     Args:
         psf: h, (C, M, M).
@@ -34,7 +37,7 @@ def shrink(psf: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
         (True, True)
     """
     mean, error = _local_mean(psf, SCALES[0]), _local_mean(variance, SCALES[0]) / SCALES[0] ** 2
-    for wide, side in zip(SCALES, SCALES[1:], strict=False):
+    for wide, side in pairwise(SCALES):
         finer, noise = _local_mean(psf, side), _local_mean(variance, side) / side**2
         usual = _local_mean(noise, wide)
         signal = (_local_mean((finer - mean).square(), wide) - usual).clamp(min=0)

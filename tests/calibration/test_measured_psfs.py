@@ -164,7 +164,7 @@ class TestMeasurePSFs(BaseTester):
 
     @pytest.mark.slow
     def test_feature_a_sharp_point_behind_a_mosaic_does_not_diverge(self):
-        """Where places follow weights that the PSFs do not, brightness runs away and the PSFs are of the wrong light."""
+        """Where places follow weights that the PSFs do not, brightness runs away, and PSFs are wrong by their light."""
         sharp = point_light(PixelwiseMask(1, initial="flat"), 0.0, SIDE, SPECTRUM, CAMERA)
         images = of_a_mosaic(sharp, sharp, ((0, 1), (1, 2)), 16, torch.tensor([1.0, 8.0, 64.0]))
         psfs = measure_psfs({0.595: images}, CAMERA, WINDOW, CUTOFF).bank.psfs
