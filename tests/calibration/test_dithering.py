@@ -66,7 +66,7 @@ class TestResolvePSF(BaseTester):
         assert float(ratio.max()) < 1.6
 
     def test_feature_weights_of_each_pixel_keep_the_noise_of_a_bright_core_out_of_the_dark(self):
-        """Over repeated measurements: half the noise at 3 pixels from the core, and as much as is said."""
+        """Over repeated measurements: half the noise at 4 pixels from the core, and as much as is said."""
         offsets, generator = places(8), torch.Generator().manual_seed(1)
         images = airy_like(offsets, 0.8)
         variance = 1e-8 + 1e-4 * images * (images > 0.1)
@@ -76,7 +76,7 @@ class TestResolvePSF(BaseTester):
             for each_pixel, found in draws.items():
                 found.append(resolve_psf(images + noise, offsets, variance, cutoff=1.0, each_pixel=each_pixel))
         steps = torch.arange(SIDE) - SIDE // 2
-        ring = torch.maximum(steps.abs()[:, None], steps.abs()) == 3
+        ring = torch.maximum(steps.abs()[:, None], steps.abs()) == 4
         weighted, white = (torch.stack([one.psf for one in draws[kind]]).var(0)[ring].mean().sqrt() for kind in draws)
         said = torch.stack([one.variance for one in draws[True]]).mean(0)[ring].mean().sqrt()
         assert float(weighted) < 0.5 * float(white)
