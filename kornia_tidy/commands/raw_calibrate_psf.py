@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +48,9 @@ examples:
 What is printed tells how far to trust the bank: "noise" is the error to be expected,
 the sum of its moduli over the PSF's light; "residuals" of about 1 say that the
 pictures of one distance fit each other, far larger ones that something moved or
-that --full-well, --read-noise or the black level are wrong. Without --reference the
+that --full-well, --read-noise or the black level are wrong. Most of the error of a
+sharp PSF is noise of the dark about it, which exposures four times as long, so that
+the background is nearly saturated, take back as well as twice the places. Without --reference the
 PSF's centre of light is its centre, and what masks do to move it is not seen.
 
 In Python:
@@ -56,6 +59,9 @@ In Python:
   sharp = Tikhonov()(capture, bank)  # of linear light
   MeasuredPSFs.load("bank.safetensors").uncertainty  # and .distances, .reports of every picture
 """
+
+
+GOOD_NOISE = 0.02  # in L1
 
 
 def add_parser(subparsers: Any) -> None:
@@ -112,6 +118,10 @@ def run(args: argparse.Namespace) -> None:
         words = " ".join(f"{100 * float(x):.2g}" for x in own)
         where = f"{float(distance):g} m, psi {float(psi):+.2f} rad"
         tell("PSF", f"{where}: {len(used)} point images, residuals {times:.2g} times the noise, noise {words} % in L1")
+        worst = float(own.max())
+        if worst > GOOD_NOISE:
+            more = math.ceil(len(used) * (worst / GOOD_NOISE) ** 2)
+            tell("", f"about {more} point images, or one more and far longer exposure, bring it to {GOOD_NOISE:.0%}")
     measured.save(args.output)
     tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     fit = None

@@ -59,7 +59,7 @@ class TestCalibratePSF(BaseTester):
         assert main(["raw", "calibrate-psf", *grey, *NOISE, *more]) == 0
         told = capsys.readouterr()
         assert told.err == ""
-        for word in ("6 point images", "residuals", "% in L1", "bank.safetensors", "bank.png"):
+        for word in ("6 point images", "residuals", "% in L1", "bring it to 2%", "bank.safetensors", "bank.png"):
             assert word in told.out
         measured = MeasuredPSFs.load("bank.safetensors")
         assert measured.distances.tolist() == [0.8, 0.5]
