@@ -15,6 +15,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+STEPS = 16  # of conjugate gradients
+REACH = 1  # pixels
+
 
 @dataclass(frozen=True, eq=False)
 class ResolvedPSF:
@@ -57,7 +60,12 @@ class ResolvedPSF:
 
 
 def resolve_psf(
-    patches: Tensor, offsets: Tensor, variances: Tensor, cutoff: float = 1.0, finer: int = 1
+    patches: Tensor,
+    offsets: Tensor,
+    variances: Tensor,
+    cutoff: float = 1.0,
+    finer: int = 1,
+    each_pixel: bool = False,
 ) -> ResolvedPSF:
     r"""Return the PSF that explains point images at several places: least squares for all aliases of each frequency.
 
@@ -66,6 +74,9 @@ def resolve_psf(
     Few images, or images alike in place, do not fix all aliases. Those are then shared out as a lens shares its light
     between frequencies, in proportion to a prior :math:`(1 - |f| / f_c)^2` of the image's own power.
 
+    Frequencies that are solved one by one take noise for white, and the shot noise of a bright core then spreads over
+    the dark about it. Weights of each pixel keep it where it is, for which there is no solution but step by step.
+
     Args:
         patches: (N, M, M) point images, background taken off, alike in brightness.
         offsets: :math:`\delta`, (N, 2) where the chief ray falls, rows and columns in samples from the centre of the
@@ -73,12 +84,15 @@ def resolve_psf(
         variances: (N, M, M).
         cutoff: :math:`f_c`, highest frequency that the lens passes, in cycles per sample.
         finer: samples of the PSF to one of the images along each axis, as a mosaic's planes have every second pixel.
+        each_pixel: whether each pixel has a weight of its own, by its variance, and not each image by its mean one.
 
     Returns:
         The PSF with its variance, propagated through the linear system.
 
     Convention:
         Patches repeat at their borders: light there must have faded, or a margin be cut off afterwards.
+
+    Source: Hestenes and Stiefel, Journal of Research of the National Bureau of Standards 49, 409 (1952), for the steps.
 
     Example:
         >>> x = torch.arange(16.0) - 8
@@ -93,7 +107,7 @@ def resolve_psf(
     band = max(1, math.ceil(cutoff))
     aliases = 2 * band
     length = aliases * side
-    patches, variances, offsets = patches.double(), variances.double(), offsets.double()
+    patches, variances, offsets = patches.double(), variances.double().clamp(min=1e-30), offsets.double()
     frequency = _frequencies(length, band, patches.device)
     spectra = torch.fft.fft2(torch.fft.ifftshift(patches, dim=(-2, -1)))
     noise = variances.mean((1, 2))  # of one pixel, alike at all frequencies
@@ -107,33 +121,90 @@ def resolve_psf(
         torch.exp(-2j * math.pi * frequency * offset[:, None]).unflatten(1, (aliases, side))
         for offset in offsets.unbind(1)
     )
-    noise_scale = noise.clamp(min=1e-30).rsqrt() / side
+    noise_scale = noise.rsqrt() / side
     own = prior.sqrt().unflatten(1, (aliases, side)).unflatten(0, (aliases, side)).permute(1, 3, 0, 2).flatten(2)
     phases = torch.einsum("nay,nbx->yxnab", rows, columns).flatten(3) * own[:, :, None] * noise_scale[:, None]
     system = phases.mH @ phases + torch.eye(aliases**2).to(phases)
     gains = torch.linalg.solve(system, phases.mH)
     leverage = float((phases * gains.mT).sum(-1).real.mean())
+    seen = spectra.permute(1, 2, 0) * noise_scale
+    solved = (gains @ seen[..., None])[..., 0]
+    if each_pixel:
+        weights = torch.fft.ifftshift(noise[:, None, None] / variances, dim=(-2, -1)).permute(1, 2, 0)
+        solved = _with_weights(solved, phases, seen, weights)
     gains = own[..., None] * gains * noise_scale  # (side, side, aliases^2, N)
-
-    solved = (gains @ spectra.permute(1, 2, 0)[..., None])[..., 0]
+    solved = own * solved
     spectrum = solved.unflatten(2, (aliases, aliases)).permute(2, 0, 3, 1).reshape(length, length)
     psf, variance = (torch.empty(finer * side, finer * side, dtype=torch.float64).to(patches) for _ in range(2))
     spectral_variances = torch.fft.fft2(variances)
     for down in range(finer):
         for right in range(finer):
-            own = (
-                torch.exp(2j * math.pi * frequency * down / finer),
-                torch.exp(2j * math.pi * frequency * right / finer),
-            )
-            between = _folded(spectrum * own[0][:, None] * own[1], side)
-            ramps = torch.einsum("ay,bx->yxab", *(ramp.unflatten(0, (aliases, side)) for ramp in own)).flatten(2)
+            moves = [torch.exp(2j * math.pi * frequency * part / finer) for part in (down, right)]
+            between = _folded(spectrum * moves[0][:, None] * moves[1], side)
+            ramps = torch.einsum("ay,bx->yxab", *(move.unflatten(0, (aliases, side)) for move in moves)).flatten(2)
             # What an image adds to the PSF, and how its noise spreads.
             filters = torch.fft.ifft2((gains * ramps[..., None]).sum(2), dim=(0, 1)).real.permute(2, 0, 1)
+            if each_pixel:
+                filters = filters * _near(side, filters)
             spread = torch.fft.fft2(filters.square()) * spectral_variances
             place = slice(down, None, finer), slice(right, None, finer)
             psf[place] = _centred(torch.fft.ifft2(between).real)
             variance[place] = torch.fft.ifft2(spread.sum(0)).real
     return ResolvedPSF(spectrum, band, psf, variance.clamp(min=0), leverage)
+
+
+def most_aliases(cutoff: float) -> int:
+    """Return how many frequencies that a lens passes fall together at most: so many images tell them apart.
+
+    Args:
+        cutoff: the highest that it passes, in cycles per sample.
+
+    Example:
+        >>> [most_aliases(cutoff) for cutoff in (0.5, 0.784, 2.08)]  # a lens well sampled, one not, behind a mosaic
+        [1, 4, 16]
+    """
+    reach = math.ceil(cutoff)
+    shifts = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    squares = (torch.linspace(0, 0.5, 33, dtype=torch.float64)[:, None] + shifts).square()
+    return int((squares[:, None, :, None] + squares[:, None] < cutoff**2).sum((2, 3)).max())
+
+
+def _with_weights(solved: Tensor, phases: Tensor, seen: Tensor, weights: Tensor) -> Tensor:
+    """Go from the solution for white noise towards that for weights of each pixel, by conjugate gradients.
+
+    Few steps do: dark pixels, which are most, are served in the first, and what a bright core says of itself it has
+    said in the solution for white noise.
+
+    Args:
+        solved: (M, M, aliases^2) aliases of each frequency in units of their prior.
+        phases: (M, M, N, aliases^2) what the images' spectra are of them, in units of the images' mean noise.
+        seen: (M, M, N) the images' spectra in these units.
+        weights: (M, M, N) of each pixel, about one; the chief ray's pixel is the first.
+    """
+
+    def back(spectra: Tensor) -> Tensor:
+        weighted = torch.fft.fft2(weights * torch.fft.ifft2(spectra, dim=(0, 1)), dim=(0, 1))
+        return (phases.mH @ weighted[..., None])[..., 0]
+
+    level = weights.mean((0, 1))[:, None]
+    factor = torch.linalg.cholesky(phases.mH @ (level * phases) + torch.eye(phases.shape[-1]).to(phases))
+    rest = back(seen - (phases @ solved[..., None])[..., 0]) - solved
+    step, before = torch.zeros_like(rest), 1.0
+    for _ in range(STEPS):
+        towards = torch.cholesky_solve(rest[..., None], factor)[..., 0]
+        now = float((rest.conj() * towards).real.sum())
+        step, before = towards + now / before * step, now
+        change = back((phases @ step[..., None])[..., 0]) + step
+        length = now / max(float((step.conj() * change).real.sum()), 1e-300)
+        solved, rest = solved + length * step, rest - length * change
+    return solved
+
+
+def _near(side: int, like: Tensor) -> Tensor:
+    """One for the pixels next to the first of a periodic image, from where weights let noise come, zero elsewhere."""
+    distance = torch.fft.fftfreq(side, 1 / side).abs()
+    near = (distance <= REACH).to(like)
+    return near[:, None] * near
 
 
 def _frequencies(length: int, band: int, device: torch.device) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
@@ -11,6 +12,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from kornia_tidy.calibration.dithering import most_aliases
 from kornia_tidy.calibration.point_images import PointImage
 from kornia_tidy.calibration.registration import Registered, register
 from kornia_tidy.calibration.shrinkage import shrink
@@ -133,18 +135,23 @@ def measure_psfs(
         ValueError: if at some distance no image can be used, the PSFs found leave residuals of five times the noise
             and more, or the cutoffs are not one a channel.
 
+    Warns:
+        UserWarning: if there are fewer images than frequencies that they are to tell apart, before any work.
+
     Example:
         >>> from kornia_tidy import SensorNoise
         >>> from kornia_tidy.calibration import point_images
         >>> x, camera = torch.arange(64.0), ThinLensCamera()
         >>> spot = lambda at: 0.8 * torch.exp(-((x[:, None] - 32) ** 2 + (x - at) ** 2) / 8)[None, None]
         >>> sensor = SensorNoise.physical(10500, 2.4)
-        >>> points = [point_images(spot(at), torch.ones(1), sensor, 15)[0] for at in (31.8, 32.0, 32.2)]
+        >>> points = [point_images(spot(at), torch.ones(1), sensor, 15)[0] for at in (31.7, 31.9, 32.1, 32.3)]
         >>> measured = measure_psfs({0.595: points}, camera, 15, diffraction_cutoff(camera, 530e-9))
         >>> measured.bank.psfs.shape, round(float(measured.bank.psfs.sum()), 4)
         (torch.Size([1, 1, 15, 15]), 1.0)
     """
     check_depth(torch.tensor(list(images)))
+    limits = _limits(images, cutoff)
+    _warn_of_few(images, limits)
     nodes = sorted((float(camera.defocus(torch.tensor(z, dtype=torch.float64))), z) for z in images)
     psfs, deviations, reports = [], [], []
     for _, distance in nodes:
@@ -158,10 +165,6 @@ def measure_psfs(
         if not good:
             faults = "; ".join(str(image.fault) for image in own) or "there is none"
             raise ValueError(f"no point image at {distance:g} m can be used: {faults}")
-        channels = 1 + max(good[0].channels)
-        limits = [cutoff] * channels if isinstance(cutoff, (int, float)) else list(cutoff)
-        if len(limits) != channels:
-            raise ValueError(f"cutoff must be one number, or one for each of {channels} channels, got {limits}")
         found = register(good, limits)
         misfit = float(found.misfit[found.used].mean())
         if not misfit <= MOST_MISFIT:
@@ -182,6 +185,33 @@ def measure_psfs(
     bank = PSFBank.from_measured(torch.stack(psfs).float(), defocus)
     distances = torch.tensor([distance for _, distance in nodes], dtype=torch.float64)
     return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports))
+
+
+def _limits(images: Mapping[float, Sequence[PointImage]], cutoff: float | Sequence[float]) -> list[float]:
+    """The cutoff of each channel."""
+    channels = 1 + max((channel for own in images.values() for image in own for channel in image.channels), default=0)
+    limits = [cutoff] * channels if isinstance(cutoff, (int, float)) else list(cutoff)
+    if len(limits) != channels:
+        raise ValueError(f"cutoff must be one number, or one for each of {channels} channels, got {limits}")
+    return limits
+
+
+def _warn_of_few(images: Mapping[float, Sequence[PointImage]], limits: Sequence[float]) -> None:
+    """Tell once, of the distance and the channel that lack most, that the prior must make up for missing places."""
+    lacking = []
+    for distance, own in images.items():
+        good = [image for image in own if image.fault is None]
+        for channel, limit in enumerate(limits if good else ()):
+            planes = good[0].channels.count(channel)  # each sees the point at a place of its own
+            wanted = -(-most_aliases(limit * _finer(good[0])) // planes)
+            lacking.append((wanted - len(good), wanted, len(good), distance, channel))
+    if lacking and max(lacking)[0] > 0:
+        _, wanted, there, distance, channel = max(lacking)
+        warnings.warn(
+            f"{there} places of the point at {distance:g} m are too few to resolve channel {channel}, whose PSF is in "
+            f"part a guess, which its noise does not tell: {wanted} are needed, half as many again are good",
+            stacklevel=3,
+        )
 
 
 def _finer(image: PointImage) -> int:

@@ -65,7 +65,9 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
                 break
         odd = _odd_one(stack, offsets, brightness, used, fit)
         if odd is None:
-            return Registered(stack.resolve(offsets, brightness, used), brightness, offsets, fit.misfit, used)
+            return Registered(
+                stack.resolve(offsets, brightness, used, final=True), brightness, offsets, fit.misfit, used
+            )
         used[odd] = False
 
 
@@ -86,8 +88,8 @@ class _Stack:
         tile = images[0].tile
         return cls(light, variance, images[0].phases, images[0].channels, cutoff, 1 if tile is None else len(tile))
 
-    def resolve(self, offsets: Tensor, brightness: Tensor, used: Tensor, finer: int | None = None) -> list[ResolvedPSF]:
-        """PSFs of each channel for images of these places and brightness."""
+    def resolve(self, offsets: Tensor, brightness: Tensor, used: Tensor, final: bool = False) -> list[ResolvedPSF]:
+        """PSFs of each channel for images of these places and brightness, in the end with all that can be known."""
         scale = brightness[used].view(-1, 1, 1, 1)
         light, variance = self.light[used] / scale, self.variance[used] / scale**2
         places = offsets[used, None] - self.phases  # (N, C, 2)
@@ -95,7 +97,7 @@ class _Stack:
         for channel, limit in enumerate(self.cutoff):
             own = [plane for plane, seen in enumerate(self.channels) if seen == channel]
             parts = (x[:, own].flatten(0, 1) for x in (light, places, variance))
-            psfs.append(resolve_psf(*parts, limit * self.finer, self.finer if finer is None else finer))
+            psfs.append(resolve_psf(*parts, limit * self.finer, self.finer if final else 1, each_pixel=final))
         return psfs
 
 
@@ -109,7 +111,7 @@ class _Fit:
 
 def _fit(stack: _Stack, offsets: Tensor, brightness: Tensor, used: Tensor) -> _Fit:
     """Return what the residuals of PSFs for these places and brightness say of each image."""
-    psfs = stack.resolve(offsets, brightness, used, finer=1)
+    psfs = stack.resolve(offsets, brightness, used)
     scale = brightness.view(-1, 1, 1, 1)
     count = len(stack.channels)
     normal, right = torch.zeros(len(offsets), 3, 3).double(), torch.zeros(len(offsets), 3).double()

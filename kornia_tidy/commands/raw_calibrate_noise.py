@@ -7,7 +7,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kornia_tidy.commands.raw_options import add_dump_options, open_raw
+from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, open_raw
 from kornia_tidy.commands.report import Stages, tell
 
 if TYPE_CHECKING:
@@ -132,12 +132,4 @@ def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:
 
         require_matplotlib()
         check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))
-    for path in (output, plot):
-        if path is None:
-            continue
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
-        if path.is_dir():
-            raise ValueError(f"cannot write {path}: it is a folder")
-        if any(path.exists() and Path(other).exists() and path.samefile(other) for other in inputs):
-            raise ValueError(f"cannot write {path}: it is an input")
+    check_outputs([output, plot], inputs)

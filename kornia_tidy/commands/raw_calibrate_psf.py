@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.commands.options import add_lens_options, make_lens
-from kornia_tidy.commands.raw_options import add_dump_options, open_raw
+from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, open_raw
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import SUFFIXES, read_image
 from kornia_tidy.files import check_file, replacing
@@ -47,7 +48,9 @@ examples:
 What is printed tells how far to trust the bank: "noise" is the error to be expected,
 the sum of its moduli over the PSF's light; "residuals" of about 1 say that the
 pictures of one distance fit each other, far larger ones that something moved or
-that --full-well, --read-noise or the black level are wrong. Without --reference the
+that --full-well, --read-noise or the black level are wrong. Most of the error of a
+sharp PSF is noise of the dark about it, which exposures four times as long, so that
+the background is nearly saturated, take back as well as twice the places. Without --reference the
 PSF's centre of light is its centre, and what masks do to move it is not seen.
 
 In Python:
@@ -56,6 +59,9 @@ In Python:
   sharp = Tikhonov()(capture, bank)  # of linear light
   MeasuredPSFs.load("bank.safetensors").uncertainty  # and .distances, .reports of every picture
 """
+
+
+GOOD_NOISE = 0.02  # in L1
 
 
 def add_parser(subparsers: Any) -> None:
@@ -112,6 +118,10 @@ def run(args: argparse.Namespace) -> None:
         words = " ".join(f"{100 * float(x):.2g}" for x in own)
         where = f"{float(distance):g} m, psi {float(psi):+.2f} rad"
         tell("PSF", f"{where}: {len(used)} point images, residuals {times:.2g} times the noise, noise {words} % in L1")
+        worst = float(own.max())
+        if worst > GOOD_NOISE:
+            more = math.ceil(len(used) * (worst / GOOD_NOISE) ** 2)
+            tell("", f"about {more} point images, or one more and far longer exposure, bring it to {GOOD_NOISE:.0%}")
     measured.save(args.output)
     tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     fit = None
@@ -140,8 +150,8 @@ def _check_arguments(args: argparse.Namespace) -> int:
     for path, suffix in ((args.output, ".safetensors"), (args.picture, ".png"), (args.fit_mask, ".npy")):
         if path is not None:
             check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
-            if not Path(path).absolute().parent.is_dir():
-                raise FileNotFoundError(f"cannot write {path}: there is no folder {Path(path).parent}")
+    inputs = [*args.files, *(args.reference or [])]
+    check_outputs([args.output, args.picture, args.fit_mask], inputs)
     if len(set(args.distances)) != len(args.distances) or not min(args.distances) > 0:
         raise ValueError(f"--distances must be different metres above zero, got {args.distances}")
     groups = len(args.distances) * len(args.exposures)
@@ -151,10 +161,8 @@ def _check_arguments(args: argparse.Namespace) -> int:
             f"exposures at each place"
         )
     places = len(args.files) // groups
-    inputs = {check_file(path).resolve() for path in [*args.files, *(args.reference or [])]}
-    for path in (args.output, args.picture, args.fit_mask):
-        if path is not None and Path(path).resolve() in inputs:
-            raise ValueError(f"cannot write {path}: it is an input")
+    for path in inputs:
+        check_file(path)
     if args.fit_mask is not None:
         check_positive("--mask-size", args.mask_size)
         if len(args.distances) < 2:

@@ -6,10 +6,11 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from kornia_tidy.sensor.raw_file import RawCapture
 
-DUMP_OPTIONS = ("pattern", "black", "white", "dtype", "byte_order")
+DUMP_OPTIONS = ("size", "pattern", "black", "white", "dtype", "byte_order")
 
 
 def add_dump_options(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +41,7 @@ def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
         ValueError: if it cannot be read, or the options do not describe a dump.
     """
     if args.size is None:
-        for name in DUMP_OPTIONS:
+        for name in DUMP_OPTIONS[1:]:
             if getattr(args, name) is not None:
                 raise ValueError(f"--{name.replace('_', '-')} is for bare dumps of counts: give --size too")
         return RawCapture.open(path)
@@ -56,6 +57,23 @@ def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
         args.dtype or "uint16",
         args.byte_order or "little",
     )
+
+
+def check_outputs(outputs: Sequence[str | Path | None], inputs: Sequence[str | Path | None]) -> None:
+    """Refuse before any work what could not be written, or would replace an input; None is no file.
+
+    Raises:
+        FileNotFoundError: if a folder does not exist.
+        ValueError: if an output is a folder or an input.
+    """
+    there = [Path(other) for other in inputs if other is not None and Path(other).exists()]
+    for path in (Path(output) for output in outputs if output is not None):
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+        if path.is_dir():
+            raise ValueError(f"cannot write {path}: it is a folder")
+        if path.exists() and any(path.samefile(other) for other in there):
+            raise ValueError(f"cannot write {path}: it is an input")
 
 
 def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:

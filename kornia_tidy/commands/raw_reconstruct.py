@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from kornia_tidy.commands.raw_develop import SUFFIXES, output_paths
-from kornia_tidy.commands.raw_options import add_dump_options, open_raw
+from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, open_raw
 from kornia_tidy.commands.report import tell
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> None:
         "weights": hashlib.sha256(read_bytes(weights)).hexdigest(),
         "depth_unit": args.depth_unit,
         "linear": args.linear,
-        "dump": {name: getattr(args, name) for name in ("size", "pattern", "black", "white", "dtype", "byte_order")},
+        "dump": {name: getattr(args, name) for name in DUMP_OPTIONS},
     }
     folder.mkdir(parents=True, exist_ok=True)
     if args.resume:

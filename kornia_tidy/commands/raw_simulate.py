@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kornia_tidy.commands.options import add_camera_options, add_depth_options, make_camera, read_scene, seed
+from kornia_tidy.commands.raw_options import check_outputs
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.scene.compositing import COMPOSITING
@@ -177,8 +178,4 @@ def _channels_for(camera: RawCapture, image: Any) -> Any:
 def _check_output(output: Path, args: argparse.Namespace) -> None:
     if output.suffix.lower() != ".dng":
         raise ValueError(f"the output must be a .dng file, got {output}")
-    if not output.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {output}: there is no folder {output.parent}")
-    inputs = [Path(other) for other in (args.image, args.depth, args.like, args.noise) if other]
-    if output.exists() and any(other.exists() and output.samefile(other) for other in inputs):
-        raise ValueError(f"cannot write {output}: it is an input")
+    check_outputs([output], [args.image, args.depth, args.like, args.noise])

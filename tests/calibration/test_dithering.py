@@ -65,6 +65,23 @@ class TestResolvePSF(BaseTester):
         assert float(ratio.min()) > 0.6
         assert float(ratio.max()) < 1.6
 
+    def test_feature_weights_of_each_pixel_keep_the_noise_of_a_bright_core_out_of_the_dark(self):
+        """Over repeated measurements: half the noise at 4 pixels from the core, and as much as is said."""
+        offsets, generator = places(8), torch.Generator().manual_seed(1)
+        images = airy_like(offsets, 0.8)
+        variance = 1e-8 + 1e-4 * images * (images > 0.1)
+        draws = {True: [], False: []}
+        for _ in range(40):
+            noise = variance.sqrt() * torch.randn(images.shape, generator=generator, dtype=torch.float64)
+            for each_pixel, found in draws.items():
+                found.append(resolve_psf(images + noise, offsets, variance, cutoff=1.0, each_pixel=each_pixel))
+        steps = torch.arange(SIDE) - SIDE // 2
+        ring = torch.maximum(steps.abs()[:, None], steps.abs()) == 4
+        weighted, white = (torch.stack([one.psf for one in draws[kind]]).var(0)[ring].mean().sqrt() for kind in draws)
+        said = torch.stack([one.variance for one in draws[True]]).mean(0)[ring].mean().sqrt()
+        assert float(weighted) < 0.5 * float(white)
+        assert 0.67 < float(weighted / said) < 1.5
+
     @given(st.integers(0, SIDE - 1), st.integers(0, SIDE - 1))
     @settings(max_examples=10, deadline=None)
     def test_feature_whole_pixels_only_move_it(self, down, right):

@@ -8,6 +8,7 @@ from safetensors.torch import load_file, save_file
 
 from kornia_tidy import PixelwiseMask, PSFBank, SensorNoise, Spectrum, ThinLensCamera, TiDyOptics
 from kornia_tidy.calibration import MeasuredPSFs, diffraction_cutoff, measure_psfs, point_images
+from kornia_tidy.calibration.point_images import PointImage
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.optics.initial_masks import fisher_mask
 from kornia_tidy.reconstruction.metrics import psnr
@@ -65,16 +66,16 @@ def captured(coded, flat, count, seed=0, spoil=None):
     return images
 
 
-def of_a_mosaic(coded, flat, tile, count):
+def of_a_mosaic(coded, flat, tile, count, exposures=EXPOSURES):
     """Point images behind a filter array, at places that differ by ninths of a pixel of a plane."""
     generator = torch.Generator().manual_seed(0)
     images = []
     for _ in range(count):
         ninths = tuple(torch.randint(-9, 10, (2,), generator=generator).tolist())
         light, clear = (planes(on_pixels(fine, ninths), tile) for fine in (coded, flat))
-        frames = exposed(0.5 * light / light.max(), EXPOSURES, generator, 10500, 2.4, 0.003)
+        frames = exposed(0.5 * light / light.max(), exposures, generator, 10500, 2.4, 0.003)
         clear = exposed(0.8 * clear / clear.max(), torch.ones(1), generator, 10500, 2.4, 0.003)[0]
-        images += point_images(frames, EXPOSURES, SENSOR, WINDOW, reference=clear, tile=tile)
+        images += point_images(frames, exposures, SENSOR, WINDOW, reference=clear, tile=tile)
     return images
 
 
@@ -143,10 +144,11 @@ class TestMeasurePSFs(BaseTester):
     def test_feature_the_unit_of_exposure_does_not_matter(self, scale, coded):
         light = on_pixels(coded[0.8], (3, 1))
         frames = exposed(0.5 * light / light.max(), EXPOSURES, torch.Generator().manual_seed(0), 10500, 2.4, 0.003)
-        banks = [
-            measure_psfs({0.8: point_images(frames, times, SENSOR, WINDOW)}, CAMERA, WINDOW, CUTOFF).bank.psfs
-            for times in (EXPOSURES, scale * EXPOSURES)
-        ]
+        with pytest.warns(UserWarning, match="too few"):
+            banks = [
+                measure_psfs({0.8: point_images(frames, times, SENSOR, WINDOW)}, CAMERA, WINDOW, CUTOFF).bank.psfs
+                for times in (EXPOSURES, scale * EXPOSURES)
+            ]
         self.assert_close(*banks, atol=1e-7)
 
     @pytest.mark.slow
@@ -160,10 +162,36 @@ class TestMeasurePSFs(BaseTester):
         middle = [(report.row, report.column) for report in found.reports]
         self.assert_close(torch.tensor(middle).mean(0), torch.full((2,), SIDE // 2 * 1.0), rtol=0, atol=0.3)
 
+    @pytest.mark.slow
+    def test_feature_a_sharp_point_behind_a_mosaic_does_not_diverge(self):
+        """Where places follow weights that the PSFs do not, brightness runs away, and PSFs are wrong by their light."""
+        sharp = point_light(PixelwiseMask(1, initial="flat"), 0.0, SIDE, SPECTRUM, CAMERA)
+        images = of_a_mosaic(sharp, sharp, ((0, 1), (1, 2)), 16, torch.tensor([1.0, 8.0, 64.0]))
+        psfs = measure_psfs({0.595: images}, CAMERA, WINDOW, CUTOFF).bank.psfs
+        truth = on_pixels(sharp)[:, INSIDE, INSIDE]
+        error = (psfs - truth / truth.sum((1, 2), keepdim=True)).abs().sum((2, 3))
+        assert float(error.max()) < 0.06
+
+    @pytest.mark.parametrize(("tile", "enough", "channel"), [(None, 4, 2), (((0, 1), (1, 2)), 12, 2)])
+    def test_feature_too_few_places_are_told_before_any_work(self, tile, enough, channel, monkeypatch):
+        """Disks of the cutoffs hold at most 4 points of the pixels' grid of frequencies, of a plane's grid 12."""
+        planes_ = 3 if tile is None else 4
+        light = torch.ones(planes_, 31, 31, dtype=torch.float64)
+        images = [PointImage((40.0, 40.0), light, light, tile)] * enough
+        monkeypatch.setattr("kornia_tidy.calibration.measured_psfs.register", lambda *_: pytest.fail("at work"))
+        words = rf"^{enough - 1} places of the point at 0.7 m .* resolve channel {channel}, .* {enough} are needed"
+        with pytest.raises(UserWarning, match=words):
+            measure_psfs({0.7: images[1:], 0.8: images}, CAMERA, WINDOW, CUTOFF)
+        with pytest.raises(pytest.fail.Exception, match="at work"):
+            measure_psfs({0.7: images}, CAMERA, WINDOW, CUTOFF)
+
     def test_exception_psfs_that_do_not_explain_their_captures(self, images):
         """Images of two distances given as of one: too few to say which is the odd one."""
         mixed = images[0.5][:2] + images[0.8][:1]
-        with pytest.raises(ValueError, match=r"found at 0\.5 m do not explain their captures: .* times the noise"):
+        with (
+            pytest.warns(UserWarning, match="too few"),
+            pytest.raises(ValueError, match=r"found at 0\.5 m do not explain their captures: .* times the noise"),
+        ):
             measure_psfs({0.5: mixed}, CAMERA, WINDOW, CUTOFF)
 
 
