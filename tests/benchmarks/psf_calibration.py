@@ -114,7 +114,11 @@ def main() -> None:
             whole, truth = (psf / psf.sum((1, 2), keepdim=True) for psf in (whole, truth))
             for filters in args.tiles:
                 for words in args.sensors:
-                    found = calibrate(distance, coded, flat, SENSORS[words], TILES[filters], args.places)
+                    try:
+                        found = calibrate(distance, coded, flat, SENSORS[words], TILES[filters], args.places)
+                    except ValueError as refusal:
+                        print(f"| {name} | {filters} | {words} | {distance:g} | refused: {refusal} |", flush=True)
+                        continue
                     psf = found.bank.psfs[0]
                     error = float((psf - truth).abs().sum((1, 2)).max())
                     said = 0.798 * float(found.uncertainty[0].sum((1, 2)).max())
