@@ -22,7 +22,10 @@ from torch import Tensor
 from kornia_tidy.scene.convolution import next_fast_size
 
 # Sides of transforms whose samples take the least time.
-SIZES = (8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 256, 288, 384, 512, 576, 768, 1024, 1536, 2048)
+SIZES = (
+    *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
+    *(512, 576, 768, 1024, 1536, 2048),
+)
 # Bytes that the planes of a chunk may take: near a processor's cache (and below what makes an allocator give memory
 # back and fetch it again), or enough to keep an accelerator busy.
 CHUNK_BYTES = {"cpu": 6 << 20}
@@ -209,7 +212,7 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     batch, height, width = labels.first.shape
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
     whole = psf_size - 1 + max(height, math.ceil(width / 2))
-    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
+    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:12] or [next_fast_size(smallest)]
     grids = [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
     if len(grids) == 1:
         return grids[0]
