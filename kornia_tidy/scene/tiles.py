@@ -212,7 +212,7 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     batch, height, width = labels.first.shape
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
     whole = psf_size - 1 + max(height, math.ceil(width / 2))
-    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:12] or [next_fast_size(smallest)]
+    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
     grids = [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
     if len(grids) == 1:
         return grids[0]
