@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics.propagation import gauss_legendre_order
+from kornia_tidy.optics.propagation import energy_operations, gauss_legendre_order
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.scene.layers import assign_layers
@@ -62,20 +62,18 @@ class BankGeometry:
 def bank_operations(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> float:
     r"""Return the operations of an exact PSF bank.
 
-    .. math:: D K \sum_\lambda (8 U N^2 + 8 U^2 N + 4 U^2), \qquad U = q_\lambda P
-
-    for D layers, K states, N cells of the pupil and q points a pixel along each side of a window P: two complex matrix
-    products and the mean intensity.
+    For each layer and wavelength as many as :func:`~kornia_tidy.optics.propagation.energy_operations` says, of its two
+    ways the one with fewer.
 
     Example:
         >>> geometry = BankGeometry(5, Pupil(torch.ones(23, 23), 0.1), (530e-9,), 2e-7)
         >>> f"{bank_operations(geometry, Fidelity(window=65), 21):.1e}"
-        '8.4e+08'
+        '3.2e+08'
     """
-    cells = geometry.pupil.amplitude.shape[-1]
-    sides = geometry.samples(fidelity)
-    each = sum(8 * side * cells**2 + 8 * side**2 * cells + 4 * side**2 for side in sides)
-    return _weight(fidelity) * layers * geometry.states * each
+    cells, window = geometry.pupil.amplitude.shape[-1], window_side(fidelity)
+    orders = [side // window for side in geometry.samples(fidelity)]
+    each = sum(min(energy_operations(geometry.states, window, order, cells)) for order in orders)
+    return _weight(fidelity) * layers * each
 
 
 def bank_seconds(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> float:

@@ -22,7 +22,10 @@ from torch import Tensor
 from kornia_tidy.scene.convolution import next_fast_size
 
 # Sides of transforms whose samples take the least time.
-SIZES = (8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 256, 288, 384, 512, 576, 768, 1024, 1536, 2048)
+SIZES = (
+    *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
+    *(512, 576, 768, 1024, 1536, 2048),
+)
 # Bytes that the planes of a chunk may take: near a processor's cache (and below what makes an allocator give memory
 # back and fetch it again), or enough to keep an accelerator busy.
 CHUNK_BYTES = {"cpu": 6 << 20}

@@ -235,6 +235,7 @@ class TestPixelEnergies(BaseTester):
         whole = pixel_energies(fields, torch.ones(2), kernels)
         (expected,) = torch.autograd.grad(whole.square().sum(), fields)
         monkeypatch.setattr("kornia_tidy.optics.wave_energy._BLOCK_SAMPLES", 1)
+        monkeypatch.setattr("kornia_tidy.optics.mutual_intensity._BLOCK_NUMBERS", 1)
         chunked = pixel_energies(fields, torch.ones(2), kernels)
         (got,) = torch.autograd.grad(chunked.square().sum(), fields)
         self.assert_close(chunked, whole, rtol=1e-12, atol=0)
