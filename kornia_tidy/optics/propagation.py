@@ -200,7 +200,7 @@ def pixel_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
 def energy_operations(states: int, window: int, order: int, cells: int) -> tuple[int, int]:
     r"""Return the additions and multiplications for a depth, wave by wave and by the mutual intensity.
 
-    .. math:: K (8 U N^2 + 8 U^2 N + 4 U^2) \quad	ext{and}\quad 4 (5 K + 1) U N^2 + 2 P^2 N^2, \qquad U = q P
+    .. math:: K (8 U N^2 + 8 U^2 N + 4 U^2) \quad\text{and}\quad 4 (5 K + 1) U N^2 + 2 P^2 N^2, \qquad U = q P
 
     for K states, N cells of the pupil and q points a pixel along each side of a window P. The second way has little to
     do for each state and point more, and the first for each cell.
