@@ -25,10 +25,11 @@ def written(tmp_path_factory):
     once = ["--benchmark-min-rounds=1", "--benchmark-max-time=0", "--benchmark-calibration-precision=1"]
     once += ["--benchmark-min-time=1e-9", "--benchmark-warmup=off", "--benchmark-quiet"]
     command = [sys.executable, "-m", "pytest", "--override-ini", "addopts=", "-q", "tests/benchmarks"]
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}  # no worker's
     done = subprocess.run(
         [*command, *once, f"--benchmark-json={path}", "-p", "no:cacheprovider"],
         cwd=ROOT,
-        env={**os.environ, "KORNIA_TIDY_BENCH_SIZE": "40", "OMP_NUM_THREADS": "1"},
+        env={**outside, "KORNIA_TIDY_BENCH_SIZE": "40", "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         check=False,

@@ -190,9 +190,12 @@ def _with_weights(solved: Tensor, phases: Tensor, seen: Tensor, weights: Tensor)
     factor = torch.linalg.cholesky(phases.mH @ (level * phases) + torch.eye(phases.shape[-1]).to(phases))
     rest = back(seen - (phases @ solved[..., None])[..., 0]) - solved
     step, before = torch.zeros_like(rest), 1.0
+    rounding = 1e-28 * float(solved.abs().square().sum())
     for _ in range(STEPS):
         towards = torch.cholesky_solve(rest[..., None], factor)[..., 0]
         now = float((rest.conj() * towards).real.sum())
+        if now <= rounding:  # images that are alike bright everywhere are solved already
+            break
         step, before = towards + now / before * step, now
         change = back((phases @ step[..., None])[..., 0]) + step
         length = now / max(float((step.conj() * change).real.sum()), 1e-300)

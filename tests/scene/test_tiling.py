@@ -321,4 +321,4 @@ class TestPlan(BaseTester):
         assert all(side - 23 + 1 >= 23 - 1 for side in sides)
 
     def test_property_sizes_transform_fast(self):
-        assert all((2 * 3) ** 16 * 5 * 7 % size == 0 for size in tiles.SIZES)
+        assert all((2 * 3) ** 16 * 5**2 * 7 % size == 0 for size in tiles.SIZES)
