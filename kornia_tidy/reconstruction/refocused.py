@@ -114,10 +114,12 @@ def _convolve(image: Tensor, filters: Tensor) -> Tensor:
     unknown = padded.isnan()
     if marked := bool(unknown.any()):  # a transform would spread what is unknown over the whole picture
         padded = padded.where(~unknown, 0)
-    height, width = padded.shape[-2:]
-    convolved = from_spectrum(
-        to_spectrum(padded, (height, width)) * to_spectrum(filters, (height, width)), (height, width), window
-    )
+    size = padded.shape[-2:]
+    spectrum = to_spectrum(padded, size)
+    # Large pictures are looked at without gradients: one filter at a time takes a fraction of the memory.
+    together = len(filters) if torch.is_grad_enabled() else 1
+    layers = [from_spectrum(spectrum * to_spectrum(some, size), size, window) for some in filters.split(together)]
+    convolved = torch.cat(layers, 1)
     if marked:
         convolved = convolved.masked_fill(functional.max_pool2d(unknown.to(padded.dtype), window, 1) > 0, torch.nan)
     return convolved
