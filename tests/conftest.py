@@ -37,5 +37,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(autouse=True)
-def _seed() -> None:
+def _seed(request: pytest.FixtureRequest) -> None:
     torch.manual_seed(0)
+    if "dynamo" in request.node.name:
+        torch.compiler.reset()  # what other tests had it compile would make it guess what varies

@@ -157,7 +157,6 @@ class TestPrecision(BaseTester):
 class TestCompile(BaseTester):
     @pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
     def test_dynamo_equals_eager_with_the_noise_replayed(self, backend):
-        torch.compiler.reset()
         optics, (image, depth) = camera(), scene()
         params = optics.draw(image)
         compiled = torch.compile(optics, fullgraph=True, backend=backend)

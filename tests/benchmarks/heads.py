@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
 import platform
 import statistics
 import subprocess
@@ -180,7 +181,7 @@ def ship_all(root: Path) -> None:
         "command": "python -m tests.benchmarks.heads train FOLDER",
         "date": datetime.now(UTC).date().isoformat(),
         "commit": subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], text=True).strip(),
-        "machine": f"{platform.machine()}, one thread a run, {torch.get_num_threads()} cores shared",
+        "machine": f"{platform.machine()}, one thread a run, {os.cpu_count()} cores shared",
         "torch": torch.__version__,
         "settings": {task: settings.as_dict() for task, settings in TASKS.items()},
         "systems": systems,

@@ -227,7 +227,6 @@ class TestEveryHead(BaseTester):
 
     def test_dynamo_is_one_graph(self, device):
         """Of the smallest: tracing takes seconds, and the exports below trace them all."""
-        torch._dynamo.reset()
         head, image = trained("phasecam3d").to(device), torch.rand(1, 3, 30, 33, device=device)
         with torch.no_grad():
             self.assert_close(torch.compile(head, fullgraph=True, backend="eager")(image), head(image))

@@ -93,7 +93,6 @@ class TestLosses(BaseTester):
 
     @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
     def test_dynamo_one_graph_and_an_empty_mask_has_no_loss(self, loss, device, backend):
-        torch._dynamo.reset()
         compiled = torch.compile(loss, fullgraph=True, backend=backend)
         prediction, target, mask = make_maps(device=device, dtype=torch.float32)
         assert compiled(prediction, target, mask) == loss(prediction, target, mask)

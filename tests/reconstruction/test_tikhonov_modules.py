@@ -85,7 +85,6 @@ class TestModules(BaseTester):
 
     @pytest.mark.parametrize("module", [Tikhonov, TikhonovLayers])
     def test_dynamo(self, module, device):
-        torch._dynamo.reset()
         inversion, bank = module().to(device), make_bank(device=device, dtype=torch.float32)
         capture = torch.rand(1, 2, 12, 9, device=device)
         compiled = torch.compile(inversion, fullgraph=True, backend="eager")

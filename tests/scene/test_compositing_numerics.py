@@ -117,7 +117,6 @@ class TestRenderNumerics(BaseTester):
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     def test_dynamo(self, compositing, layers, device):
-        torch.compiler.reset()
         bank = make_bank(4, 3, 5, dtype=torch.float32, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank)
         compiled = torch.compile(render, fullgraph=True, backend="eager", dynamic=False)
@@ -130,7 +129,6 @@ class TestRenderNumerics(BaseTester):
     @pytest.mark.filterwarnings("ignore")  # the compiler warns that it leaves complex numbers to eager kernels
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     def test_dynamo_inductor_with_gradients(self, compositing, device):
-        torch.compiler.reset()
         bank = make_bank(3, 3, 5, dtype=torch.float32, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank)
         compiled = torch.compile(render, fullgraph=True, dynamic=False)
