@@ -114,7 +114,7 @@ def _convolve(image: Tensor, filters: Tensor) -> Tensor:
     unknown = padded.isnan()
     if marked := bool(unknown.any()):  # a transform would spread what is unknown over the whole picture
         padded = padded.where(~unknown, 0)
-    size = padded.shape[-2:]
+    size = padded.shape[-2], padded.shape[-1]
     spectrum = to_spectrum(padded, size)
     # Large pictures are looked at without gradients: one filter at a time takes a fraction of the memory.
     together = len(filters) if torch.is_grad_enabled() else 1
