@@ -132,6 +132,7 @@ class TestTolerance(BaseTester):
 
     @needs_data
     @pytest.mark.slow
+    @pytest.mark.timeout(1800)
     @pytest.mark.parametrize("spectrum", SPECTRA)
     def test_property_all_real_scenes_stay_within_the_tolerance_asked(self, spectrum):
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, spectrum=SPECTRA[spectrum]())
