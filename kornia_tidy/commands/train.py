@@ -46,6 +46,10 @@ examples:
   A first look, in minutes on a CPU, for which the paper's network is too large:
     kornia-tidy train --task depth --head plain --size 96 --scenes 64 --batch 4 --epochs 5 \\
       -o outputs/look
+  Extended depth of field in minutes on a CPU, from masks that are designed first:
+    kornia-tidy train --task edof --start "focal sweep" --design 120 --refocus 5 --width 8 \\
+      --residual --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 \\
+      -o outputs/swept
   The paper's patches, by the loss of PhaseCam3D:
     kornia-tidy train --task depth --data flying-things-patches --root FlyingThings3D \\
       --loss phasecam3d --border valid -o outputs/depth
