@@ -16,10 +16,11 @@ Source: Goodman, Statistical Optics, 5.2, for the mutual intensity.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
+
+from kornia_tidy.optics.recomputed import recomputed
 
 _BLOCK_NUMBERS = 2**20  # held at once, if a single depth allows it: they stay near a core
 
@@ -45,9 +46,7 @@ def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     with torch.autocast(left.device.type, enabled=False):
         # B is packed as real less imaginary part: with J's sum of both, that leaves the real part of their product.
         pixels = (_real_rows(kernels).mT @ _real_rows(kernels * (1 - 1j))).flatten(-2)
-    if torch.compiler.is_compiling():  # the compiler makes an instance of a Function, which warns
-        return _energies(plain, turned, left, pixels)
-    return _MutualEnergies.apply(plain, turned, left, pixels)
+    return recomputed(_energies, _gradients, plain, turned, left, pixels)
 
 
 def _columns(field: Tensor) -> Tensor:
@@ -68,24 +67,6 @@ def _energies(plain: Tensor, turned: Tensor, left: Tensor, pixels: Tensor) -> Te
             for depth in _blocks(plain, left)
         ]
     return torch.cat(lines).clamp(min=0)  # where there is no light, rounding leaves less than none
-
-
-class _MutualEnergies(torch.autograd.Function):
-    """Energies of which nothing is kept for the backward pass but the matrices."""
-
-    @staticmethod
-    def forward(plain: Tensor, turned: Tensor, left: Tensor, pixels: Tensor) -> Tensor:
-        return _energies(plain, turned, left, pixels)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = grad_outputs
-        with torch.autocast(gradient.device.type, enabled=False):
-            return _gradients(*ctx.saved_tensors, gradient, ctx.needs_input_grad)
 
 
 def _gradients(

@@ -9,10 +9,11 @@ live one cache-sized block at a time: only their energies are kept, and the back
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
+
+from kornia_tidy.optics.recomputed import recomputed
 
 _BLOCK_SAMPLES = 2**18  # numbers of the waves held at once: a megabyte in float32 stays in a core's cache
 
@@ -37,9 +38,7 @@ def wave_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     first = _real_matrix(field.conj_physical().transpose(0, 1))  # (N, 2, K, N, re-im)
     second = _real_matrix(kernels.transpose(1, 2))  # (D, 2, q, P, N, re-im)
     matrices = first.flatten(0, 1).flatten(1), weights, left, second.flatten(1, 3).flatten(2)
-    if torch.compiler.is_compiling():  # the compiler makes an instance of a Function, which warns
-        return _energies(*matrices)
-    return _WaveEnergies.apply(*matrices)
+    return recomputed(_energies, _gradients, *matrices)
 
 
 def _real_matrix(numbers: Tensor) -> Tensor:
@@ -58,24 +57,6 @@ def _energies(first: Tensor, weights: Tensor, left: Tensor, second: Tensor) -> T
             lines = torch.matmul(rows, squares.view(-1, len(rows), wave.shape[-1]))
             energies[depth, row] = lines.view(len(wave), -1, 2 * order, window).sum(2)
     return energies
-
-
-class _WaveEnergies(torch.autograd.Function):
-    """Energies of which nothing is kept for the backward pass but the matrices."""
-
-    @staticmethod
-    def forward(first: Tensor, weights: Tensor, left: Tensor, second: Tensor) -> Tensor:
-        return _energies(first, weights, left, second)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = grad_outputs
-        with torch.autocast(gradient.device.type, enabled=False):
-            return _gradients(*ctx.saved_tensors, gradient, ctx.needs_input_grad)
 
 
 def _gradients(

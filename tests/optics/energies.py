@@ -1,0 +1,71 @@
+"""What holds for each way to sum the energies of waves."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.base import BaseTester
+
+
+def written_out(field: torch.Tensor, weights: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
+    wave = torch.einsum("dpqn,knm,drsm->dkpqrs", kernels, field, kernels)
+    return torch.einsum("k,dkpqrs->dpr", weights, wave.real.square() + wave.imag.square())
+
+
+def random_case(states=3, cells=7, depths=4, window=5, order=2, dtype=torch.complex128):
+    field = torch.randn(states, cells, cells, dtype=torch.complex128)
+    kernels = torch.randn(depths, window, order, cells, dtype=torch.complex128)
+    weights = torch.rand(states, dtype=torch.float64)
+    return field.to(dtype), weights.to(field.to(dtype).real.dtype), kernels.to(dtype)
+
+
+class EnergiesTester(BaseTester):
+    """``energies`` is the way that is tested."""
+
+    @pytest.mark.parametrize(("precision", "within"), [(torch.complex64, 1e-5), (torch.complex128, 1e-13)])
+    def test_feature_equals_complex_products(self, precision, within):
+        case = random_case(dtype=precision)
+        expected = written_out(*(x.to(torch.complex128) if x.is_complex() else x.double() for x in case))
+        got = self.energies(*case)
+        assert got.dtype == case[1].dtype
+        self.assert_close(got, expected, rtol=within, atol=0)
+
+    def test_feature_gradients_equal_those_of_complex_products(self):
+        case = tuple(x.requires_grad_() for x in random_case())
+        light = torch.randn(4, 5, 5, dtype=torch.float64)
+        ours, theirs = (
+            torch.autograd.grad((function(*case) * light).sum(), case) for function in (self.energies, written_out)
+        )
+        for one, two in zip(ours, theirs, strict=True):
+            self.assert_close(torch.view_as_real(one + 0j), torch.view_as_real(two + 0j), rtol=0, atol=1e-10)
+
+    @pytest.mark.parametrize("wanted", [(0,), (1,), (2,)])
+    def test_feature_each_gradient_can_be_had_alone(self, wanted):
+        case = random_case()
+        own = [case[i].requires_grad_() for i in wanted]
+        ours, theirs = (torch.autograd.grad(function(*case).sum(), own)[0] for function in (self.energies, written_out))
+        self.assert_close(torch.view_as_real(ours + 0j), torch.view_as_real(theirs + 0j), rtol=0, atol=1e-10)
+
+    def test_gradcheck_twice_in_field_weights_and_kernels(self):
+        case = tuple(x.requires_grad_() for x in random_case(2, 3, 2, 3, 2))
+        assert torch.autograd.gradcheck(self.energies, case, fast_mode=True)
+        assert torch.autograd.gradgradcheck(self.energies, case, fast_mode=True)
+
+    def test_feature_autocast_changes_nothing(self):
+        case = random_case(dtype=torch.complex64)
+        case[0].requires_grad_()
+        plain = self.energies(*case)
+        (expected,) = torch.autograd.grad(plain.sum(), case[0])
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            cast = self.energies(*case)
+            (got,) = torch.autograd.grad(cast.sum(), case[0])
+        assert torch.equal(cast, plain)
+        assert torch.equal(got, expected)
+
+    def test_feature_a_state_that_is_never_shown_keeps_a_finite_gradient(self):
+        field, _, kernels = random_case(2)
+        weights = torch.tensor([1.0, 0.0], dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(self.energies(field, weights, kernels).sum(), weights)
+        alone = self.energies(field[1:], torch.ones(1, dtype=torch.float64), kernels).sum()
+        self.assert_close(gradient[1], alone)
