@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-STEPS = 16  # of conjugate gradients
-REACH = 1  # pixels
+STEPS = 16  # of conjugate gradients, as sharp points behind a mosaic need
+REACH = 1  # pixels from which noise is counted where each pixel has a weight: beyond, weights keep it out
 
 
 @dataclass(frozen=True, eq=False)

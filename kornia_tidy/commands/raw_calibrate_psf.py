@@ -49,9 +49,10 @@ What is printed tells how far to trust the bank: "noise" is the error to be expe
 the sum of its moduli over the PSF's light; "residuals" of about 1 say that the
 pictures of one distance fit each other, far larger ones that something moved or
 that --full-well, --read-noise or the black level are wrong. Most of the error of a
-sharp PSF is noise of the dark about it, which exposures four times as long, so that
-the background is nearly saturated, take back as well as twice the places. Without --reference the
-PSF's centre of light is its centre, and what masks do to move it is not seen.
+sharp PSF is noise in the dark about it: one more exposure, four times as long, so that
+the background is nearly saturated, lowers it as much as twice the places do. Without
+--reference the PSF's centre of light is its centre, and what masks do to move it is not
+seen.
 
 In Python:
   bank = PSFBank.load("bank.safetensors")

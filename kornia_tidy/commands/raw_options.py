@@ -41,7 +41,7 @@ def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
         ValueError: if it cannot be read, or the options do not describe a dump.
     """
     if args.size is None:
-        for name in DUMP_OPTIONS[1:]:
+        for name in DUMP_OPTIONS:
             if getattr(args, name) is not None:
                 raise ValueError(f"--{name.replace('_', '-')} is for bare dumps of counts: give --size too")
         return RawCapture.open(path)

@@ -71,6 +71,8 @@ def draw_estimates(
     axes = figure.subplots(len(estimates), len(HEADINGS), squeeze=False)
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
     figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus, and how far it is", fontsize=14)
+    legend = "K: number of masks shown in turn during the exposure; plain: a lens without a mask; x3: times three"
+    figure.text(0.98, 1 - 0.28 / height, legend, fontsize=LABEL, color=FAINT, ha="right")
     for y, estimate in enumerate(estimates):
         scores = estimate.scores(image, nearness, known)
         pictures = [

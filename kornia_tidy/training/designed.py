@@ -9,7 +9,7 @@ from kornia_tidy.optics.coded_lens import CodedLens
 from kornia_tidy.optics.mask_design import design, restoration_error
 
 NOISE = 0.05  # of a scene's standard deviation: the sensor's 0.01 of full scale, for scenes that vary by a fifth of it
-LR_METRES = 8e-8  # in 120 steps masks come as low as in 300
+LR_METRES = 8e-8  # five masks are after 120 steps within 0.2 % of where they are after 200
 
 
 def design_masks(lens: CodedLens, steps: int, *, progress: bool = False) -> list[float]:
