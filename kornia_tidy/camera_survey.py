@@ -77,7 +77,9 @@ class CameraSurvey:
         self.spectrum = optics.spectrum if channels == len(optics.spectrum.weights) else Spectrum.monochrome()
         step = float(camera.pixel_pitch * camera.aperture_radius / camera.image_distance)
         states = len(optics.modulator(optics.masks.phase)[1])
-        self._geometry = BankGeometry(states, optics.pupil, self.spectrum.wavelengths, step)
+        # Where layers hide one another each state is a capture of its own, see Fidelity.occlusion_states.
+        self.captures = states if optics.compositing == "occlusion" else 1
+        self._geometry = BankGeometry(states // self.captures, optics.pupil, self.spectrum.wavelengths, step)
         self.band = defocus_band(optics.pupil.max_rho2, min(optics.spectrum.wavelengths), REFERENCE_WAVELENGTH)
         self.border, self.compositing = optics.border, optics.compositing
         self.defocus_range: tuple[float, float] = camera.defocus_range

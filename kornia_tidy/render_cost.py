@@ -1,5 +1,7 @@
 """What a capture costs: time and memory of the PSF bank and of the tiled rendering, by formula.
 
+Occlusion-aware rendering has formulas of its own, see :mod:`kornia_tidy.occlusion_cost`.
+
 Seconds are those of one core of a 2.5 GHz Xeon that does nothing else, after constants that were measured there. Other
 machines are faster or slower, but what is cheaper here is mostly cheaper there.
 """
@@ -150,27 +152,30 @@ def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:
     return _weight(fidelity) * channels * nanoseconds * 1e-9
 
 
-def memory_bytes(geometry: BankGeometry, tiles: Tiles, channels: int, fidelity: Fidelity, layers: int) -> int:
+def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, layers: int, rendering: int) -> int:
     """Return the peak memory of a capture without gradients beyond the image: of the bank or the renderer, whichever.
 
-    The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and as real matrices. The renderer
-    holds the PSFs and their spectra, the planes of a chunk of tiles and what belongs to pixels.
+    The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and as real matrices.
 
     Args:
         geometry: of the bank.
-        tiles: of the scene.
         channels: of the image.
         fidelity: its window, points and precision count.
-        layers: PSFs computed.
+        layers: PSFs held.
+        rendering: what the renderer takes, see :func:`rendering_bytes`.
     """
     real = 4 * _weight(fidelity)
-    side = max(geometry.samples(fidelity))
-    psfs = real * max(layers, tiles.layers) * channels * window_side(fidelity) ** 2
-    kernels = 2 * real * layers * side * geometry.pupil.amplitude.shape[-1]
+    psfs = real * layers * channels * window_side(fidelity) ** 2
+    kernels = 2 * real * layers * max(geometry.samples(fidelity)) * geometry.pupil.amplitude.shape[-1]
+    return psfs + max(4 * kernels, rendering)
+
+
+def rendering_bytes(tiles: Tiles, channels: int, fidelity: Fidelity) -> int:
+    """Return what the renderer takes: PSFs' spectra, the planes of a chunk of tiles, and what belongs to pixels."""
+    real = 4 * _weight(fidelity)
     plane = 2 * real * channels * tiles.size**2
     chunk = 3 * max(CHUNK_BYTES["cpu"], plane * math.ceil(tiles.pairs / tiles.blocks))
-    pixels = tiles.pixels * (4 * channels * real + 5 * 8)
-    return int(psfs + max(4 * kernels, 2 * tiles.layers * plane + chunk + pixels))
+    return 2 * tiles.layers * plane + chunk + tiles.pixels * (4 * channels * real + 5 * 8)
 
 
 def _weight(fidelity: Fidelity) -> int:

@@ -21,6 +21,7 @@ class RenderPlan:
         reference_seconds: what the reference would take.
         layers_present: PSFs computed for the scene.
         layers_total: those of the camera's whole range.
+        states: of the exposure, rendered one by one: 1 where their mean does, as it does unless layers hide others.
         wavelengths: PSFs computed for each layer.
         wavelengths_total: those that the camera's spectrum has, at all of which the reference is.
         light_held: least and largest share of the light in the window over the range.
@@ -37,6 +38,7 @@ class RenderPlan:
     reference_seconds: float
     layers_present: int
     layers_total: int
+    states: int
     wavelengths: int
     wavelengths_total: int
     light_held: tuple[float, float]
@@ -64,7 +66,8 @@ class RenderPlan:
                 + (", as nothing cheaper is within the tolerance" if knobs.name == full.name else ""),
                 f"  computes: {self.layers_present} of {self.layers_total} {knobs.layers} layers of defocus, for each "
                 f"PSFs at {every} wavelength{'s' if total != 1 else ''} of {knobs.window}x"
-                f"{knobs.window} px that hold {held} of the light, in float{64 if knobs.double else 32}",
+                f"{knobs.window} px that hold {held} of the light, in float{64 if knobs.double else 32}"
+                + (f", and an image for each of {self.states} states of the exposure" if self.states > 1 else ""),
                 "  skips: " + "; ".join(skipped),
                 f"  costs: some {self.seconds:.2g} s on one core, {self.seconds / self.reference_seconds:.2%} of the "
                 f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",

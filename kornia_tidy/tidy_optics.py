@@ -51,7 +51,8 @@ class TiDyOptics(CodedLens):
         fidelity: a preset's name (``"paper"``, ``"draft"``, ``"balanced"``, ``"reference"``) or a
             :class:`~kornia_tidy.fidelity.Fidelity`.
         compositing: ``"gather"`` (the paper's equation 1), ``"scatter"`` (conserves flux) or ``"occlusion"`` (near
-            things hide far ones; each state of the exposure is rendered, see ``Fidelity.occlusion_states``).
+            things hide far ones; each state of the exposure is rendered, see ``Fidelity.occlusion_states``; not for a
+            spectrum with a basis).
         color_space: how images are encoded: ``"srgb"`` (default) is decoded to linear light and encoded after;
             ``"linear"`` passes untouched, beyond 1 too; ``"paper"`` treats sRGB values as light, as the paper does,
             and then the sensor's units are encoded ones.
@@ -126,6 +127,12 @@ class TiDyOptics(CodedLens):
                 f"{compositing!r}: leave them out, or use another fidelity"
             )
         super().__init__(masks, camera, modulator, fidelity, spectrum, aperture)
+        if compositing == "occlusion" and self.spectrum.basis is not None:
+            # What hides is normalised by the light of its PSF; those between colours hold as much below zero as above.
+            raise ValueError(
+                "compositing 'occlusion' needs colours without spectra of their own, got a spectrum with a basis: "
+                "leave reflectance=True out, or use 'gather' or 'scatter'"
+            )
         self.sensor = sensor
         self.compositing = compositing
         self.color_space = color_space

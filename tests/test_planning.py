@@ -43,10 +43,11 @@ class Rig:
             self._cameras[key]._memory = BankMemory()  # of its own: the camera's is for one setting at a time
         dtype = torch.float64 if fidelity.double else torch.float32
         light, defocus = light.to(dtype), defocus.to(dtype)
-        bank = self._cameras[key].scene_bank(light.shape[1], dtype, defocus)
+        banks = self._cameras[key]._scene_banks(light.shape[1], defocus)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        planes = light.repeat(1, bank.psfs.shape[1] // light.shape[1], 1, 1)  # one for each reflectance, if there are
-        coded = render(planes, defocus, bank, self.optics.compositing, layers=layers, border=self.optics.border)
+        planes = light.repeat(1, banks[0][1].psfs.shape[1] // light.shape[1], 1, 1)  # one for each reflectance, if any
+        options = {"layers": layers, "border": self.optics.border}
+        coded = sum(share * render(planes, defocus, bank, self.optics.compositing, **options) for share, bank in banks)
         return coded.unflatten(1, (light.shape[1], -1)).sum(2).double()
 
     def error(self, light: Tensor, defocus: Tensor, fidelity: Fidelity, reference: Fidelity) -> float:
@@ -127,6 +128,14 @@ class TestTolerance(BaseTester):
         self.judge(rig, [(name, 64) for name in NAMES[2::14]])
 
     @needs_data
+    @pytest.mark.usefixtures("narrow")
+    def test_property_real_scenes_that_hide_parts_of_themselves_stay_within_the_tolerance_asked(self):
+        """Of one mask, and of two that are rendered one by one; what is predicted is a bound."""
+        for masks in ("learned", "random"):
+            optics = TiDyOptics(MASKS[masks](torch.Generator().manual_seed(0)), sensor=None, compositing="occlusion")
+            self.judge(Rig(optics), [(name, 64) for name in NAMES[5::32]], margin=5)
+
+    @needs_data
     def test_property_real_scenes_seen_in_many_wavelengths_stay_within_the_tolerance_asked(self, spectral):
         self.judge(spectral, [(name, 64) for name in NAMES[2::28]], margin=3)
 
@@ -164,7 +173,7 @@ class TestTolerance(BaseTester):
         st.sampled_from(sorted(IMAGES)),
         st.sampled_from(sorted(DEPTHS)),
         st.sampled_from(sorted(MASKS)),
-        st.sampled_from(["gather", "scatter"]),
+        st.sampled_from(["gather", "scatter", "occlusion"]),
         st.tuples(st.floats(0.3, 1.0), st.sampled_from([2.0, 10.0, float("inf")])),
         st.tuples(st.floats(-8, -2), st.floats(2, 8)),
         st.tuples(st.floats(4e-6, 9e-6), st.sampled_from(sorted(SPECTRA))),
@@ -175,6 +184,8 @@ class TestTolerance(BaseTester):
         self, border, image, depth, masks, compositing, depth_range, defocus_range, sensor, size, seed
     ):
         generator, (pitch, spectrum) = torch.Generator().manual_seed(seed), sensor
+        if compositing == "occlusion" and spectrum == "colours with spectra":  # refused
+            spectrum = "a camera's"
         optics = TiDyOptics(
             MASKS[masks](generator),
             ThinLensCamera.for_scene(depth_range, defocus_range, pixel_pitch=pitch),
@@ -369,6 +380,22 @@ class TestPlan(BaseTester):
         coded.square().mean().backward()
         assert float(flat.masks.phase.grad.abs().max()) > 0
         flat.masks.phase.grad = None
+
+    def test_feature_states_are_rendered_one_by_one_where_layers_hide_others(self):
+        optics = TiDyOptics(PixelwiseMask(3, 15), sensor=None)
+        hiding = TiDyOptics(optics.masks, sensor=None, compositing="occlusion")
+        depth = torch.linspace(0.4, 3, 60 * 72).view(1, 60, 72)
+        plan, other = (each.plan(depth, tolerance=1e-2) for each in (hiding, optics))
+        assert (plan.states, other.states) == (3, 1)
+        assert "and an image for each of 3 states of the exposure" in str(plan)
+        assert "states" not in str(other)
+        assert plan.seconds > 3 * other.seconds
+
+    def test_exception_the_mean_of_states_has_no_known_error_where_layers_hide_others(self):
+        optics = TiDyOptics(PixelwiseMask(2, 15), sensor=None, compositing="occlusion")
+        scene = Planner(optics, 3).scene(torch.zeros(1, 1, 40, 40))
+        with pytest.raises(ValueError, match="predicted for occlusion_states 'each', got 'mean'"):
+            scene.error(Fidelity(window=9, occlusion_states="mean"))
 
     def test_feature_a_paper_camera_can_be_planned_exactly(self):
         paper = TiDyOptics(PixelwiseMask(1), DefocusRange(-10, 10), sensor=None, fidelity="paper")

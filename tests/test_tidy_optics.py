@@ -21,6 +21,7 @@ from kornia_tidy import (
 )
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.psf_bank import enclosing_window
+from kornia_tidy.optics.spectrum import camera_spectrum
 from tests.base import SHARED, BaseTester, needs_data
 
 SMALL = Fidelity(window=9, layer_spacing=5.0)
@@ -148,9 +149,9 @@ class TestLight(BaseTester):
         assert optics.masks.phase.grad.abs().amax((1, 2)).min() > 0
         assert depth.grad.abs().max() > 0
 
-    def test_exception_plans_are_for_gather_and_scatter(self):
-        with pytest.raises(ValueError, match="must be one of 'gather', 'scatter', got 'occlusion'"):
-            TiDyOptics(compositing="occlusion", fidelity=SMALL).plan(torch.ones(1, 30, 30))
+    def test_exception_what_hides_has_no_spectrum_of_its_own(self):
+        with pytest.raises(ValueError, match="compositing 'occlusion' needs colours without spectra"):
+            TiDyOptics(compositing="occlusion", spectrum=camera_spectrum(samples=8, reflectance=True))
 
     def test_feature_paper_takes_srgb_as_light_and_correlates(self):
         masks = PixelwiseMask(2)
