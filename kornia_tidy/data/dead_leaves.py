@@ -20,8 +20,9 @@ from kornia_tidy.seeds import keyed_seed
 
 PIXELS_A_LEAF, MOST_LEAVES = 256, 3000  # in scenes of a data set: things of sizes as in photographs, with depth to see
 COVERAGE = 3.0  # how many leaves lie over a pixel on average; exp(-3) = 5 % of the picture shows the background
-LARGEST_RADIUS = 0.25  # of the picture's geometric mean side
+LARGEST_RADIUS = 0.5  # of the picture's geometric mean side
 SMALLEST_LEAF = 1.0  # px: a smaller leaf would fall between pixels
+MOST_FAR = 3.0  # exponent on nearness, from 1 in some scenes to this in others, every factor alike
 LARGEST_SLANT = 0.08  # of the dioptre range, from a leaf's middle to its edge
 OUTLINE_POINTS = 120  # divisible by 3, 4, 5 and 6: every corner of a polygon is hit
 PEN = 0.6  # px by which cv2.fillPoly grows a shape: it fills every pixel that the outline touches
@@ -50,10 +51,12 @@ def dead_leaves(
     r"""Paint one dead-leaves scene: textured shapes that occlude each other, with the depth of every pixel.
 
     Shapes (ellipses, pebbles, polygons, leaves) have radii with density :math:`\propto r^{-3}`, which gives the power
-    spectrum (:math:`1/f^2`) and the heavy-tailed gradients of natural images. Their inverse depths have density
-    :math:`\propto 1 / (b + (1 - b) u)`, where u runs from 0 at the far end to 1 at the near end and b is the share of
-    the picture that shows the background: this undoes the advantage of near leaves, so that the depth that is *seen* is
-    uniform in dioptres, and with it defocus.
+    spectrum (:math:`1/f^2`) and the heavy-tailed gradients of natural images. Their inverse depths are
+    :math:`u^\gamma` from 0 at the far end to 1 at the near end. The density of u is :math:`\propto 1 / (b + (1 - b) u)`,
+    where b is the share of the picture that shows the background: this undoes the advantage of near leaves, so that the
+    u that is *seen* is uniform. In some scenes :math:`\gamma` is 1, and what is seen is uniform in dioptres, and with it
+    in defocus; in others it is up to 3, as most scenes hold more that is far (the mean is 0.35 of the range here, and
+    0.36 on 35 photographs with known depth).
 
     Size, colour and texture do not depend on depth: besides occlusion, nothing but defocus tells how far a leaf is.
 
@@ -180,7 +183,7 @@ def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Lea
 
     background = math.exp(-_coverage(height, width, count, smallest, largest))
     visible_below = background ** rng.random(count)  # wanted share of the picture that lies farther than the leaf
-    nearness = np.sort((visible_below - background) / (1 - background))
+    nearness = np.sort((visible_below - background) / (1 - background)) ** (MOST_FAR ** rng.random())
 
     angle = rng.uniform(0, 2 * math.pi, count)
     slant = np.where(rng.random(count) < 1 / 3, rng.uniform(0, LARGEST_SLANT, count), 0.0)

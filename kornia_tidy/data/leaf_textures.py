@@ -23,6 +23,8 @@ PALETTES = (
     ("3b3a38", "6b6862", "9a958a", "c7c0b2", "e6e0d4", "7d6a55", "a3795a", "4a5560"),  # stone
     ("5c3a4a", "b05f7a", "e5a4b4", "f6dfe0", "8aa36a", "51663f", "d7b98e", "fffaf0"),  # blossom
 )
+SMOOTH = 0.35  # share of leaves without a pattern, as walls and skies: no blur tells how far they are
+ROUGHEST = 0.05  # deviation of the grain, of the light; on most leaves much less
 STRAY_COLOURS = 0.12  # share of leaves whose colour is from another palette
 
 
@@ -49,8 +51,9 @@ def paint_leaves(
     count = len(radius)
     colours = _colours(count, rng)
     kind = rng.integers(0, len(TEXTURES), count)
-    contrast = rng.beta(2, 3, count).astype(np.float32)
+    contrast = (rng.beta(2, 3, count) * (rng.random(count) > SMOOTH)).astype(np.float32)
     contrast[kind == TEXTURES.index(_script)] = 1  # writing is there to be read
+    rough = (ROUGHEST * rng.random(count) ** 2).astype(np.float32)
     style = rng.random((3, count), dtype=np.float32)  # three numbers that each texture reads in its own way
     noise_tile, script_tile = _noise_tile(rng), _script_tile(rng)
 
@@ -65,7 +68,7 @@ def paint_leaves(
     # Light from the upper left on surfaces that are a little convex.
     light = 1 - np.float32(0.16) * (x + y) / size
     grain = _read_tile(noise_tile, along + 97 * style[0, leaf], across + 89 * style[1, leaf])
-    light *= 1 + np.float32(0.05) * grain
+    light *= 1 + rough[leaf] * grain
 
     pattern = np.zeros_like(x)
     for number, texture in enumerate(TEXTURES):
