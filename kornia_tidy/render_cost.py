@@ -130,7 +130,7 @@ def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
         1
     """
     grid, sample = choose_grid(labels, layers, window), labels.change(lambda layer: layer[:, ::_STEP, ::_STEP])
-    pairs = int(grid.number(sample, layers, _STEP).present(grid.blocks * layers).sum())
+    pairs = int(grid.present(sample, layers, _STEP).sum())
     present = int(sample.present(layers + 1).sum())
     return Tiles(grid.size, grid.blocks, pairs, present, labels.first.numel(), 1 if labels.fraction is None else 2)
 
