@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -90,7 +91,6 @@ class _BlurThenMix(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (plane, psfs), plan = ctx.saved_tensors, ctx.plan
         work = _Work(plan, psfs, psfs.shape[-1] - 1)
-        turned = torch.conj_physical(work.spectra)  # correlation is the transpose of convolution
         slopes = _Slopes(ctx.needs_input_grad, plane, work)
         full = work.tiled_plane(plane) if slopes.plane else None
         for chunk, places, c in work.steps():
@@ -104,7 +104,7 @@ class _BlurThenMix(torch.autograd.Function):
             if slopes.psfs is not None:
                 slopes.add_psfs(light, own, chunk, c)
             if full is not None:
-                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, turned[c], chunk)), chunk)
+                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.turned[c], chunk)), chunk)
         if full is not None:
             full = full[..., : plane.shape[-2], : plane.shape[-1]]
         return full, slopes.of_psfs(psfs, turned=False), slopes.fraction, None
@@ -127,7 +127,6 @@ class _SplitThenBlur(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (plane, psfs), plan = ctx.saved_tensors, ctx.plan
         work = _Work(plan, psfs, 0)
-        turned = torch.conj_physical(work.spectra)
         slopes = _Slopes(ctx.needs_input_grad, plane, work)
         mixed = torch.empty_like(plane) if slopes.plane else None
         full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
@@ -136,7 +135,7 @@ class _SplitThenBlur(torch.autograd.Function):
             if slopes.psfs is not None:
                 slopes.add_psfs(light, torch.fft.fft2(work.put(plane[:, c][chunk.pixels], places, chunk)), chunk, c)
             if mixed is not None or slopes.fraction is not None:
-                blurred = torch.fft.ifft2(work.blur(light, turned[c], chunk))
+                blurred = torch.fft.ifft2(work.blur(light, work.turned[c], chunk))
                 if slopes.fraction is not None:
                     slopes.add_fraction(blurred, plane[:, c], places, chunk)
                 if mixed is not None:
@@ -160,8 +159,7 @@ class _Work:
         self._memory: dict[tuple[str, torch.dtype], Tensor] = {}
         self._dtype, self._device = psfs.dtype, psfs.device
         size, tile = plan.grid.size, plan.grid.tile
-        # (C, D', size, size) spectra of the PSFs of the layers that are present.
-        self.spectra = torch.fft.fft2(psfs.transpose(0, 1).index_select(1, plan.present), s=(size, size))
+        self._psfs = psfs
         parts = [chunk.pixels for chunk in plan.chunks]
         # The block of a pixel, times the number of layers, and where it stands in its window, in floats: alike for all
         # rows of blocks.
@@ -170,11 +168,27 @@ class _Work:
         self._number = plan.grid.number(images, y, x) * plan.start.shape[1]
         self._inside = 2 * ((y % tile + offset) * size)[:, None] + (2 * (x % tile + offset) + x // tile % 2)
 
+    @cached_property
+    def spectra(self) -> Tensor:
+        """(C, D', size, size) spectra of the PSFs of the layers that are present."""
+        psfs = self._psfs.transpose(0, 1).index_select(1, self.plan.present)
+        return torch.fft.fft2(psfs, s=(self.plan.grid.size, self.plan.grid.size))
+
+    @cached_property
+    def turned(self) -> Tensor:
+        """Spectra of the PSFs turned by 180 degrees: correlation is the transpose of convolution."""
+        return torch.conj_physical(self.spectra)
+
+    def zero_spectra(self) -> Tensor:
+        """Return zeros of the shape of :attr:`spectra`."""
+        shape = (self._psfs.shape[1], len(self.plan.present), self.plan.grid.size, self.plan.grid.size)
+        return self._psfs.new_zeros(shape, dtype=self._dtype.to_complex())
+
     def steps(self) -> Iterator[tuple[Chunk, Labels, int]]:
         """Each channel of each chunk, and where its pixels stand, see :meth:`places`."""
         for chunk in self.plan.chunks:
             places = self.places(chunk)
-            for channel in range(len(self.spectra)):
+            for channel in range(self._psfs.shape[1]):
                 yield chunk, places, channel
 
     def _buffer(self, name: str, shape: Sequence[int], dtype: torch.dtype | None = None) -> Tensor:
@@ -289,7 +303,7 @@ class _Slopes:
     def __init__(self, wanted: tuple[bool, ...], plane: Tensor, work: _Work) -> None:
         self.work = work
         self.plane = wanted[0]
-        self.psfs = torch.zeros_like(work.spectra) if wanted[1] else None
+        self.psfs = work.zero_spectra() if wanted[1] else None
         self.fraction = plane.new_zeros(work.plan.labels.first.shape) if wanted[2] else None
 
     def add_fraction(self, blurred: Tensor, factor: Tensor, places: Labels, chunk: Chunk) -> None:
