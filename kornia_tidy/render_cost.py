@@ -129,10 +129,10 @@ def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
         >>> count_tiles(flat, 3, 9).layers
         1
     """
-    grid, sample = choose_grid(labels, layers, window), labels.change(lambda layer: layer[:, ::_STEP, ::_STEP])
-    pairs = int(grid.present(sample, layers, _STEP).sum())
-    present = int(sample.present(layers + 1).sum())
-    return Tiles(grid.size, grid.blocks, pairs, present, labels.first.numel(), 1 if labels.fraction is None else 2)
+    grid, sample = choose_grid(labels, layers, window), labels.every(_STEP)
+    here = grid.present(sample, layers, _STEP)
+    pairs, present = int(here.sum()), int(here.any(0).sum())
+    return Tiles(grid.size, grid.blocks, pairs, present, labels.lower.numel(), 1 if labels.fraction is None else 2)
 
 
 def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:

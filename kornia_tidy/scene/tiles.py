@@ -12,9 +12,8 @@ image, row by row; pairs by block, then by layer.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -27,53 +26,47 @@ SIZES = (
     *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
     *(512, 576, 768, 1024, 1536, 2048),
 )
-# Bytes that the planes of a chunk may take in one channel: near a processor's cache (and below what makes an allocator give memory
-# back and fetch it again), or enough to keep an accelerator busy.
+# Bytes that the planes of a chunk may take in one channel: near a processor's cache (and below what makes an allocator
+# give memory back and fetch it again), or enough to keep an accelerator busy.
 CHUNK_BYTES = {"cpu": 4 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 
 
 @dataclass(frozen=True)
 class Labels:
-    """The layers of each pixel: all light to layer ``first``, or a share of it to layer ``second``.
+    """The layers of each pixel: all light to layer ``lower``, or a share of it to the next one.
 
     Args:
-        first: (B, H, W) int64 index of a layer.
-        second: (B, H, W) int64 index of a layer, ``first`` again where a pixel lies in one only; None for nearest.
-        fraction: (B, H, W) share of ``second``, or None for nearest layers.
+        lower: (B, H, W) int64 index of a layer, from :func:`~kornia_tidy.scene.layers.assign_layers`.
+        fraction: (B, H, W) share of the next layer, or None for nearest layers.
+        sloped: a layer with a share of zero counts too, for its gradient.
     """
 
-    first: Tensor
-    second: Tensor | None
+    lower: Tensor
     fraction: Tensor | None
+    sloped: bool = False
 
     @classmethod
     def of(cls, lower: Tensor, fraction: Tensor | None) -> Labels:
-        """Return the labels of layers that :func:`~kornia_tidy.scene.layers.assign_layers` gave, (B, H, W) each.
-
-        Where the gradient with respect to ``fraction`` is wanted, a layer with a share of zero counts too.
-        """
+        """Return the labels of layers as they were assigned, sloped where a gradient of ``fraction`` is wanted."""
         if fraction is None:
-            return cls(lower, None, None)
-        share = fraction.detach()
-        if fraction.requires_grad and torch.is_grad_enabled():
-            return cls(lower, lower + 1, share)
-        return cls(lower + (share == 1), lower + (share > 0), share)
+            return cls(lower, None)
+        return cls(lower, fraction.detach(), fraction.requires_grad and torch.is_grad_enabled())
 
-    def change(self, function: Callable[[Tensor], Tensor]) -> Labels:
-        """Return the labels with a function applied to both indices."""
-        return replace(self, first=function(self.first), second=None if self.second is None else function(self.second))
+    def every(self, step: int) -> Labels:
+        """Return the labels of every ``step``-th row and column."""
+        kept = (slice(None), slice(None, None, step), slice(None, None, step))
+        return Labels(self.lower[kept], None if self.fraction is None else self.fraction[kept], self.sloped)
 
     def terms(self, *where: slice) -> list[Tensor]:
-        """Return the one or two indices of each pixel there."""
-        return [term[where] for term in (self.first, self.second) if term is not None]
-
-    def present(self, count: int) -> Tensor:
-        """Return (count,) bool: which of the indices occur."""
-        present = torch.zeros(count, dtype=torch.bool, device=self.first.device)
-        for term in self.terms():
-            present.index_fill_(0, term.reshape(-1), True)
-        return present
+        """Return the one or two layers of each pixel there: the same twice if it lies in one."""
+        lower = self.lower[where]
+        if self.fraction is None:
+            return [lower]
+        if self.sloped:
+            return [lower, lower + 1]
+        share = self.fraction[where]
+        return [lower + (share == 1), lower + (share > 0)]
 
 
 @dataclass(frozen=True)
@@ -118,14 +111,15 @@ class Grid:
 
     def present(self, labels: Labels, layers: int, step: int = 1) -> Tensor:
         """Return (blocks, layers) bool: which of the layers a block contains. Labels are of every ``step``-th pixel."""
-        sides = ((self.batch, 1), (self.height, step), (self.width, step))
-        images, y, x = (torch.arange(0, side, stride, device=labels.first.device) for side, stride in sides)
-        present = torch.zeros(self.blocks * layers, dtype=torch.bool, device=labels.first.device)
-        first = self.number(images, y, x[:1]) * layers
-        column = self.number(images[:1], y[:1], x) * layers
-        for term in labels.terms():
-            for part, start in zip(term.split(64, 1), first.split(64, 1), strict=True):
-                present.index_fill_(0, (part + column).add_(start).view(-1), True)
+        device = labels.lower.device
+        images = torch.arange(self.batch, device=device)
+        y, x = (torch.arange(0, side, step, device=device) for side in (self.height, self.width))
+        row, column = self.number(images, y, x[:1]) * layers, self.number(images[:1], y[:1], x) * layers
+        present = torch.zeros(self.blocks * layers, dtype=torch.bool, device=device)
+        for first in range(0, len(y), 64):  # in a processor's cache
+            part = slice(first, first + 64)
+            for layer in labels.terms(slice(None), part):
+                present.index_fill_(0, (layer + column).add_(row[:, part]).view(-1), True)
         return present.view(-1, layers)
 
 
@@ -164,24 +158,6 @@ class Chunk:
         """Index of its pixels in (B, H, W)."""
         return self.batch, self.y, self.x
 
-    @cached_property
-    def run_lengths(self) -> list[int]:
-        return [own.stop - own.start for _, own, _ in self.runs]
-
-    @cached_property
-    def runs(self) -> list[tuple[int, slice, slice]]:
-        """Pairs of one block whose layers follow each other: the block, which pairs, which layers."""
-        block, layer = self.block.tolist(), self.layer.tolist()
-        starts = [
-            pair
-            for pair in range(len(block))
-            if pair == 0 or block[pair] != block[pair - 1] or layer[pair] != layer[pair - 1] + 1
-        ]
-        return [
-            (block[first], slice(first, last), slice(layer[first], layer[last - 1] + 1))
-            for first, last in pairwise([*starts, len(block)])
-        ]
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -205,7 +181,7 @@ class Plan:
 
 def make_plan(labels: Labels, layers: int, psf_size: int) -> Plan:
     """Choose the tiles for a scene, list the pairs of block and layer, and group them into chunks."""
-    device = labels.first.device
+    device = labels.lower.device
     grid = choose_grid(labels, layers, psf_size)
     stride = 2 * grid.size**2
     itemsize = 4 if labels.fraction is None else labels.fraction.element_size()
@@ -232,7 +208,7 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     Larger tiles waste less on their overlap, smaller ones hold fewer layers. The pairs of each candidate are counted
     on every eighth row and column.
     """
-    batch, height, width = labels.first.shape
+    batch, height, width = labels.lower.shape
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
     whole = psf_size - 1 + max(height, math.ceil(width / 2))
     sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
@@ -240,7 +216,7 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     if len(grids) == 1:
         return grids[0]
     step = 8
-    sample = labels.change(lambda first: first[:, ::step, ::step])
+    sample = labels.every(step)
     counts = [grid.present(sample, layers, step).sum() for grid in grids]
     counted = zip(grids, torch.stack(counts).tolist(), strict=True)
     costs = [tile_cost(grid.size, grid.blocks, pairs) for grid, pairs in counted]

@@ -2,8 +2,8 @@
 
 Overlap-save for gather, overlap-add for scatter. Each is the other's transpose, so forward and backward passes are made
 of the same four steps: cut windows out of a plane, add windows to a plane, put pixels into the planes of their layers,
-take pixels out of the planes of their layers. The planes of one channel of one chunk of tiles exist at a time. For the backward pass
-only the inputs are kept; spectra are computed again.
+take pixels out of the planes of their layers. The planes of one channel of one chunk of tiles exist at a
+time. For the backward pass only the inputs are kept; spectra are computed again.
 
 There is no direct convolution: it would pay for PSFs of a single pixel only (at 3 x 3 a loop over their pixels takes
 1.2 times as long as this, at 5 x 5 4.4 times; 1.4 megapixels, 21 layers, one core).
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -100,7 +100,7 @@ class _BlurThenMix(torch.autograd.Function):
                 light = torch.fft.fft2(work.windows(plane[:, c], chunk))
             if slopes.fraction is not None:
                 blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-                slopes.add_fraction(blurred, grad[:, c], places, chunk)
+                slopes.add_fraction(blurred, grad[:, c][chunk.pixels], places, chunk)
             if slopes.psfs is not None:
                 slopes.add_psfs(light, own, chunk, c)
             if full is not None:
@@ -137,10 +137,18 @@ class _SplitThenBlur(torch.autograd.Function):
             if mixed is not None or slopes.fraction is not None:
                 blurred = torch.fft.ifft2(work.blur(light, work.turned[c], chunk))
                 if slopes.fraction is not None:
-                    slopes.add_fraction(blurred, plane[:, c], places, chunk)
+                    slopes.add_fraction(blurred, plane[:, c][chunk.pixels], places, chunk)
                 if mixed is not None:
                     work.mix_into(mixed[:, c][chunk.pixels], blurred, places)
         return mixed, slopes.of_psfs(psfs, turned=True), slopes.fraction, None
+
+
+class Places(NamedTuple):
+    """Where pixels stand in the planes of their layers, in floats, and what share of them stands in the second."""
+
+    below: Tensor
+    above: Tensor | None
+    fraction: Tensor | None
 
 
 class _Work:
@@ -179,13 +187,13 @@ class _Work:
         """Spectra of the PSFs turned by 180 degrees: correlation is the transpose of convolution."""
         return torch.conj_physical(self.spectra)
 
-    def zero_spectra(self) -> Tensor:
+    def no_spectra(self) -> Tensor:
         """Return zeros of the shape of :attr:`spectra`."""
         shape = (self._psfs.shape[1], len(self.plan.present), self.plan.grid.size, self.plan.grid.size)
         return self._psfs.new_zeros(shape, dtype=self._dtype.to_complex())
 
-    def steps(self) -> Iterator[tuple[Chunk, Labels, int]]:
-        """Each channel of each chunk, and where its pixels stand, see :meth:`places`."""
+    def steps(self) -> Iterator[tuple[Chunk, Places, int]]:
+        """Yield each channel of each chunk, and the places of the chunk's pixels, which all channels share."""
         for chunk in self.plan.chunks:
             places = self.places(chunk)
             for channel in range(self._psfs.shape[1]):
@@ -215,10 +223,8 @@ class _Work:
             whole[:, : part.shape[1], part.shape[2] :] = 0
             whole[:, : part.shape[1], : part.shape[2]] = part
             part = whole
-        image, row, column = part.stride()
-        shape, strides = (2, *chunk.extent, size, size), (tile * column, image, tile * row, 2 * tile * column, row, column)
-        left, right = part.as_strided(shape, strides)
-        return torch.complex(left, right, out=self._planes("windows", *chunk.extent)).flatten(0, 2)
+        tiles, cut = part.unfold(1, size, tile).unfold(2, size, tile), self._planes("windows", *chunk.extent)
+        return torch.complex(tiles[:, :, 0::2], tiles[:, :, 1::2], out=cut).flatten(0, 2)
 
     def add_windows(self, plane: Tensor, windows: Tensor, chunk: Chunk) -> None:
         """Add a chunk's windows to a plane where :meth:`windows` cuts them: its transpose."""
@@ -244,27 +250,25 @@ class _Work:
 
     def blur(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Each pair's light times the spectrum of its layer: (pairs, size, size)."""
-        pairs = self._planes("pairs", len(chunk.block))
-        if not _by_runs(light):
-            return torch.index_select(spectra, 0, chunk.layer, out=pairs).mul_(light.index_select(0, chunk.block))
-        blocks, parts = light.unbind(), pairs.split(chunk.run_lengths)
-        for (block, _, layers), own in zip(chunk.runs, parts, strict=True):
-            torch.mul(spectra[layers], blocks[block], out=own)
+        pairs = torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(chunk.layer)))
+        if not _by_slices(light):
+            return pairs.mul_(light.index_select(0, chunk.block))
+        for own, block in zip(pairs.split(chunk.counts), light, strict=True):
+            own.mul_(block)
         return pairs
 
-    def sum_layers(self, pairs: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
-        """Each block's sum over its layers of their light times their spectrum. Writes over ``pairs``."""
-        total = self._planes("windows", math.prod(chunk.extent))
-        if not _by_runs(pairs):
-            return total.zero_().index_add_(0, chunk.block, pairs.mul_(spectra.index_select(0, chunk.layer)))
-        for _, own, layers in chunk.runs:
-            pairs[own].mul_(spectra[layers])
-        for block, own in zip(total, pairs.split(chunk.counts), strict=True):
-            torch.sum(own, 0, out=block)
+    def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
+        """Each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
+        own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(own))))
+        total = self._planes("windows", len(chunk.counts))
+        if not _by_slices(own):
+            return total.zero_().index_add_(0, chunk.block, own)
+        for block, pairs in zip(total, own.split(chunk.counts), strict=True):
+            torch.sum(pairs, 0, out=block)
         return total
 
-    def places(self, chunk: Chunk) -> Labels:
-        """Where each of a chunk's pixels stands in the planes of its layers, in floats."""
+    def places(self, chunk: Chunk) -> Places:
+        """Find each of a chunk's pixels in the planes of its layers."""
         images, y, x = chunk.pixels
         number = self._number[: images.stop - images.start, : y.stop - y.start, x]
         start = self.plan.start[(images.start * self.plan.grid.rows + chunk.rows.start) * self.plan.grid.columns :]
@@ -276,24 +280,24 @@ class _Work:
             torch.index_select(start.view(-1), 0, key.view(-1), out=place)
             found.append(place.view(key.shape).add_(self._inside[: y.stop - y.start, x]))
         fraction = self.plan.labels.fraction
-        return Labels(found[0], *found[1:] or [None], None if fraction is None else fraction[images, y, x])
+        return Places(found[0], None, None) if fraction is None else Places(found[0], found[1], fraction[images, y, x])
 
-    def mix_into(self, mixed: Tensor, planes: Tensor, places: Labels) -> None:
+    def mix_into(self, mixed: Tensor, planes: Tensor, places: Places) -> None:
         """Write each pixel's mean over its layers."""
         floats = torch.view_as_real(planes)
-        torch.take(floats, places.first, out=mixed)
-        if places.second is not None:
-            mixed.lerp_(torch.take(floats, places.second, out=self._buffer("above", mixed.shape)), places.fraction)
+        torch.take(floats, places.below, out=mixed)
+        if places.above is not None:
+            mixed.lerp_(torch.take(floats, places.above, out=self._buffer("above", mixed.shape)), places.fraction)
 
-    def put(self, light: Tensor, places: Labels, chunk: Chunk) -> Tensor:
+    def put(self, light: Tensor, places: Places, chunk: Chunk) -> Tensor:
         """Share each pixel out to the planes of its layers, the transpose of taking: (pairs, size, size) complex."""
-        planes = self._planes("pairs", len(chunk.block)).zero_()
+        planes = self._planes("pairs", len(chunk.layer)).zero_()
         floats = torch.view_as_real(planes)
-        if places.second is not None:
-            above = light * places.fraction
-            floats.put_(places.second, above)
-            light = torch.where(places.first == places.second, light, light - above)
-        floats.put_(places.first, light)
+        if places.above is not None:
+            shared = light * places.fraction
+            floats.put_(places.above, shared)
+            light = torch.where(places.below == places.above, light, light - shared)
+        floats.put_(places.below, light)
         return planes
 
 
@@ -303,24 +307,26 @@ class _Slopes:
     def __init__(self, wanted: tuple[bool, ...], plane: Tensor, work: _Work) -> None:
         self.work = work
         self.plane = wanted[0]
-        self.psfs = work.zero_spectra() if wanted[1] else None
-        self.fraction = plane.new_zeros(work.plan.labels.first.shape) if wanted[2] else None
+        self.psfs = work.no_spectra() if wanted[1] else None
+        self.fraction = plane.new_zeros(work.plan.labels.lower.shape) if wanted[2] else None
 
-    def add_fraction(self, blurred: Tensor, factor: Tensor, places: Labels, chunk: Chunk) -> None:
+    def add_fraction(self, blurred: Tensor, factor: Tensor, places: Places, chunk: Chunk) -> None:
         """What a pixel gains when its light moves to the layer above, times the gradient or the light it has."""
         assert self.fraction is not None
-        below, above = (torch.view_as_real(blurred).take(place) for place in places.terms())
-        self.fraction[chunk.pixels] += (above - below) * factor[chunk.pixels]
+        assert places.above is not None
+        floats = torch.view_as_real(blurred)
+        self.fraction[chunk.pixels] += (floats.take(places.above) - floats.take(places.below)) * factor
 
-    def add_psfs(self, light: Tensor, pairs: Tensor, chunk: Chunk, channel: int) -> None:
+    def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk, channel: int) -> None:
         """Correlate the layers' own pixels with the light of their windows."""
         assert self.psfs is not None
         light, sums = torch.conj_physical(light), self.psfs[channel]
-        if not _by_runs(light):
-            sums.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(pairs))
+        if not _by_slices(light):
+            sums.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
             return
-        for block, own, layers in chunk.runs:
-            sums[layers].addcmul_(pairs[own], light[block])
+        layers, blocks = sums.unbind(), light.unbind()
+        for block, layer, pair in zip(chunk.block.tolist(), chunk.layer.tolist(), own, strict=True):
+            layers[layer].addcmul_(blocks[block], pair)
 
     def of_psfs(self, psfs: Tensor, *, turned: bool) -> Tensor | None:
         """Left and right tiles correlate with themselves in the real part, with each other in the imaginary part."""
@@ -333,6 +339,6 @@ class _Slopes:
         return slope
 
 
-def _by_runs(planes: Tensor) -> bool:
-    """Runs pass over a processor's memory less often; all pairs at once start fewer kernels on an accelerator."""
+def _by_slices(planes: Tensor) -> bool:
+    """Slices pass over a processor's memory less often; all pairs at once start fewer kernels on an accelerator."""
     return planes.device.type == "cpu"
