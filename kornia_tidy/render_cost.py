@@ -154,7 +154,7 @@ def memory_bytes(geometry: BankGeometry, tiles: Tiles, channels: int, fidelity: 
     """Return the peak memory of a capture without gradients beyond the image: of the bank or the renderer, whichever.
 
     The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and as real matrices. The renderer
-    holds the PSFs and their spectra, the planes of a chunk of tiles and what belongs to pixels.
+    holds the PSFs and their spectra, the planes of a chunk of tiles in one channel and what belongs to pixels.
 
     Args:
         geometry: of the bank.
@@ -167,10 +167,10 @@ def memory_bytes(geometry: BankGeometry, tiles: Tiles, channels: int, fidelity: 
     side = max(geometry.samples(fidelity))
     psfs = real * max(layers, tiles.layers) * channels * window_side(fidelity) ** 2
     kernels = 2 * real * layers * side * geometry.pupil.amplitude.shape[-1]
-    plane = 2 * real * channels * tiles.size**2
+    plane = 2 * real * tiles.size**2
     chunk = 3 * max(CHUNK_BYTES["cpu"], plane * math.ceil(tiles.pairs / tiles.blocks))
-    pixels = tiles.pixels * (4 * channels * real + 5 * 8)
-    return int(psfs + max(4 * kernels, 2 * tiles.layers * plane + chunk + pixels))
+    pixels = tiles.pixels * (4 * channels * real + 2 * 8)
+    return int(psfs + max(4 * kernels, 2 * tiles.layers * channels * plane + chunk + pixels))
 
 
 def _weight(fidelity: Fidelity) -> int:

@@ -28,7 +28,7 @@ SIZES = (
 )
 # Bytes that the planes of a chunk may take in one channel: near a processor's cache (and below what makes an allocator
 # give memory back and fetch it again), or enough to keep an accelerator busy.
-CHUNK_BYTES = {"cpu": 4 << 20}
+CHUNK_BYTES = {"cpu": 5 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 
 

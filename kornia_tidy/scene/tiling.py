@@ -2,8 +2,8 @@
 
 Overlap-save for gather, overlap-add for scatter. Each is the other's transpose, so forward and backward passes are made
 of the same four steps: cut windows out of a plane, add windows to a plane, put pixels into the planes of their layers,
-take pixels out of the planes of their layers. The planes of one channel of one chunk of tiles exist at a
-time. For the backward pass only the inputs are kept; spectra are computed again.
+take pixels out of the planes of their layers. The planes of one chunk of tiles exist at a time, in one channel. For the
+backward pass only the inputs are kept; spectra are computed again.
 
 There is no direct convolution: it would pay for PSFs of a single pixel only (at 3 x 3 a loop over their pixels takes
 1.2 times as long as this, at 5 x 5 4.4 times; 1.4 megapixels, 21 layers, one core).
@@ -144,11 +144,10 @@ class _SplitThenBlur(torch.autograd.Function):
 
 
 class Places(NamedTuple):
-    """Where pixels stand in the planes of their layers, in floats, and what share of them stands in the second."""
+    """Where pixels stand in the planes of their lower layers, in floats; and in those above, with the share there."""
 
     below: Tensor
-    above: Tensor | None
-    fraction: Tensor | None
+    above: tuple[Tensor, Tensor] | None
 
 
 class _Work:
@@ -163,18 +162,17 @@ class _Work:
     """
 
     def __init__(self, plan: Plan, psfs: Tensor, offset: int) -> None:
-        self.plan = plan
+        self.plan, self._psfs = plan, psfs
         self._memory: dict[tuple[str, torch.dtype], Tensor] = {}
         self._dtype, self._device = psfs.dtype, psfs.device
         size, tile = plan.grid.size, plan.grid.tile
-        self._psfs = psfs
-        parts = [chunk.pixels for chunk in plan.chunks]
-        # The block of a pixel, times the number of layers, and where it stands in its window, in floats: alike for all
-        # rows of blocks.
-        sides = [max(part[axis].stop - part[axis].start for part in parts) for axis in range(2)]
-        images, y, x = (torch.arange(side, device=psfs.device) for side in (*sides, plan.grid.width))
+        images = torch.arange(max(chunk.batch.stop - chunk.batch.start for chunk in plan.chunks), device=psfs.device)
+        y = torch.arange(max(chunk.y.stop - chunk.y.start for chunk in plan.chunks), device=psfs.device)
+        x = torch.arange(plan.grid.width, device=psfs.device)
+        # A pixel's block times the number of layers, and where it stands in its window, counted in floats: alike for
+        # all rows of blocks.
         self._number = plan.grid.number(images, y, x) * plan.start.shape[1]
-        self._inside = 2 * ((y % tile + offset) * size)[:, None] + (2 * (x % tile + offset) + x // tile % 2)
+        self._inside = ((y % tile + offset) * (2 * size))[:, None] + (2 * (x % tile + offset) + x // tile % 2)
 
     @cached_property
     def spectra(self) -> Tensor:
@@ -271,6 +269,7 @@ class _Work:
         """Find each of a chunk's pixels in the planes of its layers."""
         images, y, x = chunk.pixels
         number = self._number[: images.stop - images.start, : y.stop - y.start, x]
+        # Blocks are counted from the first of the chunk's first row.
         start = self.plan.start[(images.start * self.plan.grid.rows + chunk.rows.start) * self.plan.grid.columns :]
         key = self._buffer("key", number.shape, torch.int64)
         found = []
@@ -280,23 +279,25 @@ class _Work:
             torch.index_select(start.view(-1), 0, key.view(-1), out=place)
             found.append(place.view(key.shape).add_(self._inside[: y.stop - y.start, x]))
         fraction = self.plan.labels.fraction
-        return Places(found[0], None, None) if fraction is None else Places(found[0], found[1], fraction[images, y, x])
+        return Places(found[0], None if fraction is None else (found[1], fraction[images, y, x]))
 
     def mix_into(self, mixed: Tensor, planes: Tensor, places: Places) -> None:
         """Write each pixel's mean over its layers."""
         floats = torch.view_as_real(planes)
         torch.take(floats, places.below, out=mixed)
         if places.above is not None:
-            mixed.lerp_(torch.take(floats, places.above, out=self._buffer("above", mixed.shape)), places.fraction)
+            above, share = places.above
+            mixed.lerp_(torch.take(floats, above, out=self._buffer("above", mixed.shape)), share)
 
     def put(self, light: Tensor, places: Places, chunk: Chunk) -> Tensor:
         """Share each pixel out to the planes of its layers, the transpose of taking: (pairs, size, size) complex."""
         planes = self._planes("pairs", len(chunk.layer)).zero_()
         floats = torch.view_as_real(planes)
         if places.above is not None:
-            shared = light * places.fraction
-            floats.put_(places.above, shared)
-            light = torch.where(places.below == places.above, light, light - shared)
+            above, share = places.above
+            shared = light * share
+            floats.put_(above, shared)
+            light = torch.where(places.below == above, light, light - shared)
         floats.put_(places.below, light)
         return planes
 
@@ -315,7 +316,7 @@ class _Slopes:
         assert self.fraction is not None
         assert places.above is not None
         floats = torch.view_as_real(blurred)
-        self.fraction[chunk.pixels] += (floats.take(places.above) - floats.take(places.below)) * factor
+        self.fraction[chunk.pixels] += (floats.take(places.above[0]) - floats.take(places.below)) * factor
 
     def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk, channel: int) -> None:
         """Correlate the layers' own pixels with the light of their windows."""
