@@ -41,21 +41,23 @@ def count_windows(labels: Labels, layers: int, window: int) -> Windows:
         window: side of the PSFs.
 
     Example:
-        >>> flat = Labels(torch.zeros(1, 72, 72, dtype=torch.int64), None, None)
+        >>> import torch
+        >>> flat = Labels(torch.zeros(1, 72, 72, dtype=torch.int64), None)
         >>> count_windows(flat, 3, 9).held.unique().tolist()
         [1]
     """
     terms = labels.terms()
-    height, width = (side - window + 1 for side in labels.first.shape[-2:])
+    height, width = (side - window + 1 for side in labels.lower.shape[-2:])
     grid = choose_grid(terms, (height, width), layers, window)
-    held = layers_of_windows(terms, grid, layers)
-    return Windows(grid.size, held, int(labels.present(layers + 1).sum()), labels.first.numel())
+    here = layers_of_windows(terms, grid, layers)
+    return Windows(grid.size, here.sum(1), int(here.any(0).sum()), labels.lower.numel())
 
 
 def windows_seconds(windows: Windows, channels: int) -> float:
     """Return the time of one capture on one core, whatever its precision: it is computed in float64.
 
     Example:
+        >>> import torch
         >>> f"{windows_seconds(Windows(64, torch.full((400,), 3), 21, 2**20), 3):.1g}"
         '0.3'
     """

@@ -131,10 +131,10 @@ def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
         >>> count_tiles(flat, 3, 9).layers
         1
     """
-    grid, sample = choose_grid(labels, layers, window), labels.change(lambda layer: layer[:, ::_STEP, ::_STEP])
-    pairs = int(grid.number(sample, layers, _STEP).present(grid.blocks * layers).sum())
-    present = int(sample.present(layers + 1).sum())
-    return Tiles(grid.size, grid.blocks, pairs, present, labels.first.numel(), 1 if labels.fraction is None else 2)
+    grid, sample = choose_grid(labels, layers, window), labels.every(_STEP)
+    here = grid.present(sample, layers, _STEP)
+    pairs, present = int(here.sum()), int(here.any(0).sum())
+    return Tiles(grid.size, grid.blocks, pairs, present, labels.lower.numel(), 1 if labels.fraction is None else 2)
 
 
 def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:
@@ -171,11 +171,11 @@ def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, laye
 
 
 def rendering_bytes(tiles: Tiles, channels: int, fidelity: Fidelity) -> int:
-    """Return what the renderer takes: PSFs' spectra, the planes of a chunk of tiles, and what belongs to pixels."""
+    """Return what the renderer takes: spectra, the planes of a chunk of tiles in one channel, labels and sums."""
     real = 4 * _weight(fidelity)
-    plane = 2 * real * channels * tiles.size**2
+    plane = 2 * real * tiles.size**2
     chunk = 3 * max(CHUNK_BYTES["cpu"], plane * math.ceil(tiles.pairs / tiles.blocks))
-    return 2 * tiles.layers * plane + chunk + tiles.pixels * (4 * channels * real + 5 * 8)
+    return 2 * tiles.layers * channels * plane + chunk + tiles.pixels * (4 * channels * real + 2 * 8)
 
 
 def _weight(fidelity: Fidelity) -> int:

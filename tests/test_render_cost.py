@@ -60,7 +60,7 @@ class TestCost(BaseTester):
         rows = torch.linspace(-10, 10, 300).view(1, 1, -1, 1).expand(1, 1, 300, 400)
         nodes = tuple(float(psi) for psi in range(-20, 21, 2))
         labels = label_pixels(rows, 2, nodes, "linear")
-        counted, plan = count_tiles(labels, len(nodes), 31), make_plan(labels, len(nodes), 31, 3)
+        counted, plan = count_tiles(labels, len(nodes), 31), make_plan(labels, len(nodes), 31)
         assert (counted.size, counted.blocks) == (plan.grid.size, plan.grid.blocks)
         assert 0.7 < counted.pairs / sum(len(chunk.block) for chunk in plan.chunks) <= 1
         assert counted.layers == len(plan.present) == 11

@@ -52,11 +52,11 @@ def dead_leaves(
 
     Shapes (ellipses, pebbles, polygons, leaves) have radii with density :math:`\propto r^{-3}`, which gives the power
     spectrum (:math:`1/f^2`) and the heavy-tailed gradients of natural images. Their inverse depths are
-    :math:`u^\gamma` from 0 at the far end to 1 at the near end. The density of u is :math:`\propto 1 / (b + (1 - b) u)`,
-    where b is the share of the picture that shows the background: this undoes the advantage of near leaves, so that the
-    u that is *seen* is uniform. In some scenes :math:`\gamma` is 1, and what is seen is uniform in dioptres, and with it
-    in defocus; in others it is up to 3, as most scenes hold more that is far (the mean is 0.35 of the range here, and
-    0.36 on 35 photographs with known depth).
+    :math:`u^\gamma` of the way from the far end to the near one. u has the density :math:`\propto 1 / (b + (1 - b) u)`,
+    where b is the share of the picture that shows the background: this undoes the advantage of near leaves, so that
+    what is *seen* is uniform in u. Where :math:`\gamma` is 1, it is uniform in dioptres, and with it in defocus; from
+    scene to scene it varies up to 3, as most scenes hold more that is far (the mean is 0.35 of the range here, and 0.36
+    on 35 photographs with known depth).
 
     Size, colour and texture do not depend on depth: besides occlusion, nothing but defocus tells how far a leaf is.
 

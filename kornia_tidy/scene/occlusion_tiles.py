@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.scene.convolution import next_fast_size
+from kornia_tidy.scene.tiles import Labels
 
 # Sides of transforms; and bytes that the complex planes of a chunk may take, see tiles.py.
 SIZES = (16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024)
@@ -93,7 +94,7 @@ def make_plan(
         dark: what lies beyond the border has no weight.
     """
     count, channels, psf_size = bank
-    labels = labels_of(lower, fraction, sloped=sloped)
+    labels = Labels(lower, fraction, sloped).terms()
     grid = choose_grid(labels, output, count, psf_size)
     here = _present(labels, grid, count, 1).cpu()
     used = here.any(0)
@@ -142,7 +143,7 @@ def choose_grid(labels: list[Tensor], output: tuple[int, int], count: int, psf_s
     sizes = [size for size in SIZES if smallest <= size < 2 * (psf_size - 1 + max(output))]
     batch = len(labels[0])
     grids = [Grid(batch, *output, size, size - psf_size + 1) for size in sizes or [next_fast_size(smallest)]]
-    costs = [windows_cost(layers_of_windows(labels, grid, count), grid.size) for grid in grids]
+    costs = [windows_cost(layers_of_windows(labels, grid, count).sum(1), grid.size) for grid in grids]
     return grids[int(torch.stack(costs).argmin())]
 
 
@@ -166,19 +167,9 @@ def windows_cost(layers: Tensor, size: int) -> Tensor:
     return each.sum() * (size**2 * (0.6 + size / 130))
 
 
-def labels_of(lower: Tensor, fraction: Tensor | None, *, sloped: bool) -> list[Tensor]:
-    """Return the one or two layers of each pixel. ``sloped``: a share of zero counts too."""
-    if fraction is None:
-        return [lower]
-    if sloped:
-        return [lower, lower + 1]
-    return [lower + (fraction == 1), lower + (fraction > 0)]
-
-
 def layers_of_windows(labels: list[Tensor], grid: Grid, count: int) -> Tensor:
-    """Return how many of the layers each window holds, looked at on every eighth row and column."""
-    sample = [label[:, ::SAMPLE, ::SAMPLE] for label in labels]
-    return _present(sample, grid, count, SAMPLE).sum(1)
+    """Return (tiles, count) bool: the layers in each tile's window, looked at on every eighth row and column."""
+    return _present([label[:, ::SAMPLE, ::SAMPLE] for label in labels], grid, count, SAMPLE)
 
 
 def _present(labels: list[Tensor], grid: Grid, count: int, step: int) -> Tensor:

@@ -4,16 +4,16 @@ A block is ``tile`` rows by ``2 tile`` columns: two tiles side by side. Seen thr
 window of ``size = tile + P - 1`` pixels a side. The left window is the real and the right one the imaginary part of a
 single complex plane: PSFs are real, so one complex transform serves both, at half the price of two.
 
-A pair is a block and a layer present in it. Each pair owns a complex plane of ``size`` x ``size`` for each channel, and
-each pixel has one place in the planes of each of its layers. Blocks are numbered image by image, row by row; pairs by
-block, then by layer.
+A pair is a block and a layer present in it. Each pair owns a complex plane of ``size`` x ``size``, and each pixel has
+one place in the planes of each of its layers; channels are worked on one after the other. Blocks are numbered image by
+image, row by row; pairs by block, then by layer.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -26,53 +26,47 @@ SIZES = (
     *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
     *(512, 576, 768, 1024, 1536, 2048),
 )
-# Bytes that the planes of a chunk may take: near a processor's cache (and below what makes an allocator give memory
-# back and fetch it again), or enough to keep an accelerator busy.
-CHUNK_BYTES = {"cpu": 6 << 20}
+# Bytes that the planes of a chunk may take in one channel: near a processor's cache (and below what makes an allocator
+# give memory back and fetch it again), or enough to keep an accelerator busy.
+CHUNK_BYTES = {"cpu": 5 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 
 
 @dataclass(frozen=True)
 class Labels:
-    """The layers of each pixel: all light to layer ``first``, or a share of it to layer ``second``.
+    """The layers of each pixel: all light to layer ``lower``, or a share of it to the next one.
 
     Args:
-        first: (B, H, W) int64 index of a layer.
-        second: (B, H, W) int64 index of a layer, ``first`` again where a pixel lies in one only; None for nearest.
-        fraction: (B, H, W) share of ``second``, or None for nearest layers.
+        lower: (B, H, W) int64 index of a layer, from :func:`~kornia_tidy.scene.layers.assign_layers`.
+        fraction: (B, H, W) share of the next layer, or None for nearest layers.
+        sloped: a layer with a share of zero counts too, for its gradient.
     """
 
-    first: Tensor
-    second: Tensor | None
+    lower: Tensor
     fraction: Tensor | None
+    sloped: bool = False
 
     @classmethod
     def of(cls, lower: Tensor, fraction: Tensor | None) -> Labels:
-        """Return the labels of layers that :func:`~kornia_tidy.scene.layers.assign_layers` gave, (B, H, W) each.
-
-        Where the gradient with respect to ``fraction`` is wanted, a layer with a share of zero counts too.
-        """
+        """Return the labels of layers as they were assigned, sloped where a gradient of ``fraction`` is wanted."""
         if fraction is None:
-            return cls(lower, None, None)
-        share = fraction.detach()
-        if fraction.requires_grad and torch.is_grad_enabled():
-            return cls(lower, lower + 1, share)
-        return cls(share.floor().long().add_(lower), share.ceil().long().add_(lower), share)
+            return cls(lower, None)
+        return cls(lower, fraction.detach(), fraction.requires_grad and torch.is_grad_enabled())
 
-    def change(self, function: Callable[[Tensor], Tensor]) -> Labels:
-        """Return the labels with a function applied to both indices."""
-        return replace(self, first=function(self.first), second=None if self.second is None else function(self.second))
+    def every(self, step: int) -> Labels:
+        """Return the labels of every ``step``-th row and column."""
+        kept = (slice(None), slice(None, None, step), slice(None, None, step))
+        return Labels(self.lower[kept], None if self.fraction is None else self.fraction[kept], self.sloped)
 
     def terms(self, *where: slice) -> list[Tensor]:
-        """Return the one or two indices of each pixel there."""
-        return [term[where] for term in (self.first, self.second) if term is not None]
-
-    def present(self, count: int) -> Tensor:
-        """Return (count,) bool: which of the indices occur."""
-        present = torch.zeros(count, dtype=torch.bool, device=self.first.device)
-        for term in self.terms():
-            present.index_fill_(0, term.reshape(-1), True)
-        return present
+        """Return the one or two layers of each pixel there: the same twice if it lies in one."""
+        lower = self.lower[where]
+        if self.fraction is None:
+            return [lower]
+        if self.sloped:
+            return [lower, lower + 1]
+        share = self.fraction[where]
+        return [lower + (share == 1), lower + (share > 0)]
 
 
 @dataclass(frozen=True)
@@ -110,14 +104,23 @@ class Grid:
         """Blocks of all images."""
         return self.batch * self.rows * self.columns
 
-    def number(self, labels: Labels, layers: int, step: int = 1) -> Labels:
-        """Return labels that number block and layer: block * layers + layer. Labels are of every ``step``-th pixel."""
-        device = labels.first.device
-        row = torch.arange(0, self.height, step, device=device).div_(self.tile, rounding_mode="floor")
-        column = torch.arange(0, self.width, step, device=device).div_(2 * self.tile, rounding_mode="floor")
-        image = torch.arange(self.batch, device=device)[:, None] * self.rows
-        rows = ((image + row) * (self.columns * layers)).unsqueeze(-1)
-        return labels.change(lambda first: (first + column * layers).add_(rows))
+    def number(self, images: Tensor, y: Tensor, x: Tensor) -> Tensor:
+        """Return the block of pixels, (images, y, x), by their indices along each axis."""
+        rows, columns = y // self.tile, x // (2 * self.tile)
+        return (images[:, None, None] * self.rows + rows[:, None]) * self.columns + columns
+
+    def present(self, labels: Labels, layers: int, step: int = 1) -> Tensor:
+        """Return (blocks, layers) bool: which of the layers a block contains. Labels are of every ``step``-th pixel."""
+        device = labels.lower.device
+        images = torch.arange(self.batch, device=device)
+        y, x = (torch.arange(0, side, step, device=device) for side in (self.height, self.width))
+        row, column = self.number(images, y, x[:1]) * layers, self.number(images[:1], y[:1], x) * layers
+        present = torch.zeros(self.blocks * layers, dtype=torch.bool, device=device)
+        for first in range(0, len(y), 64):  # in a processor's cache
+            part = slice(first, first + 64)
+            for layer in labels.terms(slice(None), part):
+                present.index_fill_(0, (layer + column).add_(row[:, part]).view(-1), True)
+        return present.view(-1, layers)
 
 
 @dataclass(frozen=True)
@@ -150,9 +153,10 @@ class Chunk:
         images, rows, columns = (part.stop - part.start for part in (self.batch, self.rows, self.columns))
         return images, rows, columns
 
-    def pixels(self, channel: int) -> tuple[slice, int, slice, slice]:
-        """Index of its pixels in (B, C, H, W)."""
-        return self.batch, channel, self.y, self.x
+    @property
+    def pixels(self) -> tuple[slice, slice, slice]:
+        """Index of its pixels in (B, H, W)."""
+        return self.batch, self.y, self.x
 
 
 @dataclass(frozen=True)
@@ -162,45 +166,40 @@ class Plan:
     Args:
         grid: the blocks.
         present: (D',) the layers that the scene contains.
-        labels: the block and layer of each pixel as one number, see :meth:`Grid.number`.
-        place: (blocks * D,) where the planes of a block and layer start within their chunk, in floats; of no meaning
-            if they are not a pair.
+        labels: the layers of each pixel.
+        start: (blocks, D) where the plane of a block and layer starts among its chunk's, in floats; of no meaning if
+            they are not a pair.
         chunks: the blocks in the order they are worked on.
     """
 
     grid: Grid
     present: Tensor
     labels: Labels
-    place: Tensor
+    start: Tensor
     chunks: list[Chunk]
 
 
-def make_plan(labels: Labels, layers: int, psf_size: int, channels: int) -> Plan:
+def make_plan(labels: Labels, layers: int, psf_size: int) -> Plan:
     """Choose the tiles for a scene, list the pairs of block and layer, and group them into chunks."""
-    device = labels.first.device
+    device = labels.lower.device
     grid = choose_grid(labels, layers, psf_size)
-    stride = 2 * channels * grid.size**2
+    stride = 2 * grid.size**2
     itemsize = 4 if labels.fraction is None else labels.fraction.element_size()
     limit = CHUNK_BYTES.get(device.type, CHUNK_BYTES_ACCELERATOR) // (stride * itemsize)
 
-    labels = grid.number(labels, layers)
-    pairs = labels.present(grid.blocks * layers)
-    used = pairs.view(-1, layers).any(0)
-    pairs = pairs.nonzero().squeeze(-1)
-    block, layer = pairs // layers, pairs % layers
-    ends = torch.zeros(grid.blocks + 1, dtype=torch.int64, device=device)
-    ends[1:] = torch.bincount(block, minlength=grid.blocks).cumsum(0)
-    counted = ends.tolist()
-    parts = list(_split(grid, counted, limit))
-    numbers = (used.cumsum(0) - 1)[layer]
-    place = torch.zeros(grid.blocks * layers, dtype=torch.int64, device=device)
+    here = grid.present(labels, layers)
+    used = here.any(0)
+    block, layer = here.nonzero().unbind(1)
+    number = (used.cumsum(0) - 1)[layer]
+    ends = [0, *here.sum(1).cumsum(0).tolist()]
+    start = torch.zeros(grid.blocks, layers, dtype=torch.int64, device=device)
     chunks = []
-    for extent, first, last in parts:
-        own = slice(counted[first], counted[last])
-        place[pairs[own]] = torch.arange(0, (own.stop - own.start) * stride, stride, device=device)
-        counts = [stop - start for start, stop in pairwise(counted[first : last + 1])]
-        chunks.append(_chunk(grid, extent, block[own] - first, numbers[own], counts))
-    return Plan(grid, used.nonzero().squeeze(-1), labels, place, chunks)
+    for extent, first, last in _split(grid, ends, limit):
+        own = slice(ends[first], ends[last])
+        start[block[own], layer[own]] = torch.arange(0, (own.stop - own.start) * stride, stride, device=device)
+        counts = [stop - start for start, stop in pairwise(ends[first : last + 1])]
+        chunks.append(_chunk(grid, extent, block[own] - first, number[own], counts))
+    return Plan(grid, used.nonzero().squeeze(-1), labels, start, chunks)
 
 
 def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
@@ -209,7 +208,7 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     Larger tiles waste less on their overlap, smaller ones hold fewer layers. The pairs of each candidate are counted
     on every eighth row and column.
     """
-    batch, height, width = labels.first.shape
+    batch, height, width = labels.lower.shape
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
     whole = psf_size - 1 + max(height, math.ceil(width / 2))
     sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
@@ -217,8 +216,8 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     if len(grids) == 1:
         return grids[0]
     step = 8
-    sample = labels.change(lambda first: first[:, ::step, ::step])
-    counts = [grid.number(sample, layers, step).present(grid.blocks * layers).sum() for grid in grids]
+    sample = labels.every(step)
+    counts = [grid.present(sample, layers, step).sum() for grid in grids]
     counted = zip(grids, torch.stack(counts).tolist(), strict=True)
     costs = [tile_cost(grid.size, grid.blocks, pairs) for grid, pairs in counted]
     return grids[costs.index(min(costs))]

@@ -295,7 +295,7 @@ class TestPlan(BaseTester):
         bank = make_bank(6, 1, 5, device=device)
         psi = depth_map(kind, bank, 37, 51)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
-        plan = make_plan(Labels.of(label, None), 6, 5, 1)
+        plan = make_plan(Labels.of(label, None), 6, 5)
         tile = plan.grid.tile
         expected = {
             (b, y // tile, x // (2 * tile), int(label[b, y, x])) for b in range(2) for y in range(37) for x in range(51)
