@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from kornia_tidy.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
+from kornia_tidy.render_cost import label_pixels
+from kornia_tidy.scene.occlusion_tiles import choose_grid, make_plan
+from tests.base import BaseTester
+
+NODES = tuple(float(psi) for psi in range(-20, 21, 2))
+
+MEMORY = """
+import sys, torch
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.planning import Planner
+import torch._dynamo  # counted as no part of the capture
+def peak():
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")) * 1024
+torch.set_num_threads(1)
+side, fidelity = int(sys.argv[1]), Fidelity(window=int(sys.argv[2]))
+options = {"compositing": "occlusion", "color_space": "linear", "memory_budget": 1 << 40}
+optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, **options)
+y = torch.linspace(0, 6, side)
+image, depth = torch.rand(1, 3, side, side), 0.31 + 1.2 * (1 + y.sin()[:, None] * y.cos())[None, None]
+with torch.no_grad():
+    optics(image[..., :80, :80], depth[..., :80, :80] * 0 + 0.31)
+    before = peak()
+    optics(image, depth)
+    used = peak() - before
+scene = Planner(optics, 3).scene(optics.camera.defocus(depth), image)
+print(scene._described(fidelity, 1.0).memory_bytes / used)
+"""
+
+
+def ramp(height: int, width: int) -> torch.Tensor:
+    return torch.linspace(-10, 10, height).view(1, 1, -1, 1).expand(1, 1, height, width)
+
+
+class TestCost(BaseTester):
+    @pytest.mark.parametrize("mode", ["nearest", "linear"])
+    def test_feature_windows_are_those_of_the_renderer(self, mode):
+        """Against the plan that the renderer makes, where every pixel is looked at."""
+        labels = label_pixels(ramp(330, 430), 1, NODES, mode)
+        counted = count_windows(labels, len(NODES), 31)
+        plan = make_plan(labels.lower, labels.fraction, (300, 400), (len(NODES), 3, 31), sloped=False, dark=False)
+        held = torch.cat([chunk.layers.new_full((len(chunk.layers),), chunk.layers.shape[1]) for chunk in plan.chunks])
+        assert counted.size == plan.grid.size
+        assert 0.8 < counted.held.sum() / held.sum() <= 1
+        assert counted.layers == len(plan.present) == 11
+        assert counted.pixels == 330 * 430
+
+    def test_feature_wide_psfs_do_not_get_windows_beyond_the_cache(self):
+        """A flat scene has one layer whatever the tiles; where there are many, small windows are cheaper a sample."""
+        many = label_pixels(ramp(200, 200), 1, NODES, "nearest").terms()
+        assert choose_grid(many, (200, 200), len(NODES), 65).size == 144
+
+    def test_feature_time_grows_with_channels_and_with_layers(self):
+        few, many = (Windows(64, torch.full((40,), number), 21, 2**16) for number in (2, 4))
+        assert windows_seconds(few, 3) == pytest.approx(3 * windows_seconds(few, 1))
+        assert 2 < windows_seconds(many, 1) / windows_seconds(few, 1) < 3
+
+    def test_feature_memory_grows_with_the_layers_of_a_window_and_the_precision_of_the_image(self):
+        few, many = (Windows(256, torch.full((40,), number), 21, 2**20) for number in (2, 40))
+        assert windows_bytes(many, 3, 4) > windows_bytes(few, 3, 4)
+        assert windows_bytes(few, 3, 8) - windows_bytes(few, 3, 4) == 2 * 3 * 4 * 2**20
+
+    @pytest.mark.slow
+    @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of memory is read from Linux's /proc")
+    @pytest.mark.parametrize(("side", "window"), [(1024, 23), (768, 65)])
+    def test_feature_memory_is_what_the_process_takes(self, side, window):
+        run = [sys.executable, "-c", MEMORY, str(side), str(window)]
+        done = subprocess.run(run, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert 0.7 < float(done.stdout) < 1.6
