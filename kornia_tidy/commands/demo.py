@@ -32,11 +32,12 @@ from kornia_tidy.training.trained import TrainedSystem
 DESCRIPTION = """\
 Photograph a scene with a camera whose five phase masks were learnt together with a network, and let the network
 reconstruct from that one capture an image in focus everywhere and the depth of every pixel; beside it the same with one
-mask and with a plain lens. Without IMAGE and DEPTH the scene is made by the library. The depths of IMAGE are stretched,
-in dioptres, over the range for which the masks were learnt.
+mask and with a plain lens, and what five masks give that were learnt for the image alone (EDoF). Without IMAGE and
+DEPTH the scene is made by the library. The depths of IMAGE are stretched, in dioptres, over the range for which the
+masks were learnt.
 """
 
-SYSTEMS = {"plain": "joint-0", "K = 1": "joint-1", "K = 5": "joint-5"}
+SYSTEMS = {"plain": "joint-0", "K = 1": "joint-1", "K = 5": "joint-5", "K=5 EDoF": "edof-5"}
 LARGEST = 1024  # pixels of the longer side; larger pictures are made smaller, to keep a demonstration short
 DOTS_PER_INCH = 150
 CAPTION = (
@@ -71,7 +72,11 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     stages = Stages()
     progress = tqdm(
-        total=6, desc="demo", bar_format="{desc}: {bar} {n}/{total} {postfix}", file=sys.stderr, leave=False
+        total=len(SYSTEMS) + 3,
+        desc="demo",
+        bar_format="{desc}: {bar} {n}/{total} {postfix}",
+        file=sys.stderr,
+        leave=False,
     )
 
     def step(name: str) -> Any:
@@ -87,31 +92,34 @@ def run(args: argparse.Namespace) -> None:
             assert isinstance(camera, ThinLensCamera)  # which the systems were trained with
             scene = _scene(args, camera)
             near = nearness(camera, scene.depth)
-        estimates = []
+        estimates = {}
         for name, system in systems.items():
             with step(name):
-                estimates.append(_estimate(name, system, scene, args.seed))
+                estimates[name] = _estimate(name, system, scene, args.seed)
+        best = estimates["K = 5"]
         with step("first mask"):
             times = DwellTimes([1.0] + [0.0] * (len(optics.masks.phase) - 1))
             first = TiDyOptics(optics.masks, optics.camera, times, optics.sensor, optics.fidelity)
             alone = first(scene.image, scene.depth, generator=torch.Generator().manual_seed(args.seed))
         with step("pictures"):
             explained, reconstructed = BytesIO(), BytesIO()
-            coded = estimates[-1].capture
-            explain(scene.image, scene.depth, optics, alone, coded, CAPTION).savefig(explained, dpi=DOTS_PER_INCH)
-            figure = draw_estimates(scene.image, near, estimates, scene.valid)
+            explain(scene.image, scene.depth, optics, alone, best.capture, CAPTION).savefig(
+                explained, dpi=DOTS_PER_INCH
+            )
+            figure = draw_estimates(scene.image, near, list(estimates.values()), scene.valid)
             figure.savefig(reconstructed, dpi=DOTS_PER_INCH)
         bank = optics.psf_bank()
 
-    best = estimates[-1]
+    assert best.nearness is not None  # it is a joint system
     pictures = {
         "scene.png": scene.image,
         "depth.png": near,
-        "coded_plain.png": estimates[0].capture,
-        "coded_k1.png": estimates[1].capture,
+        "coded_plain.png": estimates["plain"].capture,
+        "coded_k1.png": estimates["K = 1"].capture,
         "coded_k5.png": best.capture,
         "estimated_scene.png": best.image,
         "estimated_depth.png": best.nearness,
+        "estimated_scene_alone.png": estimates["K=5 EDoF"].image,
     }
     files = {"demo.png": explained.getvalue(), "reconstruction.png": reconstructed.getvalue()}
     with stages("write"):
@@ -122,18 +130,23 @@ def run(args: argparse.Namespace) -> None:
     tell("masks", f"{optics.masks.extra_repr()}, learnt in {systems['K = 5'].step} steps on dead leaves")
     tell("PSFs", light_in_words(bank, optics))
     tell("clamped", clamped_in_words(optics, scene.depth))
-    for estimate in estimates:
-        scores = estimate.scores(scene.image, near, scene.valid)
-        tell(
-            estimate.name,
-            f"capture {scores['capture_psnr']:.2f} dB; all in focus {scores['image_psnr']:.2f} dB, "
-            f"SSIM {scores['image_ssim']:.3f}; depth RMSE {scores['depth_rmse']:.3f} of the range",
-        )
+    _tell_scores(estimates, scene, near)
     tell("wrote", f"{folder / 'demo.png'}: how the capture comes about")
     tell("", f"{folder / 'reconstruction.png'}: what is made of it")
     for name in pictures:
         tell("", str(folder / name))
     tell("time", stages.summary())
+
+
+def _tell_scores(estimates: Mapping[str, Estimate], scene: Scene, near: Tensor) -> None:
+    for name, estimate in estimates.items():
+        scores = estimate.scores(scene.image, near, scene.valid)
+        depth = f"; depth RMSE {scores['depth_rmse']:.3f} of the range" if estimate.nearness is not None else ""
+        tell(
+            name,
+            f"capture {scores['capture_psnr']:.2f} dB; all in focus {scores['image_psnr']:.2f} dB, "
+            f"SSIM {scores['image_ssim']:.3f}{depth}",
+        )
 
 
 def _write(folder: Path, pictures: Mapping[str, Tensor], files: Mapping[str, bytes]) -> None:
@@ -148,7 +161,7 @@ def _estimate(name: str, system: TrainedSystem, scene: Scene, noise: int) -> Est
     """Photograph a scene and reconstruct it."""
     capture = system.optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(noise))
     maps = split_maps(system.settings.task, system.head(capture[None]))
-    return Estimate(name, capture, maps["image"][0], maps["depth"][0])
+    return Estimate(name, capture, maps["image"][0], maps["depth"][0] if "depth" in maps else None)
 
 
 def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:

@@ -21,30 +21,33 @@ HEADINGS = ("the scene", "capture", "all-in-focus estimate", "its error, x3", "d
 
 
 class Estimate(NamedTuple):
-    """What one camera and its network made of a scene; maps are (C, H, W), depth as nearness in [0, 1]."""
+    """What one camera and its network made of a scene; maps are (C, H, W), depth as nearness in [0, 1] or unknown."""
 
     name: str
     capture: Tensor
     image: Tensor
-    nearness: Tensor
+    nearness: Tensor | None
 
     def scores(self, image: Tensor, nearness: Tensor, known: Tensor | None = None) -> dict[str, float]:
         """Return PSNR (dB) of capture and image, SSIM of the image, and RMSE of the nearness where it is known."""
         truth = image[None]
-        return {
+        scores = {
             "capture_psnr": float(psnr(self.capture[None], truth)),
             "image_psnr": float(psnr(self.image[None].clamp(0, 1), truth)),
             "image_ssim": float(ssim(self.image[None].clamp(0, 1), truth)),
-            "depth_rmse": float(
-                rmse(self.nearness[None].clamp(0, 1), nearness[None], None if known is None else known[None])
-            ),
         }
+        if self.nearness is None:
+            return scores
+        where = None if known is None else known[None]
+        return {**scores, "depth_rmse": float(rmse(self.nearness[None].clamp(0, 1), nearness[None], where))}
 
 
 def draw_estimates(
     image: Tensor, nearness: Tensor, estimates: Sequence[Estimate], known: Tensor | None = None
 ) -> Figure:
     """Draw a row for each camera: the capture, image and depth that a network makes of it, and where they err.
+
+    A network that estimates no depth leaves its places empty.
 
     Args:
         image: the scene in focus, (3, H, W) in [0, 1].
@@ -71,7 +74,9 @@ def draw_estimates(
     axes = figure.subplots(len(estimates), len(HEADINGS), squeeze=False)
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
     figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus, and how far it is", fontsize=14)
-    legend = "K: number of masks shown in turn during the exposure; plain: a lens without a mask; x3: times three"
+    legend = (
+        "K: masks shown in turn during the exposure; plain: none; EDoF: learnt for the image alone; x3: times three"
+    )
     figure.text(0.98, 1 - 0.28 / height, legend, fontsize=LABEL, color=FAINT, ha="right")
     for y, estimate in enumerate(estimates):
         scores = estimate.scores(image, nearness, known)
@@ -79,9 +84,14 @@ def draw_estimates(
             (estimate.capture, f"{scores['capture_psnr']:.1f} dB"),
             (estimate.image, f"{scores['image_psnr']:.1f} dB, SSIM {scores['image_ssim']:.2f}"),
             ((estimate.image - image).abs() * ERROR_SCALE, ""),
-            (_in_colors(estimate.nearness), f"RMSE {scores['depth_rmse']:.3f} of the range"),
-            ((estimate.nearness - nearness).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
         ]
+        if estimate.nearness is not None:
+            pictures += [
+                (_in_colors(estimate.nearness), f"RMSE {scores['depth_rmse']:.3f} of the range"),
+                ((estimate.nearness - nearness).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
+            ]
+        for empty in axes[y][1 + len(pictures) :]:
+            empty.set_axis_off()
         for x, (picture, words) in enumerate(pictures, start=1):
             _show(axes[y][x], picture, words, HEADINGS[x] if y == 0 else "")
         axes[y][1].text(

@@ -39,6 +39,13 @@ class TestDrawEstimates(BaseTester):
 
         assert scores["depth_rmse"] == pytest.approx(float((nearness * 0.5).square().mean().sqrt()), rel=1e-5)
 
+    def test_feature_an_estimate_without_depth_leaves_its_places_empty(self):
+        image, nearness = scene()
+        estimates = [Estimate("K = 1", image, image, nearness), Estimate("edof", image, image, None)]
+        assert "depth_rmse" not in estimates[1].scores(image, nearness)
+        shown = [axes.axison for axes in draw_estimates(image, nearness, estimates).axes]
+        assert shown == 6 * [True] + 4 * [True] + 2 * [False]
+
     def test_exception_one_estimate_is_no_comparison(self):
         image, nearness = scene()
         with pytest.raises(ValueError, match="compares two estimates or more, got 1"):
