@@ -59,7 +59,7 @@ def windows_seconds(windows: Windows, channels: int) -> float:
     Example:
         >>> import torch
         >>> f"{windows_seconds(Windows(64, torch.full((400,), 3), 21, 2**20), 3):.1g}"
-        '0.3'
+        '0.4'
     """
     return float(windows_cost(windows.held, windows.size)) * channels * 1e-9
 
