@@ -410,7 +410,7 @@ class TestTiledOcclusion(BaseTester):
             patch.setattr(occlusion_tiles, "CHUNK_BYTES_ACCELERATOR", 200_000)
             with largest:
                 render(image, defocus, bank, "occlusion").sum().backward()
-        assert largest.bytes < 500_000  # two tiles of 20 layers at least; the planes of all layers are 5 MB and more
+        assert largest.bytes < 1_600_000  # two tiles of 20 layers at least; the planes of all layers are 5 MB and more
 
     @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
     @pytest.mark.usefixtures("small_tiles")
