@@ -391,6 +391,13 @@ class TestPlan(BaseTester):
         assert "states" not in str(other)
         assert plan.seconds > 3 * other.seconds
 
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_memory_layout_of_depth_does_not_matter(self, compositing):
+        depth = torch.linspace(0.4, 3, 48 * 64).view(1, 48, 64)
+        optics = TiDyOptics(PixelwiseMask(1, initial="flat"), sensor=None, compositing=compositing, border="valid")
+        turned = depth.mT.contiguous().mT
+        assert optics.plan(turned, tolerance=1e-2) == optics.plan(depth, tolerance=1e-2)
+
     def test_exception_the_mean_of_states_has_no_known_error_where_layers_hide_others(self):
         optics = TiDyOptics(PixelwiseMask(2, 15), sensor=None, compositing="occlusion")
         scene = Planner(optics, 3).scene(torch.zeros(1, 1, 40, 40))

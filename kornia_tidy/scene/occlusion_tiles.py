@@ -189,8 +189,8 @@ def _present(labels: list[Tensor], grid: Grid, count: int, step: int) -> Tensor:
         here = table[row * own_row :]
         for label in labels:
             keys = label[:, math.ceil(top / step) : math.ceil(bottom / step)] + first
-            here.index_fill_(0, keys.view(-1), True)
-            here.index_fill_(0, keys[..., reached].sub_(count).view(-1), True)
+            here.index_fill_(0, keys.reshape(-1), True)
+            here.index_fill_(0, keys[..., reached].sub_(count).reshape(-1), True)
     return table.view(-1, count)
 
 

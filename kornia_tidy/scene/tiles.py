@@ -119,7 +119,7 @@ class Grid:
         for first in range(0, len(y), 64):  # in a processor's cache
             part = slice(first, first + 64)
             for layer in labels.terms(slice(None), part):
-                present.index_fill_(0, (layer + column).add_(row[:, part]).view(-1), True)
+                present.index_fill_(0, (layer + column).add_(row[:, part]).reshape(-1), True)
         return present.view(-1, layers)
 
 
