@@ -56,7 +56,7 @@ def camera_tags(data: bytes) -> dict[str, Any]:
 def black_tile(data: bytes) -> list[list[float]] | None:
     """Return the black levels of a DNG that repeats them over more than 2x2 pixels, by rows; None if it does not."""
     for directory in tiff_directories(data):
-        rows, columns = (directory.get(BLACK_REPEAT) or (1, 1))[:2]
+        rows, columns = (*_whole_numbers(directory, BLACK_REPEAT), 1, 1)[:2]
         levels = directory.get(BLACK_LEVEL, ())
         if max(rows, columns) > 2 and len(levels) == rows * columns and all(map(math.isfinite, levels)):
             return [list(levels[row * columns : (row + 1) * columns]) for row in range(rows)]
@@ -77,14 +77,20 @@ def missing_bytes(data: bytes) -> int:
     directories = list(tiff_directories(data))
     if not directories or DNG_VERSION not in directories[0]:
         return 0
-    whole = [directory for directory in directories if directory.get(SUBFILE_TYPE, (0,))[0] == 0]
+    whole = [directory for directory in directories if not any(_whole_numbers(directory, SUBFILE_TYPE)[:1])]
     ends = [
         offset + length
         for directory in whole
         for offsets, lengths in STORED
-        for offset, length in zip(directory.get(offsets, ()), directory.get(lengths, ()), strict=False)
+        for offset, length in zip(_whole_numbers(directory, offsets), _whole_numbers(directory, lengths), strict=False)
     ]
     return max(0, max(ends, default=0) - len(data))
+
+
+def _whole_numbers(directory: Directory, tag: int) -> tuple[int, ...]:
+    """Return the values of a tag; none if it has none or, in a damaged file, of another type."""
+    values = directory.get(tag, ())
+    return tuple(values) if all(type(value) is int for value in values) else ()
 
 
 def tiff_directories(data: bytes) -> Iterator[Directory]:

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.sensor.raw_tags import black_tile, camera_tags, kodak_matrix, missing_bytes, tiff_directories
@@ -64,6 +64,7 @@ class TestCameraTags(BaseTester):
         black_tile(start + data)
         kodak_matrix(start + data)
 
+    @example([(15, 4)])  # a tag without values
     @given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), max_size=30))
     @settings(max_examples=200, deadline=None)
     def test_feature_a_damaged_header_ends_well(self, changes):
