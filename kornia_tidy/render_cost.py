@@ -21,12 +21,11 @@ from kornia_tidy.optics.propagation import energy_operations, gauss_legendre_ord
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.scene.layers import assign_layers
-from kornia_tidy.scene.tiles import CHUNK_BYTES, Labels, choose_grid, tile_cost
+from kornia_tidy.scene.tiles import CHUNK_BYTES, SAMPLE, Labels, choose_grid, tile_cost
 
 BANK_RATE = {False: 60e9, True: 35e9}  # operations a second of a PSF bank in float32, and in float64, counted twice
 TILE_FACTOR = 1.1  # of what the renderer takes over the cost by which it chooses its tiles
 PIXEL_NANOSECONDS = 8.5  # of a channel of a pixel and each layer that it takes light from
-_STEP = 8  # px between those of which the layers are counted
 
 _points = cache(gauss_legendre_order)
 
@@ -131,8 +130,8 @@ def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
         >>> count_tiles(flat, 3, 9).layers
         1
     """
-    grid, sample = choose_grid(labels, layers, window), labels.every(_STEP)
-    here = grid.present(sample, layers, _STEP)
+    grid, sample = choose_grid(labels, layers, window), labels.every(SAMPLE)
+    here = grid.present(sample, layers, SAMPLE)
     pairs, present = int(here.sum()), int(here.any(0).sum())
     return Tiles(grid.size, grid.blocks, pairs, present, labels.lower.numel(), 1 if labels.fraction is None else 2)
 
@@ -162,7 +161,8 @@ def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, laye
         channels: of the image.
         fidelity: its window, points and precision count.
         layers: PSFs held.
-        rendering: what the renderer takes, see :func:`rendering_bytes`.
+        rendering: what the renderer takes, see :func:`rendering_bytes`; where layers hide one another,
+            :func:`kornia_tidy.occlusion_cost.windows_bytes`.
     """
     real = 4 * _weight(fidelity)
     psfs = real * layers * channels * window_side(fidelity) ** 2

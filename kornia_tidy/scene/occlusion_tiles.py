@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.scene.convolution import next_fast_size
-from kornia_tidy.scene.tiles import Labels
+from kornia_tidy.scene.tiles import SAMPLE, Labels
 
 # Sides of transforms; and bytes that the complex planes of a chunk may take, see tiles.py.
 SIZES = (16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024)
 CHUNK_BYTES = {"cpu": 2 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
-SAMPLE = 8  # px between the rows and columns on which the layers of candidates are counted
 
 Corner = tuple[int, int, int]  # image, first row and first column of a window in the padded plane, and of its tile
 
@@ -139,9 +138,9 @@ def choose_grid(labels: list[Tensor], output: tuple[int, int], count: int, psf_s
     Larger tiles waste less on their overlap, smaller ones hold fewer layers. The layers of each candidate are counted
     on every eighth row and column.
     """
+    batch = len(labels[0])
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: a window meets only next neighbours
     sizes = [size for size in SIZES if smallest <= size < 2 * (psf_size - 1 + max(output))]
-    batch = len(labels[0])
     grids = [Grid(batch, *output, size, size - psf_size + 1) for size in sizes or [next_fast_size(smallest)]]
     costs = [windows_cost(layers_of_windows(labels, grid, count).sum(1), grid.size) for grid in grids]
     return grids[int(torch.stack(costs).argmin())]

@@ -30,6 +30,7 @@ SIZES = (
 # give memory back and fetch it again), or enough to keep an accelerator busy.
 CHUNK_BYTES = {"cpu": 5 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
+SAMPLE = 8  # px between the rows and columns on which the layers of candidates are counted
 
 
 @dataclass(frozen=True)
@@ -215,9 +216,8 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     grids = [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
     if len(grids) == 1:
         return grids[0]
-    step = 8
-    sample = labels.every(step)
-    counts = [grid.present(sample, layers, step).sum() for grid in grids]
+    sample = labels.every(SAMPLE)
+    counts = [grid.present(sample, layers, SAMPLE).sum() for grid in grids]
     counted = zip(grids, torch.stack(counts).tolist(), strict=True)
     costs = [tile_cost(grid.size, grid.blocks, pairs) for grid, pairs in counted]
     return grids[costs.index(min(costs))]
