@@ -14,7 +14,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -124,6 +126,14 @@ class Grid:
         return present.view(-1, layers)
 
 
+class Run(NamedTuple):
+    """Pairs of one block whose layers follow one another: one product with their spectra serves them all."""
+
+    block: int
+    pairs: slice
+    layers: slice
+
+
 @dataclass(frozen=True)
 class Chunk:
     """Blocks that are worked on together: some images, or some rows of one image, or a part of one row.
@@ -153,6 +163,20 @@ class Chunk:
         """Images, rows and columns of blocks."""
         images, rows, columns = (part.stop - part.start for part in (self.batch, self.rows, self.columns))
         return images, rows, columns
+
+    @cached_property
+    def runs(self) -> list[Run]:
+        """Its pairs, in as few runs as they make."""
+        block, layer = self.block.tolist(), self.layer.tolist()
+        starts = [
+            pair
+            for pair in range(len(block))
+            if pair == 0 or block[pair] != block[pair - 1] or layer[pair] != layer[pair - 1] + 1
+        ]
+        return [
+            Run(block[start], slice(start, stop), slice(layer[start], layer[stop - 1] + 1))
+            for start, stop in pairwise([*starts, len(block)])
+        ]
 
     @property
     def pixels(self) -> tuple[slice, slice, slice]:

@@ -248,19 +248,20 @@ class _Work:
 
     def blur(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Each pair's light times the spectrum of its layer: (pairs, size, size)."""
-        pairs = torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(chunk.layer)))
+        pairs = self._planes("pairs", len(chunk.layer))
         if not _by_slices(light):
-            return pairs.mul_(light.index_select(0, chunk.block))
-        for own, block in zip(pairs.split(chunk.counts), light, strict=True):
-            own.mul_(block)
+            return torch.mul(spectra[chunk.layer], light[chunk.block], out=pairs)
+        for run in chunk.runs:
+            torch.mul(spectra[run.layers], light[run.block], out=pairs[run.pairs])
         return pairs
 
     def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
-        own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(own))))
         total = self._planes("windows", len(chunk.counts))
         if not _by_slices(own):
-            return total.zero_().index_add_(0, chunk.block, own)
+            return total.zero_().index_add_(0, chunk.block, own.mul_(spectra[chunk.layer]))
+        for run in chunk.runs:
+            own[run.pairs].mul_(spectra[run.layers])
         for block, pairs in zip(total, own.split(chunk.counts), strict=True):
             torch.sum(pairs, 0, out=block)
         return total
@@ -325,9 +326,8 @@ class _Slopes:
         if not _by_slices(light):
             sums.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
             return
-        layers, blocks = sums.unbind(), light.unbind()
-        for block, layer, pair in zip(chunk.block.tolist(), chunk.layer.tolist(), own, strict=True):
-            layers[layer].addcmul_(blocks[block], pair)
+        for run in chunk.runs:
+            sums[run.layers].addcmul_(light[run.block], own[run.pairs])
 
     def of_psfs(self, psfs: Tensor, *, turned: bool) -> Tensor | None:
         """Left and right tiles correlate with themselves in the real part, with each other in the imaginary part."""
