@@ -4,7 +4,8 @@ Every system is trained with the same scenes, network and steps, all of which ``
 differ. None of the scenes of the tables is ever trained on.
 
 - ``python -m tests.benchmarks.heads train FOLDER``: each system in a folder of its own; goes on where it stopped. Two
-  such commands may share the work (``--tasks``, ``--masks``, ``--seeds``).
+  such commands may share the work (``--tasks``, ``--masks``, ``--seeds``). ``--sigma`` is the noise of the sensor, which
+  decides what averages are worth; a folder for each.
 - ``... score FOLDER``: each system on new dead leaves and on the real scenes, where these are on the machine.
 - ``... table FOLDER``: prints the table, means over scenes and their spread over seeds.
 - ``... ship FOLDER``: of each kind that the library names, the system with the lowest validation loss.
@@ -84,14 +85,15 @@ def folder_of(root: Path, task: str, masks: int, seed: int) -> Path:
     return root / f"{task}-{masks}-seed{seed}"
 
 
-def train_all(root: Path, tasks: list[str], masks: list[int], seeds: list[int]) -> None:
-    """Train what is not yet trained."""
+def train_all(root: Path, tasks: list[str], masks: list[int], seeds: list[int], sigma: float) -> None:
+    """Train what is not yet trained, at a read noise of ``sigma`` of full scale."""
     for seed in seeds:
         for task in tasks:
             for number in masks:
                 folder = folder_of(root, task, number, seed)
                 print(folder.name, flush=True)
-                train(TASKS[task].replace(masks=number, seed=seed), folder, resume=True, progress=True)
+                settings = TASKS[task].replace(masks=number, seed=seed, sigma=sigma)
+                train(settings, folder, resume=True, progress=True)
 
 
 def is_trained(folder: Path) -> bool:
@@ -159,7 +161,7 @@ def table(root: Path) -> str:
 
 def ship_all(root: Path) -> None:
     """Put the best systems into the library, and beside them how they came about."""
-    systems = {}
+    systems, settings = {}, {}
     for name in PRETRAINED:
         task, masks = name.split("-")
         runs = {}
@@ -169,6 +171,7 @@ def ship_all(root: Path) -> None:
                 runs[folder] = min(float(row["val_loss"]) for row in _rows(folder / "validation.csv"))
         best = min(runs, key=lambda folder: runs[folder])
         ship(best / BEST, FOLDER / f"{name}.safetensors")
+        settings[task] = TrainingSettings.read(best / "settings.json").replace(masks=5, seed=0).as_dict()
         seconds = [float(row["seconds_a_step"]) for row in _rows(best / "training.csv")]
         systems[name] = {
             "seed": int(best.name[-1]),
@@ -183,7 +186,7 @@ def ship_all(root: Path) -> None:
         "commit": subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], text=True).strip(),
         "machine": f"{platform.machine()}, one thread a run, {os.cpu_count()} cores shared",
         "torch": torch.__version__,
-        "settings": {task: settings.as_dict() for task, settings in TASKS.items()},
+        "settings": settings,
         "systems": systems,
     }
     write_bytes(FOLDER / "heads.json", (json.dumps(about, indent=1) + "\n").encode())
@@ -202,9 +205,10 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--masks", nargs="+", type=int, choices=MASKS, default=list(MASKS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--sigma", type=float, default=SETTINGS.sigma, help="noise of the sensor (%(default)s)")
     args = parser.parse_args()
     if args.command == "train":
-        train_all(args.folder, args.tasks, args.masks, args.seeds)
+        train_all(args.folder, args.tasks, args.masks, args.seeds, args.sigma)
     elif args.command == "score":
         score_all(args.folder)
     elif args.command == "table":
