@@ -12,7 +12,8 @@ from kornia_tidy.optics.phase_masks import PixelwiseMask, ZernikeMask
 from kornia_tidy.optics.phase_masks.base import mask_axes
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
-STARTS = ("noise", "fisher, noise", "fisher, noisy fishers", "3 fishers, 2 noisy", "focal sweep")
+CLEAN = {"noisy fishers": 0, "fisher, noisy fishers": 1, "3 fishers, 2 noisy": 3}  # Fisher masks without noise
+STARTS = ("noise", "fisher, noise", *CLEAN, "focal sweep")
 
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
 SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; each of the five is sharp at a depth of its own
@@ -61,12 +62,13 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     """Return the five masks that a sequence starts from.
 
     Args:
-        start: one of the paper's four, or of our own for extended depth of field:
+        start: one of the paper's, or of our own for extended depth of field:
 
             - ``"noise"``: each uniform on [0, 1.2e-6] m.
             - ``"fisher, noise"``: the first the Fisher mask, the others such noise.
-            - ``"fisher, noisy fishers"``: Fisher masks turned by a quarter each, all but the first with noise added,
-              normal of mean 5.35e-7 and standard deviation 3.05e-7 m.
+            - ``"noisy fishers"``: Fisher masks turned by a quarter each, with noise added, normal of mean 5.35e-7 and
+              standard deviation 3.05e-7 m.
+            - ``"fisher, noisy fishers"``: the same, the first without noise.
             - ``"3 fishers, 2 noisy"``: the same, with noise on the last two.
             - ``"focal sweep"``: lenses focused at a defocus of 0, -8, 8, -16 and 16 rad, with normal noise of
               6e-8 m.
@@ -83,9 +85,10 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
         - The noise's mean only raises a mask, which changes nothing; its numbers are the mean and the standard
           deviation of PhaseCam3D's published heights.
 
-    Source: Shah et al., TiDy-PSFs (ICCV 2023), the ablation of initial masks, which ranks them for depth (RMSE 0.0254,
-    0.0329, 0.0271 and 0.0207 in this order); Nagahara et al., Flexible Depth of Field
-    Photography (ECCV 2008), for the sweep of focus.
+    Source: Shah et al., TiDy-PSFs (ICCV 2023): the ablation of initial masks ranks them for depth (RMSE 0.0254 for
+    noise, then 0.0329, 0.0271 and 0.0207 for those that begin with a Fisher mask, in this order), and in that of their
+    number all Fisher masks have noise; Nagahara et al., Flexible Depth of Field Photography (ECCV 2008), for the sweep
+    of focus.
 
     Example:
         >>> from kornia_tidy.optics import PixelwiseMask
@@ -107,5 +110,5 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
         return torch.cat([fisher[None], uniform[1:]])
     turned = torch.stack([fisher.rot90(quarters) for quarters in range(5)])
     noise = NOISE_MEAN + NOISE_STD * torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
-    noise[: 1 if start == "fisher, noisy fishers" else 3] = 0
+    noise[: CLEAN[start]] = 0
     return turned + noise

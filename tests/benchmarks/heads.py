@@ -4,8 +4,8 @@ Every system is trained with the same scenes, network and steps, all of which ``
 differ. None of the scenes of the tables is ever trained on.
 
 - ``python -m tests.benchmarks.heads train FOLDER``: each system in a folder of its own; goes on where it stopped. Two
-  such commands may share the work (``--tasks``, ``--masks``, ``--seeds``). ``--sigma`` is the noise of the sensor, which
-  decides what averages are worth; a folder for each.
+  such commands may share the work (``--tasks``, ``--masks``, ``--seeds``). ``--sigma`` and ``--start`` give all another
+  noise and other first masks; they belong into a folder of their own.
 - ``... score FOLDER``: each system on new dead leaves and on the real scenes, where these are on the machine.
 - ``... table FOLDER``: prints the table, means over scenes and their spread over seeds.
 - ``... ship FOLDER``: of each kind that the library names, the system with the lowest validation loss.
@@ -33,6 +33,7 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.initial_masks import STARTS
 from kornia_tidy.pretrained import FOLDER, PRETRAINED, ship
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.training.callbacks import BEST
@@ -85,14 +86,14 @@ def folder_of(root: Path, task: str, masks: int, seed: int) -> Path:
     return root / f"{task}-{masks}-seed{seed}"
 
 
-def train_all(root: Path, tasks: list[str], masks: list[int], seeds: list[int], sigma: float) -> None:
-    """Train what is not yet trained, at a read noise of ``sigma`` of full scale."""
+def train_all(root: Path, tasks: list[str], masks: list[int], seeds: list[int], **changed: Any) -> None:
+    """Train what is not yet trained, with some settings changed for all."""
     for seed in seeds:
         for task in tasks:
             for number in masks:
                 folder = folder_of(root, task, number, seed)
                 print(folder.name, flush=True)
-                settings = TASKS[task].replace(masks=number, seed=seed, sigma=sigma)
+                settings = TASKS[task].replace(masks=number, seed=seed, **changed)
                 train(settings, folder, resume=True, progress=True)
 
 
@@ -205,10 +206,12 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--masks", nargs="+", type=int, choices=MASKS, default=list(MASKS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--sigma", type=float, default=SETTINGS.sigma, help="noise of the sensor (%(default)s)")
+    parser.add_argument("--sigma", type=float)
+    parser.add_argument("--start", choices=STARTS)
     args = parser.parse_args()
     if args.command == "train":
-        train_all(args.folder, args.tasks, args.masks, args.seeds, args.sigma)
+        changed = {name: value for name in ("sigma", "start") if (value := getattr(args, name)) is not None}
+        train_all(args.folder, args.tasks, args.masks, args.seeds, **changed)
     elif args.command == "score":
         score_all(args.folder)
     elif args.command == "table":
