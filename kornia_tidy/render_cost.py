@@ -23,7 +23,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.scene.layers import assign_layers
 from kornia_tidy.scene.tiles import CHUNK_BYTES, SAMPLE, Labels, choose_grid, tile_cost
 
-BANK_RATE = {False: 60e9, True: 35e9}  # operations a second of a PSF bank in float32, and in float64, counted twice
+BANK_RATE = {False: 52e9, True: 57e9}  # operations a second of a PSF bank in float32, and in float64, counted twice
 TILE_FACTOR = 1.1  # of what the renderer takes over the cost by which it chooses its tiles
 PIXEL_NANOSECONDS = 8.5  # of a channel of a pixel and each layer that it takes light from
 

@@ -4,8 +4,8 @@ Every system is trained with the same scenes, network and steps, all of which ``
 differ. None of the scenes of the tables is ever trained on.
 
 - ``python -m tests.benchmarks.heads train FOLDER``: each system in a folder of its own; goes on where it stopped. Two
-  such commands may share the work (``--tasks``, ``--masks``, ``--seeds``). ``--sigma``, ``--start`` and ``--epochs`` give all
-  another noise, other first masks and more or fewer steps; they belong into a folder of their own.
+  such commands may share the work (``--tasks``, ``--masks``, ``--seeds``). ``--sigma``, ``--start`` and ``--epochs``
+  change the noise, the first masks and the steps of all: for a table of their own, in a folder of their own.
 - ``... score FOLDER``: each system on new dead leaves and on the real scenes, where these are on the machine.
 - ``... table FOLDER``: prints the table, means over scenes and their spread over seeds.
 - ``... ship FOLDER``: of each kind that the library names, the system with the lowest validation loss.
