@@ -192,6 +192,25 @@ class TestLight(BaseTester):
         ]
         self.assert_close(weighted.psf_bank().psfs, 0.75 * alone[0] + 0.25 * alone[1], atol=1e-6, rtol=0)
 
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_learns_where_determinism_is_demanded(self, compositing, device):
+        """Torch then refuses operations that have no deterministic form."""
+        optics = TiDyOptics(PixelwiseMask(2), sensor=None, compositing=compositing, fidelity=SMALL).to(device)
+        image = torch.rand(1, 3, 40, 40, device=device, requires_grad=True)
+        depth = (0.3 + torch.rand(1, 1, 40, 40, device=device)).requires_grad_()
+        found = []
+        before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+        torch.use_deterministic_algorithms(True)
+        try:
+            for _ in range(2):
+                loss = optics(image, depth).square().sum()
+                found.append(torch.autograd.grad(loss, [image, depth, *optics.parameters()]))
+        finally:
+            torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        for first, second in zip(*found, strict=True):
+            assert torch.equal(first, second)
+            assert float(first.abs().max()) > 0
+
     def test_feature_fresnel_baseline_has_nothing_to_learn(self):
         optics = TiDyOptics(FresnelLens(), sensor=None, fidelity=SMALL)
         assert list(optics.parameters()) == []

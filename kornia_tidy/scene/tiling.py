@@ -293,13 +293,13 @@ class _Work:
     def put(self, light: Tensor, places: Places, chunk: Chunk) -> Tensor:
         """Share each pixel out to the planes of its layers, the transpose of taking: (pairs, size, size) complex."""
         planes = self._planes("pairs", len(chunk.layer)).zero_()
-        floats = torch.view_as_real(planes)
+        floats = torch.view_as_real(planes).view(-1)
         if places.above is not None:
             above, share = places.above
             shared = light * share
-            floats.put_(above, shared)
+            floats.index_put_((above,), shared)  # put_ is refused where determinism is asked for
             light = torch.where(places.below == above, light, light - shared)
-        floats.put_(places.below, light)
+        floats.index_put_((places.below,), light)
         return planes
 
 

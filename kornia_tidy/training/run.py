@@ -160,8 +160,6 @@ def _contained() -> Generator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
             warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)
-            # Rendering puts each pixel of a tile to a place of its own, in whatever order.
-            warnings.filterwarnings("ignore", message="put_ does not have a deterministic implementation")
             yield
     finally:
         logger.setLevel(level)
