@@ -8,11 +8,12 @@ from tqdm import tqdm
 from kornia_tidy.optics.coded_lens import CodedLens
 from kornia_tidy.optics.mask_design import design, restoration_error
 
-NOISE = 0.05  # of a scene's standard deviation: the sensor's 0.01 of full scale, for scenes that vary by a fifth of it
+LEAST_SIGMA = 1e-3
+SCENE_SPREAD = 0.2  # standard deviation of a scene's light, of full scale
 LR_METRES = 8e-8  # five masks are after 120 steps within 0.2 % of where they are after 200
 
 
-def design_masks(lens: CodedLens, steps: int, *, progress: bool = False) -> list[float]:
+def design_masks(lens: CodedLens, steps: int, sigma: float = 0.01, *, progress: bool = False) -> list[float]:
     """Design a camera's masks for extended depth of field, in place: they lower the error of the best restoration.
 
     End-to-end training then goes on from there. Few steps of it move masks little: those that began as noise had a
@@ -22,6 +23,7 @@ def design_masks(lens: CodedLens, steps: int, *, progress: bool = False) -> list
     Args:
         lens: the camera. Its window and stray light are as before afterwards.
         steps: gradient steps.
+        sigma: noise of the sensor, of full scale; none counts as 0.001. The less of it, the more masks may blur.
         progress: show a progress bar.
 
     Returns:
@@ -44,7 +46,7 @@ def design_masks(lens: CodedLens, steps: int, *, progress: bool = False) -> list
 
     def error() -> Tensor:
         bar.update()
-        return restoration_error(lens.psf_bank(), NOISE)
+        return restoration_error(lens.psf_bank(), max(sigma, LEAST_SIGMA) / SCENE_SPREAD)
 
     try:
         return design(lens.masks, error, steps, LR_METRES)
