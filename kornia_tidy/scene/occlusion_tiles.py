@@ -17,7 +17,7 @@ from kornia_tidy.scene.tiles import SAMPLE, Labels
 
 # Sides of transforms; and bytes that the complex planes of a chunk may take, see tiles.py.
 SIZES = (16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024)
-CHUNK_BYTES = {"cpu": 2 << 20}
+CHUNK_BYTES = {"cpu": 4 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 
 Corner = tuple[int, int, int]  # image, first row and first column of a window in the padded plane, and of its tile
