@@ -24,6 +24,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from kornia_tidy.scene.convolution import pad_border
+from kornia_tidy.scene.kept_memory import keep_memory
 from kornia_tidy.scene.layers import layer_weight
 from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
 from kornia_tidy.scene.occlusion_tiles import Chunk, Corner, Grid, Plan, make_plan
@@ -73,6 +74,7 @@ def occlude_tiled(
     if border == "valid":
         height, width = height - psf_size + 1, width - psf_size + 1
     sloped = fraction is not None and fraction.requires_grad and torch.is_grad_enabled()
+    keep_memory()
 
     # Black beyond the border has no weight; let it lie in layers that are there anyway.
     sides = "replicate" if border == "zero" else border

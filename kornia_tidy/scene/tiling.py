@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kornia_tidy.scene.convolution import pad_border
+from kornia_tidy.scene.kept_memory import keep_memory
 from kornia_tidy.scene.tiles import Chunk, Labels, Plan, make_plan
 
 
@@ -71,6 +72,7 @@ def _plan(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None) -
     """Return the plan, and the fraction as (B, H, W)."""
     lower = lower[:, 0].expand(len(image), -1, -1)
     fraction = None if fraction is None else fraction[:, 0].expand(len(image), -1, -1)
+    keep_memory()
     return make_plan(Labels.of(lower, fraction), len(psfs), psfs.shape[-1]), fraction
 
 
