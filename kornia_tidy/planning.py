@@ -38,7 +38,6 @@ from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
 from kornia_tidy.optics.defocus_interpolation import TAPS, fine_nodes, guarded
-from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.render_cost import (
     Tiles,
     bank_seconds,
@@ -55,7 +54,6 @@ from kornia_tidy.scene.tiles import Labels
 
 SAFETY = 1.4  # on 35 photographs measured errors were up to 1.2 times what the formula says
 WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
-SPECTRAL_POINT_SAFETY = 1.6  # in many wavelengths up to 1.45 times: points are compared where most light is, only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
 OCCLUSION = 0.8  # of what is predicted for scatter; on real and random scenes measured up to 0.6
 ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; measured up to 1.9e-3
@@ -210,11 +208,10 @@ class PlannedScene:
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
         share = OCCLUSION if self._occlusion else 1.0
         window_error = self._window_error(window_side(fidelity), fidelity.stray_light)
-        points = SAFETY if self._survey.spectrum == Spectrum.rgb() else SPECTRAL_POINT_SAFETY
         return [
             ("layers", SAFETY * share * self._layer_error(fidelity) + self._order_error(fidelity)),
             ("window", WINDOW_SAFETY * share * window_error),
-            ("points a pixel", points * share * self._point_error(fidelity.pixel_tolerance)),
+            ("points a pixel", SAFETY * share * self._point_error(fidelity.pixel_tolerance)),
             ("wavelengths", SAFETY * share * self._wavelength_error(fidelity.wavelengths)),
             ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self._level),
         ]

@@ -28,8 +28,8 @@ SIZES = (
     *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
     *(512, 576, 768, 1024, 1536, 2048),
 )
-# Bytes that the planes of a chunk may take in one channel: near a processor's cache (and below what makes an allocator
-# give memory back and fetch it again), or enough to keep an accelerator busy.
+# Bytes that the planes of a chunk may take in one channel: near a processor's cache (and see kept_memory.py), or enough
+# to keep an accelerator busy.
 CHUNK_BYTES = {"cpu": 5 << 20}
 CHUNK_BYTES_ACCELERATOR = 256 << 20
 SAMPLE = 8  # px between the rows and columns on which the layers of candidates are counted

@@ -252,7 +252,7 @@ class _Work:
         """Each pair's light times the spectrum of its layer: (pairs, size, size)."""
         pairs = self._planes("pairs", len(chunk.layer))
         if not _by_slices(light):
-            return torch.mul(spectra[chunk.layer], light[chunk.block], out=pairs)
+            return torch.index_select(spectra, 0, chunk.layer, out=pairs).mul_(light.index_select(0, chunk.block))
         for run in chunk.runs:
             torch.mul(spectra[run.layers], light[run.block], out=pairs[run.pairs])
         return pairs
@@ -261,7 +261,8 @@ class _Work:
         """Each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
         total = self._planes("windows", len(chunk.counts))
         if not _by_slices(own):
-            return total.zero_().index_add_(0, chunk.block, own.mul_(spectra[chunk.layer]))
+            own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(own))))
+            return total.zero_().index_add_(0, chunk.block, own)
         for run in chunk.runs:
             own[run.pairs].mul_(spectra[run.layers])
         for block, pairs in zip(total, own.split(chunk.counts), strict=True):

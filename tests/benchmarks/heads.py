@@ -172,6 +172,7 @@ def ship_all(root: Path) -> None:
                 runs[folder] = min(float(row["val_loss"]) for row in _rows(folder / "validation.csv"))
         best = min(runs, key=lambda folder: runs[folder])
         ship(best / BEST, FOLDER / f"{name}.safetensors")
+        # Of the task: masks and seeds are the systems' own.
         settings[task] = TrainingSettings.read(best / "settings.json").replace(masks=5, seed=0).as_dict()
         seconds = [float(row["seconds_a_step"]) for row in _rows(best / "training.csv")]
         systems[name] = {

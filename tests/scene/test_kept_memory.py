@@ -7,8 +7,6 @@ import sys
 
 import pytest
 
-from kornia_tidy.scene import kept_memory
-
 FAULTS = """
 import resource, torch
 from kornia_tidy.scene.kept_memory import keep_memory
@@ -36,9 +34,3 @@ class TestKeepMemory:
     def test_feature_pages_are_fetched_once(self):
         """51,200 pages of 4 KiB are written. 1,280 to 2,561 are fetched; 6,346 to 49,578 where nothing is kept."""
         assert faults() < 4000
-
-    def test_feature_once_a_process(self):
-        kept_memory.keep_memory()
-        asked = kept_memory.keep_memory.cache_info().misses
-        kept_memory.keep_memory()
-        assert kept_memory.keep_memory.cache_info().misses == asked == 1
