@@ -82,12 +82,14 @@ def moving_capture(
                     f"{name} must have one scene for each of the {len(weights)} states of the exposure, got "
                     f"{scenes.shape[1]}"
                 )
-        total, warned = torch.zeros(()), False
+        total, warned, clamped = torch.zeros(()), False, 0
         for state, share in enumerate(weights):
             one = linear_through_state(optics, state)
             one._warned |= warned  # say once what is beyond the camera's range
             light = one(optics.decode(images[:, state].to(dtype)), depths[:, state]) * share
             total, warned = light if state == 0 else total + light, one._warned
+            clamped += one.clamped_pixels
+        optics._clamped = torch.tensor(clamped)
         if optics.sensor is not None:
             total = optics.sensor(total, params=params, generator=generator)
         coded = optics.encode(total).to(images.dtype)

@@ -94,6 +94,7 @@ def burst(
         one = linear_through_state(optics, k)
         one.check_inputs = optics.check_inputs and k == 0  # say once what is wrong
         shot = one(light, depth) * share.to(light)
+        optics._clamped = one._clamped  # every shot sees the same depths
         shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1)
     return stack if batched else stack[0]

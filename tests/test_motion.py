@@ -170,6 +170,9 @@ class TestMovingCapture(BaseTester):
         with pytest.warns(UserWarning, match="beyond the camera's range") as caught:
             moving_capture(optics, *at_rest(optics, image, depth * 0.2))
         assert len(caught) == 1
+        assert optics.clamped_pixels == len(optics.state_weights(depth.dtype)) * depth.numel()
+        moving_capture(optics, *at_rest(optics, image, depth))
+        assert optics.clamped_pixels == 0
 
     def test_feature_psfs_are_computed_once_for_scenes_that_follow(self, monkeypatch):
         optics, (image, depth) = camera(), scene(torch.float32)

@@ -103,10 +103,11 @@ class TestBurst(BaseTester):
         assert float(optics.modulator.logits.grad.abs().max()) > 0
 
     def test_feature_depths_out_of_range_are_warned_about_once(self):
-        image, depth = scene()
+        optics, (image, depth) = camera(), scene()
         with pytest.warns(UserWarning, match="beyond the camera's range") as caught:
-            burst(camera(), image, depth * 0.2)
+            burst(optics, image, depth * 0.2)
         assert len(caught) == 1
+        assert optics.clamped_pixels == depth.numel()
 
 
 def linear_to_srgb(light: torch.Tensor) -> torch.Tensor:
