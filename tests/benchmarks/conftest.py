@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -22,24 +22,34 @@ def size() -> int:
 
 @pytest.fixture
 def bench(benchmark, device, size, request) -> Callable[..., None]:
-    """Time an action on the device, and write down what it worked on.
+    """Time an action on the device, and write down what it worked on. What it returns must be finite.
 
     Facts: ``masks`` K, ``layers`` D, ``window`` P, ``wavelengths`` W, ``pupil`` (samples of the pupil along a side);
     0 where there are none. The picture has ``size`` x ``size`` pixels, 0 where there is none.
     """
 
     def run(action: Callable[[], Any], **facts: int) -> None:
-        def timed() -> None:
-            action()
+        def timed() -> Any:
+            result = action()
             synchronize(device)
+            return result
 
         benchmark.group = request.node.path.stem.removeprefix("test_")
         none = {"masks": 0, "layers": 0, "window": 0, "wavelengths": 0, "pupil": 0}
         benchmark.extra_info |= {"size": size, **none, **facts, "device": str(device)}
         benchmark.extra_info["threads"] = torch.get_num_threads()
-        benchmark(timed)
+        assert all(bool(tensor.isfinite().all()) for tensor in _tensors(benchmark(timed)))
 
     return run
+
+
+def _tensors(result: Any) -> Iterator[torch.Tensor]:
+    """Yield the tensors of a result, of tuples and mappings of them, too."""
+    if isinstance(result, torch.Tensor):
+        yield result
+    elif isinstance(result, (tuple, list, dict)):
+        for part in result.values() if isinstance(result, dict) else result:
+            yield from _tensors(part)
 
 
 @pytest.fixture

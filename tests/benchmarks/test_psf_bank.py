@@ -18,8 +18,7 @@ def run(bench, device, masks=5, window=23, wavelengths=3, gradients=False):
     def action():
         with torch.set_grad_enabled(gradients):
             psfs = optics.psf_bank().psfs
-        if gradients:
-            torch.autograd.grad(psfs.square().sum(), optics.masks.phase)
+        return torch.autograd.grad(psfs.square().sum(), optics.masks.phase) if gradients else psfs
 
     layers = len(optics.defocus_nodes)
     bench(action, size=0, masks=masks, layers=layers, window=window, wavelengths=wavelengths, pupil=23)
