@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.optics.defocus_interpolation import TAPS, fine_nodes, guarded, interpolation_matrix
+from kornia_tidy.optics.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
 from kornia_tidy.scene.convolution import next_fast_size, pad_border
 from kornia_tidy.scene.layers import layer_weights
 
@@ -235,7 +235,7 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
     if layers not in TAPS:
         return weights, nodes
     samples = guarded(nodes, TAPS[layers] // 2)
-    matrix = interpolation_matrix(
+    matrix = fine_layer_matrix(
         samples[0], samples[1] - samples[0], len(samples), taken_from, band if layers == "bandlimited" else None
     )
     return weights @ torch.tensor(matrix, dtype=torch.float64), samples

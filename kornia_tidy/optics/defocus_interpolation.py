@@ -2,7 +2,8 @@ r"""PSFs between the depths they were computed for: the intensity of a PSF is ba
 
 The field holds :math:`e^{i\psi\rho^2}` with :math:`\rho^2` from 0 to its largest value, so its squared modulus, as a
 function of :math:`\psi`, has no frequency above :math:`\Omega = \max\rho^2 \, \lambda_0 / \lambda` radians a radian.
-Samples closer than :math:`\pi / \Omega` carry every depth between them.
+Samples closer than :math:`\pi / \Omega` carry every depth between them. Cubic and band-limited layers find the PSFs of
+fine layers from them, which a pixel mixes linearly.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch import Tensor
 from kornia_tidy.optics.psf_bank import PSFBank
 
 TAPS = {"cubic": 4, "bandlimited": 10}
-FINE_SPACING = 0.25  # radians between interpolated PSFs; between those, linear layers err by less than a thousandth
+FINE_SPACING = 1 / 3  # radians between interpolated PSFs; between those, linear layers err by less than a thousandth
 
 
 def defocus_band(max_rho2: float, shortest_wavelength: float, reference_wavelength: float) -> float:
@@ -39,8 +40,12 @@ def fine_nodes(nodes: Sequence[float]) -> tuple[float, ...]:
         (0.0, 0.25, 0.5, 0.75, 1.0)
     """
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
-    finer = math.ceil(spacing / FINE_SPACING)
-    return tuple(nodes[0] + spacing / finer * i for i in range(finer * (len(nodes) - 1) + 1))
+    step = _fine_step(spacing)
+    return tuple(nodes[0] + step * i for i in range(round(spacing / step) * (len(nodes) - 1) + 1))
+
+
+def _fine_step(spacing: float) -> float:
+    return spacing / math.ceil(spacing / FINE_SPACING - 1e-6)
 
 
 def guarded(nodes: Sequence[float], guards: int) -> tuple[float, ...]:
@@ -98,19 +103,53 @@ def interpolation_matrix(
     return tuple(map(tuple, matrix.tolist()))
 
 
+def fine_layer_matrix(
+    start: float, spacing: float, count: int, targets: tuple[float, ...], band: float | None
+) -> tuple[tuple[float, ...], ...]:
+    r"""Return the weights that give the PSFs of fine layers, between which pixels mix linearly, from the computed ones.
+
+    A straight line through two points of a curve lies to one side of it, off by up to :math:`h^2 f'' / 8`. Layers are
+    moved back by half of that, :math:`(f(\psi - h) - 2 f(\psi) + f(\psi + h)) / 16`, so that what lies between is off by
+    as much to the one side as they are to the other: half the worst error, 0.47 times the root mean square.
+
+    Args:
+        start: see :func:`interpolation_matrix`.
+        spacing: see there.
+        count: see there.
+        targets: layers, some of :func:`fine_nodes`.
+        band: see there.
+
+    Returns:
+        (targets, count) numbers.
+
+    Example:
+        >>> weights = np.array(fine_layer_matrix(0.0, 1.0, 7, (3.0,), None))
+        >>> bend = (np.arange(7) - 3) ** 2 / 2  # a second derivative of one
+        >>> (weights @ bend).round(6) == round(-(1 / 3) ** 2 / 16, 6)
+        array([ True])
+    """
+    step = _fine_step(spacing)
+    shifted = (
+        np.array(interpolation_matrix(start, spacing, count, tuple(x + shift for x in targets), band))
+        for shift in (-step, 0.0, step)
+    )
+    below, here, above = shifted
+    return tuple(map(tuple, (here - (below - 2 * here + above) / 16).tolist()))
+
+
 # What torch.compiler.assume_constant_result does, see propagation.py: NumPy is not traced through.
-setattr(interpolation_matrix, "_dynamo_marked_constant", True)  # noqa: B010
+setattr(fine_layer_matrix, "_dynamo_marked_constant", True)  # noqa: B010
 
 
 def interpolated_bank(
     bank: PSFBank, nodes: tuple[float, ...], targets: tuple[float, ...], band: float | None
 ) -> PSFBank:
-    """Return the PSFs of a bank at other depths.
+    """Return the PSFs of fine layers from those of a bank. See :func:`fine_layer_matrix`.
 
     Args:
         bank: PSFs before anything is done about stray light.
         nodes: their defocus in radians, evenly spaced.
-        targets: ascending nodes in radians, with their taps among the bank's nodes.
+        targets: ascending layers in radians, with their taps among the bank's nodes.
         band: highest frequency from :func:`defocus_band`, or None for cubic interpolation.
 
     Returns:
@@ -123,7 +162,7 @@ def interpolated_bank(
         tensor([0.1500, 0.2000])
     """
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
-    matrix = interpolation_matrix(nodes[0], spacing, len(nodes), targets, band)
+    matrix = fine_layer_matrix(nodes[0], spacing, len(nodes), targets, band)
     psfs = (bank.psfs.new_tensor(matrix) @ bank.psfs.flatten(1)).unflatten(1, bank.psfs.shape[1:])
     return PSFBank(psfs, psfs.new_tensor(targets), psfs.sum((2, 3)))
 
