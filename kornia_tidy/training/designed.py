@@ -23,7 +23,9 @@ def design_masks(lens: CodedLens, steps: int, sigma: float = 0.01, *, progress: 
     Args:
         lens: the camera. Its window and stray light are as before afterwards.
         steps: gradient steps.
-        sigma: noise of the sensor, of full scale; none counts as 0.001. The less of it, the more masks may blur.
+        sigma: noise, of full scale; none counts as 0.001. The less of it, the more masks may blur. Training leaves the
+            default whatever the sensor: with a noise of 0.002, networks behind one mask designed for 0.002 ended 0.2 dB
+            below those behind one designed for 0.01 (three seeds of three), and behind five masks alike.
         progress: show a progress bar.
 
     Returns:

@@ -127,7 +127,7 @@ class TidyTraining(pl.LightningModule):
         """
         optics = build_optics(settings)
         if design and settings.design and settings.masks:
-            design_masks(optics, settings.design, settings.sigma, progress=progress)
+            design_masks(optics, settings.design, progress=progress)
             optics.fidelity = optics.fidelity.replace(window=settings.window)  # that of the masks as they are now
         return cls(
             optics,

@@ -45,7 +45,7 @@ class TestDesignMasks(BaseTester):
         assert after[1] < 0.95 * before[1]
         assert after[1] < 0.9 * after[0]
 
-    def test_feature_masks_are_designed_for_the_noise_there_is(self):
+    def test_feature_masks_are_designed_for_the_noise_given(self):
         """With a tenth of it, 0.18 of the variance for masks designed for that and 0.24 for the usual ones."""
         found = []
         for sigma in (0.0, 0.01):  # none counts as a tenth of the usual
