@@ -13,11 +13,11 @@ from kornia_tidy.optics.phase_masks.base import mask_axes
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 CLEAN = {"noisy fishers": 0, "fisher, noisy fishers": 1, "3 fishers, 2 noisy": 3}  # Fisher masks without noise
-STARTS = ("noise", "fisher, noise", *CLEAN, "focal sweep")
+STARTS = ("noise", "fisher, noise", *CLEAN, "like fishers", "focal sweep")
 
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
 SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; each of the five is sharp at a depth of its own
-SWEEP_NOISE = 6e-8  # m; without it masks stay round
+SMALL_NOISE = 6e-8  # m; without it masks stay round, or alike
 
 # What design_fisher_mask(seed=3) found: radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
 # fmt: off
@@ -62,7 +62,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     """Return the five masks that a sequence starts from.
 
     Args:
-        start: one of the paper's, or of our own for extended depth of field:
+        start: one of the paper's, or of our own:
 
             - ``"noise"``: each uniform on [0, 1.2e-6] m.
             - ``"fisher, noise"``: the first the Fisher mask, the others such noise.
@@ -70,8 +70,10 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
               standard deviation 3.05e-7 m.
             - ``"fisher, noisy fishers"``: the same, the first without noise.
             - ``"3 fishers, 2 noisy"``: the same, with noise on the last two.
-            - ``"focal sweep"``: lenses focused at a defocus of 0, -8, 8, -16 and 16 rad, with normal noise of
-              6e-8 m.
+            - ``"like fishers"``: the Fisher mask, and four times the same with normal noise of 6e-8 m: their average is
+              not blurred by turns.
+            - ``"focal sweep"``: for extended depth of field, lenses focused at a defocus of 0, -8, 8, -16 and 16 rad,
+              with the same noise.
         generator: source of the noise.
 
     Returns:
@@ -100,15 +102,17 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(5, 23, 23, generator=generator, dtype=torch.float64)
     if start == "noise":
         return uniform
-    if start == "focal sweep":
-        y, x = mask_axes(23)
-        defocus = torch.tensor(SWEEP, dtype=torch.float64)[:, None, None] * (x**2 + y**2)
-        noise = SWEEP_NOISE * torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
-        return noise - defocus * REFERENCE_WAVELENGTH / (2 * math.pi * 0.5)  # an index of 1.5
     fisher = fisher_mask()
     if start == "fisher, noise":
         return torch.cat([fisher[None], uniform[1:]])
+    normal = torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
+    if start == "focal sweep":
+        y, x = mask_axes(23)
+        defocus = torch.tensor(SWEEP, dtype=torch.float64)[:, None, None] * (x**2 + y**2)
+        return SMALL_NOISE * normal - defocus * REFERENCE_WAVELENGTH / (2 * math.pi * 0.5)  # an index of 1.5
+    if start == "like fishers":
+        return torch.cat([fisher[None], fisher + SMALL_NOISE * normal[1:]])
     turned = torch.stack([fisher.rot90(quarters) for quarters in range(5)])
-    noise = NOISE_MEAN + NOISE_STD * torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
+    noise = NOISE_MEAN + NOISE_STD * normal
     noise[: CLEAN[start]] = 0
     return turned + noise

@@ -52,7 +52,7 @@ SETTINGS = TrainingSettings(
 )  # fmt: skip
 EDOF = SETTINGS.replace(task="edof", refocus=5, start="focal sweep", design=120, epochs=10)
 # Depth is harder to learn: masks that show it begin as Fisher masks.
-JOINT = SETTINGS.replace(task="joint", refocus=9, start="3 fishers, 2 noisy", epochs=15, depth_weight=0.3)
+JOINT = SETTINGS.replace(task="joint", refocus=9, start="like fishers", epochs=15, depth_weight=0.3)
 TASKS = {"edof": EDOF, "joint": JOINT}
 MASKS = {5: "K = 5", 1: "K = 1", 0: "Fresnel lens"}
 SEEDS = (0, 1, 2)
@@ -176,7 +176,7 @@ def ship_all(root: Path) -> None:
         best = min(runs, key=lambda folder: runs[folder])
         ship(best / BEST, FOLDER / f"{name}.safetensors")
         # Of the task: masks and seeds are the systems' own.
-        settings[task] = TrainingSettings.read(best / "settings.json").replace(masks=5, seed=0).as_dict()
+        settings.setdefault(task, TrainingSettings.read(best / "settings.json").replace(masks=5, seed=0).as_dict())
         seconds = [float(row["seconds_a_step"]) for row in _rows(best / "training.csv")]
         systems[name] = {
             "seed": int(best.name[-1]),

@@ -64,6 +64,11 @@ class TestInitialHeights(BaseTester):
         self.assert_close(noise[clean:].std((1, 2)), torch.full((5 - clean,), 3.05e-7), rtol=0, atol=3e-8)
         assert len({round(float(one.sum()), 12) for one in noise[clean:]}) == 5 - clean  # each its own
 
+    def test_feature_fishers_that_are_alike_but_for_little_noise(self):
+        noise = drawn("like fishers") - fisher_mask()
+        assert not noise[0].any()
+        self.assert_close(noise[1:].std((1, 2)), torch.full((4,), 6e-8), rtol=0.1)
+
     def test_feature_each_of_a_sweep_is_sharp_at_its_own_defocus(self):
         depths = torch.arange(-20.0, 21.0).tolist()
         sharpest = []
