@@ -27,8 +27,8 @@ def load_pretrained(name: str) -> TrainedSystem:
 
     Returns:
         Camera, network, training settings and steps, in eval mode on the CPU. The network takes captures of that
-        camera, (B, 3, H, W) as :class:`~kornia_tidy.TiDyOptics` returns them, and returns the maps of its task, which
-        :func:`~kornia_tidy.training.tasks.split_maps` names.
+        camera, (B, 3, H, W) as :class:`~kornia_tidy.TiDyOptics` returns them, with a noise of 0.002 of full scale, and
+        returns the maps of its task, which :func:`~kornia_tidy.training.tasks.split_maps` names.
 
     Raises:
         ValueError: if there is no system of this name.
