@@ -150,12 +150,12 @@ class CameraSurvey:
     def pixel_changes(self, tolerance: float) -> tuple[tuple[float, ...], Tensor]:
         """Return some defocus, and what fewer points a pixel change in PSFs there, where most of their light is.
 
-        PSFs in focus change most.
+        PSFs in focus change most, and those of the shortest wavelength: none is left out.
         """
-        nodes = self._spread_and_focus()
+        nodes, window = self._spread_and_focus(), self._smallest(_PIXEL_WINDOW)
         for each in (tolerance, REFERENCE.pixel_tolerance):
             if each not in self._pixels:
-                self._pixels[each] = self._bank(nodes, self._smallest(_PIXEL_WINDOW), each, torch.float64).psfs.cpu()
+                self._pixels[each] = self._bank(nodes, window, each, torch.float64, wavelengths=None).psfs.cpu()
         return nodes, self._pixels[tolerance] - self._pixels[REFERENCE.pixel_tolerance]
 
     def wavelength_changes(self, count: int) -> tuple[tuple[float, ...], list[Tensor]]:
@@ -201,11 +201,18 @@ class CameraSurvey:
         return tuple(sorted({*self._spread(_INTERVALS), min(max(0.0, lo), hi)}))
 
     @torch.no_grad()
-    def _bank(self, nodes: tuple[float, ...], window: int, tolerance: float, dtype: torch.dtype) -> PSFBank:
+    def _bank(
+        self,
+        nodes: tuple[float, ...],
+        window: int,
+        tolerance: float,
+        dtype: torch.dtype,
+        wavelengths: int | None = _WAVELENGTHS,
+    ) -> PSFBank:
         raw = REFERENCE.replace(
             window=window,
             pixel_tolerance=tolerance,
             stray_light="discard",
-            wavelengths=max(self._fewest, _WAVELENGTHS),
+            wavelengths=None if wavelengths is None else max(self._fewest, wavelengths),
         )
         return self._optics.with_fidelity(raw).psf_bank(self.channels, dtype, nodes)
