@@ -370,10 +370,10 @@ class TestPlan(BaseTester):
         assert plan.layers_total <= 19
 
     def test_feature_layers_counted_are_those_rendered(self, flat):
-        """All depths between two nodes: ten taps hold the scene, of the nodes and five guards at either end."""
+        """All depths between two nodes: ten taps hold the scene, and the neighbours of fine layers one more each."""
         defocus = torch.linspace(-9.9, -9.6, 48).expand(1, 1, 48, 48)
         plan = Planner(flat, 3).scene(defocus, torch.rand(1, 3, 48, 48)).plan(1e-12)
-        assert (plan.layers_present, plan.layers_total) == (10, 51)
+        assert (plan.layers_present, plan.layers_total) == (12, 51)
 
     def test_feature_masks_may_learn_and_be_planned_for(self, flat):
         plan = flat.plan(torch.full((1, 40, 40), 0.5), tolerance=1e-2)

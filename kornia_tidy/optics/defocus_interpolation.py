@@ -19,7 +19,7 @@ from torch import Tensor
 from kornia_tidy.optics.psf_bank import PSFBank
 
 TAPS = {"cubic": 4, "bandlimited": 10}
-FINE_SPACING = 1 / 3  # radians between interpolated PSFs; between those, linear layers err by less than a thousandth
+FINE_SPACING = 0.35  # radians between interpolated PSFs; between those, linear layers err by less than a thousandth
 
 
 def defocus_band(max_rho2: float, shortest_wavelength: float, reference_wavelength: float) -> float:
@@ -45,7 +45,7 @@ def fine_nodes(nodes: Sequence[float]) -> tuple[float, ...]:
 
 
 def _fine_step(spacing: float) -> float:
-    return spacing / math.ceil(spacing / FINE_SPACING - 1e-6)
+    return spacing / math.ceil(spacing / FINE_SPACING)
 
 
 def guarded(nodes: Sequence[float], guards: int) -> tuple[float, ...]:
@@ -109,8 +109,8 @@ def fine_layer_matrix(
     r"""Return the weights that give the PSFs of fine layers, between which pixels mix linearly, from the computed ones.
 
     A straight line through two points of a curve lies to one side of it, off by up to :math:`h^2 f'' / 8`. Layers are
-    moved back by half of that, :math:`(f(\psi - h) - 2 f(\psi) + f(\psi + h)) / 16`, so that what lies between is off by
-    as much to the one side as they are to the other: half the worst error, 0.47 times the root mean square.
+    moved back by half of that, :math:`(f(\psi - h) - 2 f(\psi) + f(\psi + h)) / 16`, so that what lies between is off
+    by as much to the one side as they are to the other: half the worst error, 0.47 times the root mean square.
 
     Args:
         start: see :func:`interpolation_matrix`.
