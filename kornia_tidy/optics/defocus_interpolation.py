@@ -116,7 +116,7 @@ def fine_layer_matrix(
         start: see :func:`interpolation_matrix`.
         spacing: see there.
         count: see there.
-        targets: layers, some of :func:`fine_nodes`.
+        targets: layers that follow one another, of :func:`fine_nodes`.
         band: see there.
 
     Returns:
@@ -129,12 +129,9 @@ def fine_layer_matrix(
         array([ True])
     """
     step = _fine_step(spacing)
-    shifted = (
-        np.array(interpolation_matrix(start, spacing, count, tuple(x + shift for x in targets), band))
-        for shift in (-step, 0.0, step)
-    )
-    below, here, above = shifted
-    return tuple(map(tuple, (here - (below - 2 * here + above) / 16).tolist()))
+    around = (targets[0] - step, *targets, targets[-1] + step)
+    points = np.array(interpolation_matrix(start, spacing, count, around, band))
+    return tuple(map(tuple, (points[1:-1] - np.diff(points, 2, axis=0) / 16).tolist()))
 
 
 # What torch.compiler.assume_constant_result does, see propagation.py: NumPy is not traced through.
@@ -149,7 +146,7 @@ def interpolated_bank(
     Args:
         bank: PSFs before anything is done about stray light.
         nodes: their defocus in radians, evenly spaced.
-        targets: ascending layers in radians, with their taps among the bank's nodes.
+        targets: layers that follow one another in radians, with their taps among the bank's nodes.
         band: highest frequency from :func:`defocus_band`, or None for cubic interpolation.
 
     Returns:
@@ -158,8 +155,8 @@ def interpolated_bank(
     Example:
         >>> depths = torch.arange(5.0)
         >>> bank = PSFBank(depths.reshape(5, 1, 1, 1) / 10, depths, depths[:, None] / 10)
-        >>> interpolated_bank(bank, (0.0, 1.0, 2.0, 3.0, 4.0), (1.5, 2.0), None).energy.flatten()
-        tensor([0.1500, 0.2000])
+        >>> interpolated_bank(bank, (0.0, 1.0, 2.0, 3.0, 4.0), (5 / 3, 2.0), None).energy.flatten()
+        tensor([0.1667, 0.2000])
     """
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
     matrix = fine_layer_matrix(nodes[0], spacing, len(nodes), targets, band)
