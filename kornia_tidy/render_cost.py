@@ -21,11 +21,9 @@ from kornia_tidy.optics.propagation import energy_operations, gauss_legendre_ord
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.scene.layers import assign_layers
-from kornia_tidy.scene.tiles import CHUNK_BYTES, SAMPLE, Labels, choose_grid, tile_cost
+from kornia_tidy.scene.tiles import CHUNK_BYTES, SAMPLE, Labels, choose_grid, tile_cost, transforms_cost
 
 BANK_RATE = {False: 52e9, True: 57e9}  # operations a second of a PSF bank in float32, and in float64, counted twice
-TILE_FACTOR = 1.1  # of what the renderer takes over the cost by which it chooses its tiles
-PIXEL_NANOSECONDS = 8.5  # of a channel of a pixel and each layer that it takes light from
 
 _points = cache(gauss_legendre_order)
 
@@ -147,8 +145,7 @@ def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:
         '0.1'
     """
     windows = tile_cost(tiles.size, tiles.blocks, tiles.pairs) + tile_cost(tiles.size, 0, tiles.layers)
-    nanoseconds = TILE_FACTOR * windows + PIXEL_NANOSECONDS * tiles.pixels * tiles.terms
-    return _weight(fidelity) * channels * nanoseconds * 1e-9
+    return _weight(fidelity) * channels * transforms_cost(windows, tiles.pixels, tiles.terms) * 1e-9
 
 
 def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, layers: int, rendering: int) -> int:

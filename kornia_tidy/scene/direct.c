@@ -1,0 +1,330 @@
+// Direct convolution in vectors: a block of pixels meets the PSFs of its own layers, sample by sample, and no other.
+//
+// A strip is ROWS rows of LANES pixels, as many as a vector holds; a block is two strips side by side. What is added up
+// stays in registers: one vector of light serves all rows of a strip, each with its own sample of the PSF. The last
+// blocks of a row and of a plane are moved back inside it and overlap with their neighbours.
+//
+// Layers are given as in tiles.py: all light of a pixel to layer `lower`, or a share of it to the next one. PSFs are
+// turned by 180 degrees, so that output pixel (y, x) sees the plane's pixels (y, x) to (y + side - 1, x + side - 1).
+//
+// Compiled by compiled.py with REAL as float or double; exact to rounding, without fast-math.
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define INLINE static inline __attribute__((always_inline))
+
+enum { LANES = 64 / sizeof(REAL), ROWS = 4, WIDTH = 2 * LANES };
+enum { TERMS = 2 * ROWS * WIDTH };        // the most layers that a block lists
+enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // of blocks, whose correlations are added up together
+
+typedef REAL vec __attribute__((vector_size(64)));
+typedef REAL loose __attribute__((vector_size(64), aligned(sizeof(REAL)), may_alias));
+
+// The fields of `_Scene` in direct.py. Strides count elements; widths and heights are those of the output.
+typedef struct {
+    int64_t images, channels, height, width, layers, side, threads, slabs;
+    int64_t plane_image, plane_channel, plane_row, lower_image, lower_row, share_image, share_row;
+    int64_t slope;              // 0: mix by shares; 1: the next layer less the lower one
+    const REAL *plane;          // light, larger by side - 1
+    const REAL *psfs;           // (layers, channels, side, side), turned, columns first
+    const int64_t *lower;       // (images, height, width)
+    const REAL *share;          // like lower, or null
+    const REAL *own;            // (images, channels, height, width): what PSFs are correlated with
+    REAL *out;                  // mix: (images, channels, height, width); correlate: zeros (slabs, layers, channels, side, side)
+} scene;
+
+// A layer in a block, and in which strips: 1 the left one, 2 the right one, 3 both.
+typedef struct {
+    int32_t layer, strips;
+} member;
+
+// One row of light meets rows `from` to `to` of a strip. Columns are taken `step` at a time into sums of their own, so
+// that additions need not wait for one another.
+INLINE void add_row(const REAL *light, const REAL *psf, int64_t side, int strips, int step, int from, int to,
+                    vec sums[2][2][ROWS]) {
+    int64_t j = 0;
+    for (; j + step <= side; j += step)
+#pragma GCC unroll 2
+        for (int s = 0; s < step; s++)
+#pragma GCC unroll 2
+            for (int strip = 0; strip < strips; strip++) {
+                vec x = *(const loose *)(light + j + s + strip * LANES);
+#pragma GCC unroll 4
+                for (int v = from; v < to; v++) sums[s][strip][v] += psf[(j + s) * side - v] * x;
+            }
+    for (; j < side; j++)
+#pragma GCC unroll 2
+        for (int strip = 0; strip < strips; strip++) {
+            vec x = *(const loose *)(light + j + strip * LANES);
+#pragma GCC unroll 4
+            for (int v = from; v < to; v++) sums[0][strip][v] += psf[j * side - v] * x;
+        }
+}
+
+// `side` is at least ROWS - 1.
+INLINE void convolve(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, int strips, vec total[2][ROWS]) {
+    const int step = strips == 1 ? 2 : 1;
+    vec sums[2][2][ROWS];
+    memset(sums, 0, sizeof sums);
+    for (int64_t r = 0; r < side + ROWS - 1; r++, light += pitch) {
+        const REAL *p = psf + r;
+        if (r >= ROWS - 1 && r < side) add_row(light, p, side, strips, step, 0, ROWS, sums);
+        else if (r == 0) add_row(light, p, side, strips, step, 0, 1, sums);
+        else if (r == 1) add_row(light, p, side, strips, step, 0, 2, sums);
+        else if (r == 2) add_row(light, p, side, strips, step, 0, 3, sums);
+        else if (r == side) add_row(light, p, side, strips, step, 1, ROWS, sums);
+        else if (r == side + 1) add_row(light, p, side, strips, step, 2, ROWS, sums);
+        else add_row(light, p, side, strips, step, 3, ROWS, sums);
+    }
+    for (int strip = 0; strip < strips; strip++)
+        for (int v = 0; v < ROWS; v++) total[strip][v] = sums[0][strip][v] + sums[1][strip][v];
+}
+
+static void convolve_strip(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, vec total[2][ROWS]) {
+    convolve(light, pitch, psf, side, 1, total);
+}
+
+static void convolve_block(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, vec total[2][ROWS]) {
+    convolve(light, pitch, psf, side, 2, total);
+}
+
+INLINE int note(member *members, int count, int64_t layer, int strip) {
+    int n = 0;
+    while (n < count && members[n].layer != layer) n++;
+    if (n == count) members[count++] = (member){layer, 0};
+    members[n].strips |= 1 << strip;
+    return count;
+}
+
+// Lists the layers of a block's pixels, and says how many there are.
+INLINE int list_members(const scene *s, const int64_t *lower, const REAL *share, member *members) {
+    int64_t other = 0;
+    for (int v = 0; v < ROWS; v++)
+        for (int i = 0; i < WIDTH; i++) other |= lower[v * s->lower_row + i] ^ lower[0];
+    if (!share && !other) {
+        members[0] = (member){lower[0], 3};
+        return 1;
+    }
+    int count = 0;
+    for (int v = 0; v < ROWS; v++)
+        for (int i = 0; i < WIDTH; i++) {
+            int64_t layer = lower[v * s->lower_row + i];
+            REAL f = share ? share[v * s->share_row + i] : 0;
+            if (s->slope || f != 1) count = note(members, count, layer, i / LANES);
+            if (s->slope || f > 0) count = note(members, count, layer + 1, i / LANES);
+        }
+    return count;
+}
+
+// How much a strip's pixels take of a layer.
+INLINE void weigh(const scene *s, const int64_t *lower, const REAL *share, int64_t layer, vec weights[ROWS]) {
+    for (int v = 0; v < ROWS; v++) {
+        const int64_t *l = lower + v * s->lower_row;
+        const REAL *f = share ? share + v * s->share_row : 0;
+        REAL *w = (REAL *)&weights[v];
+        if (s->slope)
+            for (int i = 0; i < LANES; i++) w[i] = (REAL)(l[i] + 1 == layer) - (REAL)(l[i] == layer);
+        else if (f)
+            for (int i = 0; i < LANES; i++) w[i] = l[i] == layer ? 1 - f[i] : l[i] + 1 == layer ? f[i] : 0;
+        else
+            for (int i = 0; i < LANES; i++) w[i] = l[i] == layer;
+    }
+}
+
+INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
+
+// The pairs of a strip and a layer present in it, counted in every `every`-th band of rows.
+int64_t count_pairs(const scene *s, int64_t every) {
+    int64_t bands = (s->height + ROWS - 1) / ROWS, pairs = 0;
+#pragma omp parallel for num_threads(s->threads) reduction(+ : pairs)
+    for (int64_t band = 0; band < s->images * bands; band += every) {
+        int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
+        const int64_t *lower = s->lower + image * s->lower_image + y * s->lower_row;
+        const REAL *share = s->share ? s->share + image * s->share_image + y * s->share_row : 0;
+        member members[TERMS];
+        for (int64_t left = 0; left < s->width; left += WIDTH) {
+            int64_t x = least(left, s->width - WIDTH);
+            int count = list_members(s, lower + x, share ? share + x : 0, members);
+            for (int n = 0; n < count; n++) pairs += 1 + (members[n].strips == 3);
+        }
+    }
+    return pairs;
+}
+
+static void mix_block(const scene *s, const REAL *light, const int64_t *lower, const REAL *share, const member *members,
+                      int count, const REAL *psfs, REAL *out) {
+    vec total[2][ROWS], own[2][ROWS], weights[ROWS];
+    int64_t stride = s->channels * s->side * s->side;
+    if (count == 1 && !share)
+        convolve_block(light, s->plane_row, psfs + members->layer * stride, s->side, total);
+    else {
+        memset(total, 0, sizeof total);
+        for (int n = 0; n < count; n++) {
+            const REAL *psf = psfs + members[n].layer * stride;
+            int first = members[n].strips == 2, last = members[n].strips != 1;
+            if (members[n].strips == 3) convolve_block(light, s->plane_row, psf, s->side, own);
+            else convolve_strip(light + first * LANES, s->plane_row, psf, s->side, own + first);
+            for (int strip = first; strip <= last; strip++) {
+                int at = strip * LANES;
+                weigh(s, lower + at, share ? share + at : 0, members[n].layer, weights);
+                for (int v = 0; v < ROWS; v++) total[strip][v] += weights[v] * own[strip][v];
+            }
+        }
+    }
+    for (int v = 0; v < ROWS; v++)
+        for (int strip = 0; strip < 2; strip++) *(loose *)(out + v * s->width + strip * LANES) = total[strip][v];
+}
+
+// Each pixel takes the light that it sees through its own PSFs.
+void mix(const scene *s) {
+    int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH;
+#pragma omp parallel for schedule(dynamic, 4) num_threads(s->threads)
+    for (int64_t band = 0; band < s->images * bands; band++) {
+        int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
+        const int64_t *lower = s->lower + image * s->lower_image + y * s->lower_row;
+        const REAL *share = s->share ? s->share + image * s->share_image + y * s->share_row : 0;
+        member members[TERMS];
+        for (int64_t block = 0; block < blocks; block++) {
+            int64_t x = least(block * WIDTH, s->width - WIDTH);
+            int count = list_members(s, lower + x, share ? share + x : 0, members);
+            for (int64_t c = 0; c < s->channels; c++) {
+                const REAL *light = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
+                REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
+                mix_block(s, light, lower + x, share ? share + x : 0, members, count, s->psfs + c * s->side * s->side, out);
+            }
+        }
+    }
+}
+
+// `count` rows of a PSF's samples against strips: own pixels times the light they see.
+INLINE void correlate_rows(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, int strips, int count,
+                           vec *sums) {
+    for (int64_t j = 0; j < side; j++) {
+        vec total[ROWS];
+#pragma GCC unroll 4
+        for (int k = 0; k < count; k++) total[k] = sums[k * side + j];
+#pragma GCC unroll 2
+        for (int strip = 0; strip < strips; strip++)
+#pragma GCC unroll 7
+            for (int r = 0; r < ROWS + count - 1; r++) {
+                vec x = *(const loose *)(light + r * pitch + j + strip * LANES);
+#pragma GCC unroll 4
+                for (int k = 0; k < count; k++)
+                    if (r - k >= 0 && r - k < ROWS) total[k] += own[strip][r - k] * x;
+            }
+#pragma GCC unroll 4
+        for (int k = 0; k < count; k++) sums[k * side + j] = total[k];
+    }
+}
+
+INLINE void correlate_with(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, int strips, vec *sums) {
+    int64_t k = 0;
+    for (; k + 4 <= side; k += 4) correlate_rows(light + k * pitch, pitch, own, side, strips, 4, sums + k * side);
+    light += k * pitch, sums += k * side;
+    if (side - k == 3) correlate_rows(light, pitch, own, side, strips, 3, sums);
+    if (side - k == 2) correlate_rows(light, pitch, own, side, strips, 2, sums);
+    if (side - k == 1) correlate_rows(light, pitch, own, side, strips, 1, sums);
+}
+
+static void correlate_strip(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, vec *sums) {
+    correlate_with(light, pitch, own, side, 1, sums);
+}
+
+static void correlate_block(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, vec *sums) {
+    correlate_with(light, pitch, own, side, 2, sums);
+}
+
+// Where a block of a piece stands, and its layers: those from members[start] to members[stop - 1].
+typedef struct {
+    int64_t y, x, skip_rows, skip_columns, start, stop;
+} place;
+
+// A piece's own pixels in one layer and channel against the light they see, added up over the piece.
+static void correlate_piece(const scene *s, int64_t image, int64_t channel, int64_t layer, const place *places, int count,
+                            const member *members, vec *sums) {
+    const REAL *plane = s->plane + image * s->plane_image + channel * s->plane_channel;
+    const REAL *own = s->own + (image * s->channels + channel) * s->height * s->width;
+    memset(sums, 0, s->side * s->side * sizeof(vec));
+    for (const place *p = places; p < places + count; p++)
+        for (int64_t n = p->start; n < p->stop; n++) {
+            if (members[n].layer != layer) continue;
+            int first = members[n].strips == 2, last = members[n].strips != 1;
+            vec weights[2][ROWS];
+            for (int strip = first; strip <= last; strip++) {
+                int64_t x = p->x + strip * LANES;
+                weigh(s, s->lower + image * s->lower_image + p->y * s->lower_row + x,
+                      s->share ? s->share + image * s->share_image + p->y * s->share_row + x : 0, layer, weights[strip]);
+                for (int v = 0; v < ROWS; v++) weights[strip][v] *= *(const loose *)(own + (p->y + v) * s->width + x);
+                // Pixels that the blocks before have counted.
+                if (p->skip_rows || p->skip_columns)
+                    for (int v = 0; v < ROWS; v++)
+                        for (int i = 0; i < LANES; i++)
+                            if (v < p->skip_rows || strip * LANES + i < p->skip_columns) weights[strip][v][i] = 0;
+            }
+            const REAL *light = plane + p->y * s->plane_row + p->x;
+            if (members[n].strips == 3) correlate_block(light, s->plane_row, weights, s->side, sums);
+            else correlate_strip(light + first * LANES, s->plane_row, weights + first, s->side, sums);
+        }
+}
+
+INLINE REAL sum_of(vec lanes) {
+    typedef REAL half __attribute__((vector_size(32)));
+    typedef REAL quarter __attribute__((vector_size(16)));
+    half halves[2];
+    memcpy(halves, &lanes, sizeof lanes);
+    halves[0] += halves[1];
+    quarter quarters[2];
+    memcpy(quarters, halves, sizeof halves[0]);
+    quarters[0] += quarters[1];
+    REAL sum = 0;
+    for (int i = 0; i < LANES / 4; i++) sum += quarters[0][i];
+    return sum;
+}
+
+// What each sample of each layer's PSF has brought from the plane to the layer's own pixels, in sums over slabs of rows.
+// Returns 0, or 1 if there is no memory.
+int correlate(const scene *s) {
+    int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH, area = s->side * s->side;
+    int64_t all = s->images * bands, failed = 0;
+#pragma omp parallel for schedule(dynamic, 1) num_threads(s->threads)
+    for (int64_t slab = 0; slab < s->slabs; slab++) {
+        place places[PIECE_ROWS * PIECE_BLOCKS];
+        member *members = malloc(sizeof(member) * PIECE_ROWS * PIECE_BLOCKS * TERMS);
+        char *present = malloc(s->layers + 1);
+        vec *sums = aligned_alloc(64, area * sizeof(vec));
+        if (!members || !present || !sums) {
+#pragma omp atomic write
+            failed = 1;
+        } else
+            for (int64_t top = all * slab / s->slabs, next; top < all * (slab + 1) / s->slabs; top = next) {
+                int64_t image = top / bands;
+                next = least(least(top + PIECE_ROWS, all * (slab + 1) / s->slabs), (image + 1) * bands);
+                for (int64_t left = 0; left < blocks; left += PIECE_BLOCKS) {
+                    int count = 0;
+                    int64_t end = 0;
+                    memset(present, 0, s->layers + 1);
+                    for (int64_t band = top; band < next; band++)
+                        for (int64_t block = left; block < least(left + PIECE_BLOCKS, blocks); block++) {
+                            int64_t y = least(band % bands * ROWS, s->height - ROWS);
+                            int64_t x = least(block * WIDTH, s->width - WIDTH);
+                            int found = list_members(
+                                s, s->lower + image * s->lower_image + y * s->lower_row + x,
+                                s->share ? s->share + image * s->share_image + y * s->share_row + x : 0, members + end);
+                            for (int n = 0; n < found; n++) present[members[end + n].layer] = 1;
+                            places[count++] = (place){y, x, band % bands * ROWS - y, block * WIDTH - x, end, end + found};
+                            end += found;
+                        }
+                    for (int64_t layer = 0; layer < s->layers; layer++)
+                        for (int64_t c = 0; present[layer] && c < s->channels; c++) {
+                            correlate_piece(s, image, c, layer, places, count, members, sums);
+                            REAL *out = s->out + ((slab * s->layers + layer) * s->channels + c) * area;
+                            for (int64_t n = 0; n < area; n++) out[n] += sum_of(sums[n]);
+                        }
+                }
+            }
+        free(members), free(present), free(sums);
+    }
+    return failed;
+}
