@@ -92,7 +92,7 @@ def _compile(source: Path, library: Path, command: list[str]) -> bool:
     """Write the library whole or not at all. A compiler that says no is no error: say so in the log."""
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         new = Path(folder) / library.name
-        ended = subprocess.run(  # the user's own compiler
+        ended = subprocess.run(  # noqa: S603 (the user's own compiler)
             [*command, "-o", str(new), str(source)], capture_output=True, text=True, timeout=SECONDS, check=False
         )
         if ended.returncode != 0:
