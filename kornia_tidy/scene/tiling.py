@@ -39,9 +39,7 @@ def blur_then_mix(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
         (B, C, H, W), or smaller by P - 1 for ``"valid"``. It has gradients with respect to image, psfs and fraction,
         but no second ones.
     """
-    lower, fraction = (None if x is None else x[:, 0].expand(len(image), -1, -1) for x in (lower, fraction))
-    labels = Labels.of(lower, fraction)
-    keep_memory()
+    labels, fraction = _labels(lower, fraction, len(image))
     if goes_directly(psfs, labels):
         return _MixDirectly.apply(pad_border(image, psfs.shape[-1] // 2, border), psfs, fraction, labels)
     plan = make_plan(labels, len(psfs), psfs.shape[-1])
@@ -68,11 +66,17 @@ def split_then_blur(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor
     sides = "replicate" if border == "zero" else border
     lower = pad_border(lower.to(image.dtype), radius, sides).long()
     fraction = None if fraction is None else pad_border(fraction, radius, sides)
-    lower, fraction = (None if x is None else x[:, 0].expand(len(image), -1, -1) for x in (lower, fraction))
-    keep_memory()
-    plan = make_plan(Labels.of(lower, fraction), len(psfs), psfs.shape[-1])
+    labels, fraction = _labels(lower, fraction, len(image))
+    plan = make_plan(labels, len(psfs), psfs.shape[-1])
     plane = pad_border(image, radius, border)
     return _SplitThenBlur.apply(plane, psfs, fraction, plan)
+
+
+def _labels(lower: Tensor, fraction: Tensor | None, batch: int) -> tuple[Labels, Tensor | None]:
+    """Return the layers of each image's pixels, and the fraction as (B, H, W)."""
+    keep_memory()
+    fraction = None if fraction is None else fraction[:, 0].expand(batch, -1, -1)
+    return Labels.of(lower[:, 0].expand(batch, -1, -1), fraction), fraction
 
 
 class _BlurThenMix(torch.autograd.Function):
