@@ -19,6 +19,14 @@ COMPOSITINGS = ("gather", "scatter")
 ATOL = {torch.float32: 2e-6, torch.float64: 1e-12}
 
 
+@pytest.fixture(autouse=True, scope="module")
+def by_transforms():
+    """Not directly, which these PSFs would be; see test_direct.py for that."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tiling, "goes_directly", lambda psfs, labels: False)
+        yield
+
+
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Tiles so small, and chunks of so few pairs, that a small scene has many of both."""
