@@ -177,10 +177,11 @@ static void mix_block(const scene *s, const REAL *light, const int64_t *lower, c
         for (int strip = 0; strip < 2; strip++) *(loose *)(out + v * s->width + strip * LANES) = total[strip][v];
 }
 
-// Each pixel takes the light that it sees through its own PSFs.
+// Each pixel takes the light that it sees through its own PSFs. Threads work on many bands that follow one another, whose
+// light they share, before few.
 void mix(const scene *s) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH;
-#pragma omp parallel for schedule(dynamic, 4) num_threads(s->threads)
+#pragma omp parallel for schedule(guided, 8) num_threads(s->threads)
     for (int64_t band = 0; band < s->images * bands; band++) {
         int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
         const int64_t *lower = s->lower + image * s->lower_image + y * s->lower_row;
