@@ -307,8 +307,10 @@ class PlannedScene:
             if self._labelled is None or self._labelled[0] != (mode, nodes, margin):  # one at a time: they are large
                 seen = self._seen(margin)
                 self._labelled = (mode, nodes, margin), label_pixels(seen, self._batch, nodes, mode)
-            count = count_windows if self._occlusion else count_tiles
-            self._tiles[mode, nodes, window] = count(self._labelled[1], len(nodes), window)
+            scene = self._labelled[1], len(nodes), window
+            gathers = self._survey.compositing == "gather"
+            cut = count_windows(*scene) if self._occlusion else count_tiles(*scene, gathers=gathers)
+            self._tiles[mode, nodes, window] = cut
         return self._tiles[mode, nodes, window]
 
     def _seen(self, margin: int) -> Tensor:

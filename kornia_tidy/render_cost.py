@@ -20,6 +20,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.propagation import energy_operations, gauss_legendre_order
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+from kornia_tidy.scene.direct import can_go_directly, count_pairs, direct_cost, is_direct_faster
 from kornia_tidy.scene.layers import assign_layers
 from kornia_tidy.scene.tiles import CHUNK_BYTES, SAMPLE, Labels, choose_grid, tile_cost, transforms_cost
 
@@ -82,7 +83,7 @@ def bank_seconds(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> flo
 
 @dataclass(frozen=True)
 class Tiles:
-    """What the tiled renderer does for a scene, see :mod:`kornia_tidy.scene.tiles`.
+    """What the tiled renderer does for a scene, see :mod:`kornia_tidy.scene.tiles` and :mod:`kornia_tidy.scene.direct`.
 
     Args:
         size: side of the tiles' windows in pixels.
@@ -91,6 +92,7 @@ class Tiles:
         layers: layers present in the scene.
         pixels: of the output in one channel, over the batch.
         terms: layers that a pixel takes light from: 1 or 2.
+        strips: pairs of a strip and a layer, in float32, where the scene can be convolved directly.
     """
 
     size: int
@@ -99,6 +101,7 @@ class Tiles:
     layers: int
     pixels: int
     terms: int
+    strips: int | None = None
 
 
 def label_pixels(defocus: Tensor, batch: int, nodes: Sequence[float], mode: str) -> Labels:
@@ -115,13 +118,14 @@ def label_pixels(defocus: Tensor, batch: int, nodes: Sequence[float], mode: str)
     return Labels.of(lower, None if mode == "nearest" else fraction)
 
 
-def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
+def count_tiles(labels: Labels, layers: int, window: int, *, gathers: bool = True) -> Tiles:
     """Cut up a scene as the renderer will, and count. Only every eighth row and column is looked at.
 
     Args:
         labels: from :func:`label_pixels`.
         layers: how many there are.
         window: side of the PSFs.
+        gathers: pixels take light, which may go directly, and do not spread it.
 
     Example:
         >>> flat = label_pixels(torch.zeros(1, 1, 64, 64), 1, (-1.0, 0.0, 1.0), "linear")
@@ -131,21 +135,32 @@ def count_tiles(labels: Labels, layers: int, window: int) -> Tiles:
     grid, sample = choose_grid(labels, layers, window), labels.every(SAMPLE)
     here = grid.present(sample, layers, SAMPLE)
     pairs, present = int(here.sum()), int(here.any(0).sum())
-    return Tiles(grid.size, grid.blocks, pairs, present, labels.lower.numel(), 1 if labels.fraction is None else 2)
+    directly = gathers and can_go_directly(labels, torch.float32)
+    strips = count_pairs(labels, torch.float32) if directly else None
+    terms = 1 if labels.fraction is None else 2
+    return Tiles(grid.size, grid.blocks, pairs, present, labels.lower.numel(), terms, strips)
 
 
 def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:
-    """Return the time of the tiled renderer on one core of a 2.5 GHz Xeon.
+    """Return the time of the tiled renderer on one core of a 2.5 GHz Xeon, by transforms or directly.
 
-    It is :func:`kornia_tidy.scene.tiles.tile_cost`, by which the renderer chooses its tiles, with the spectra of the
-    PSFs, and what is taken pixel by pixel from each layer.
+    It is what the renderer itself chooses by: :func:`kornia_tidy.scene.tiles.transforms_cost`, with the spectra of the
+    PSFs, or :func:`kornia_tidy.scene.direct.direct_cost`.
 
     Example:
-        >>> f"{rendering_seconds(Tiles(128, 100, 400, 21, 2**20, 2), 3, Fidelity()):.1g}"
+        >>> f"{rendering_seconds(Tiles(128, 100, 400, 21, 2**20, 2), 3, Fidelity(window=23)):.1g}"
         '0.1'
     """
+    direct, transforms = _nanoseconds(tiles, fidelity)
+    faster = transforms if direct is None else min(direct, transforms)
+    return _weight(fidelity) * channels * faster * 1e-9
+
+
+def _nanoseconds(tiles: Tiles, fidelity: Fidelity) -> tuple[float | None, float]:
+    """Of a channel in float32, directly, if it can be, and by transforms."""
     windows = tile_cost(tiles.size, tiles.blocks, tiles.pairs) + tile_cost(tiles.size, 0, tiles.layers)
-    return _weight(fidelity) * channels * transforms_cost(windows, tiles.pixels, tiles.terms) * 1e-9
+    direct = None if tiles.strips is None else direct_cost(tiles.strips, window_side(fidelity))
+    return direct, transforms_cost(windows, tiles.pixels, tiles.terms)
 
 
 def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, layers: int, rendering: int) -> int:
@@ -168,8 +183,14 @@ def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, laye
 
 
 def rendering_bytes(tiles: Tiles, channels: int, fidelity: Fidelity) -> int:
-    """Return what the renderer takes: spectra, the planes of a chunk of tiles in one channel, labels and sums."""
+    """Return what the renderer takes: spectra, the planes of a chunk of tiles in one channel, labels and sums.
+
+    Directly it takes a padded image, labels and what it returns.
+    """
     real = 4 * _weight(fidelity)
+    direct, transforms = _nanoseconds(tiles, fidelity)
+    if direct is not None and is_direct_faster(direct, transforms):
+        return tiles.pixels * (2 * channels * real + 2 * 8)
     plane = 2 * real * tiles.size**2
     chunk = 3 * max(CHUNK_BYTES["cpu"], plane * math.ceil(tiles.pairs / tiles.blocks))
     return 2 * tiles.layers * channels * plane + chunk + tiles.pixels * (4 * channels * real + 2 * 8)

@@ -13,7 +13,15 @@ from torch.utils.flop_counter import FlopCounterMode
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.planning import Planner
-from kornia_tidy.render_cost import Tiles, bank_operations, count_tiles, label_pixels, rendering_seconds, window_side
+from kornia_tidy.render_cost import (
+    Tiles,
+    bank_operations,
+    count_tiles,
+    label_pixels,
+    rendering_bytes,
+    rendering_seconds,
+    window_side,
+)
 from kornia_tidy.scene.tiles import make_plan
 from tests.base import BaseTester, needs_data
 from tests.capture_memory import predicted_over_used
@@ -49,6 +57,20 @@ class TestCost(BaseTester):
         assert rendering_seconds(tiles, 3, fidelity) == pytest.approx(3 * one)
         assert rendering_seconds(tiles, 1, fidelity.replace(double=True)) == pytest.approx(2 * one)
         assert one < rendering_seconds(replace(tiles, pairs=240), 1, fidelity) < 2 * one
+
+    def test_feature_the_faster_way_counts(self):
+        """By transforms or directly; who spreads light cannot go directly."""
+        rows = torch.linspace(-10, 10, 128).view(1, 1, -1, 1).expand(1, 1, 128, 128)
+        nodes = tuple(float(psi) for psi in range(-20, 21, 2))
+        labels = label_pixels(rows, 2, nodes, "nearest")
+        if count_tiles(labels, len(nodes), 9).strips is None:
+            pytest.skip("no C compiler on this machine: all is rendered by transforms")
+        assert count_tiles(labels, len(nodes), 9, gathers=False).strips is None
+        for window, directly in ((9, True), (129, False)):
+            tiles, fidelity = count_tiles(labels, len(nodes), window), Fidelity(window=window)
+            by_transforms = replace(tiles, strips=None)
+            assert (rendering_seconds(tiles, 3, fidelity) < rendering_seconds(by_transforms, 3, fidelity)) == directly
+            assert (rendering_bytes(tiles, 3, fidelity) < rendering_bytes(by_transforms, 3, fidelity)) == directly
 
     @needs_data
     @pytest.mark.slow

@@ -16,6 +16,7 @@
 #define INLINE static inline __attribute__((always_inline))
 
 enum { LANES = 64 / sizeof(REAL), ROWS = 4, WIDTH = 2 * LANES };
+enum { APART = 4 };  // rows of light
 enum { TERMS = 2 * ROWS * WIDTH };        // the most layers that a block lists
 enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // of blocks, whose correlations are added up together
 
@@ -40,6 +41,8 @@ typedef struct {
     int32_t layer, strips;
 } member;
 
+INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
+
 // One row of light meets rows `from` to `to` of a strip. Columns are taken `step` at a time into sums of their own, so
 // that additions need not wait for one another.
 INLINE void add_row(const REAL *light, const REAL *psf, int64_t side, int strips, int step, int from, int to,
@@ -63,23 +66,30 @@ INLINE void add_row(const REAL *light, const REAL *psf, int64_t side, int strips
         }
 }
 
-// `side` is at least ROWS - 1.
+// `side` is 1, or at least ROWS - 1. What some rows of light bring is added up apart from the rest: sums of many numbers lose
+// more digits than sums of sums.
 INLINE void convolve(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, int strips, vec total[2][ROWS]) {
     const int step = strips == 1 ? 2 : 1;
-    vec sums[2][2][ROWS];
-    memset(sums, 0, sizeof sums);
-    for (int64_t r = 0; r < side + ROWS - 1; r++, light += pitch) {
-        const REAL *p = psf + r;
-        if (r >= ROWS - 1 && r < side) add_row(light, p, side, strips, step, 0, ROWS, sums);
-        else if (r == 0) add_row(light, p, side, strips, step, 0, 1, sums);
-        else if (r == 1) add_row(light, p, side, strips, step, 0, 2, sums);
-        else if (r == 2) add_row(light, p, side, strips, step, 0, 3, sums);
-        else if (r == side) add_row(light, p, side, strips, step, 1, ROWS, sums);
-        else if (r == side + 1) add_row(light, p, side, strips, step, 2, ROWS, sums);
-        else add_row(light, p, side, strips, step, 3, ROWS, sums);
-    }
     for (int strip = 0; strip < strips; strip++)
-        for (int v = 0; v < ROWS; v++) total[strip][v] = sums[0][strip][v] + sums[1][strip][v];
+        for (int v = 0; v < ROWS; v++) total[strip][v] = (vec){0};
+    for (int64_t first = 0; first < side + ROWS - 1; first += APART) {
+        vec sums[2][2][ROWS];
+        memset(sums, 0, sizeof sums);
+        for (int64_t r = first; r < least(first + APART, side + ROWS - 1); r++, light += pitch) {
+            const REAL *p = psf + r;
+            if (r >= ROWS - 1 && r < side) add_row(light, p, side, strips, step, 0, ROWS, sums);
+            else if (side == 1) add_row(light, p, side, strips, step, r, r + 1, sums);
+            else if (r == 0) add_row(light, p, side, strips, step, 0, 1, sums);
+            else if (r == 1) add_row(light, p, side, strips, step, 0, 2, sums);
+            else if (r == 2) add_row(light, p, side, strips, step, 0, 3, sums);
+            else if (r == side) add_row(light, p, side, strips, step, 1, ROWS, sums);
+            else if (r == side + 1) add_row(light, p, side, strips, step, 2, ROWS, sums);
+            else add_row(light, p, side, strips, step, 3, ROWS, sums);
+        }
+        for (int strip = 0; strip < strips; strip++)
+            for (int v = 0; v < ROWS; v++)
+                total[strip][v] += step == 2 ? sums[0][strip][v] + sums[1][strip][v] : sums[0][strip][v];
+    }
 }
 
 static void convolve_strip(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, vec total[2][ROWS]) {
@@ -132,8 +142,6 @@ INLINE void weigh(const scene *s, const int64_t *lower, const REAL *share, int64
             for (int i = 0; i < LANES; i++) w[i] = l[i] == layer;
     }
 }
-
-INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
 // The pairs of a strip and a layer present in it, counted in every `every`-th band of rows.
 int64_t count_pairs(const scene *s, int64_t every) {
@@ -224,8 +232,7 @@ INLINE void correlate_with(const REAL *light, int64_t pitch, const vec own[2][RO
     int64_t k = 0;
     for (; k + 4 <= side; k += 4) correlate_rows(light + k * pitch, pitch, own, side, strips, 4, sums + k * side);
     light += k * pitch, sums += k * side;
-    if (side - k == 3) correlate_rows(light, pitch, own, side, strips, 3, sums);
-    if (side - k == 2) correlate_rows(light, pitch, own, side, strips, 2, sums);
+    if (side - k == 3) correlate_rows(light, pitch, own, side, strips, 3, sums);  // a side is odd
     if (side - k == 1) correlate_rows(light, pitch, own, side, strips, 1, sums);
 }
 

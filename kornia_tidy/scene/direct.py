@@ -19,7 +19,6 @@ from kornia_tidy.scene.tiles import SAMPLE, Labels, choose_grid, tile_cost, tran
 
 SOURCE = Path(__file__).with_name("direct.c")
 STRIP_ROWS, STRIP_BYTES = 4, 64  # a strip of pixels, see direct.c
-SMALLEST_SIDE = 5  # px, of PSFs
 SHARED = 0.5  # of the work by transforms that threads share; of direct work it is all
 EVERY = 4  # columns of strips are counted in every fourth row of them
 SLABS = 4  # sums of a correlation that each thread makes in turn: enough for all to end together
@@ -37,33 +36,35 @@ class _Scene(ctypes.Structure):
     )
 
 
-def can_go_directly(psfs: Tensor, labels: Labels) -> bool:
-    """Whether there is a way to convolve these directly: on a processor, with a compiler, PSFs and planes large enough.
+def can_go_directly(labels: Labels, dtype: torch.dtype) -> bool:
+    """Whether a scene can be convolved directly: on a processor, with a compiler, and planes as large as a block.
 
     Args:
-        psfs: (D, C, P, P).
         labels: the layers of the output's pixels.
+        dtype: of the light.
     """
-    if psfs.device.type != "cpu" or psfs.dtype not in REALS or psfs.shape[-1] < SMALLEST_SIDE:
+    if labels.lower.device.type != "cpu" or dtype not in REALS:
         return False
     height, width = labels.lower.shape[-2:]
-    fits = height >= STRIP_ROWS and width >= 2 * STRIP_BYTES // psfs.element_size()
-    return fits and compiled(SOURCE, psfs.dtype) is not None
+    fits = height >= STRIP_ROWS and width >= 2 * STRIP_BYTES // dtype.itemsize
+    return fits and compiled(SOURCE, dtype) is not None
 
 
-def goes_directly(psfs: Tensor, labels: Labels) -> bool:
+def goes_directly(labels: Labels, layers: int, side: int, dtype: torch.dtype) -> bool:
     """Whether direct convolution is possible, and takes less time than transforms. See :func:`can_go_directly`."""
-    if not can_go_directly(psfs, labels):
+    if not can_go_directly(labels, dtype):
         return False
-    layers, side = len(psfs), psfs.shape[-1]
-    threads = torch.get_num_threads()
-    direct = direct_cost(count_pairs(labels, psfs.dtype), side) / threads
     grid = choose_grid(labels, layers, side)
     pairs = int(grid.present(labels.every(SAMPLE), layers, SAMPLE).sum())
     windows = tile_cost(grid.size, grid.blocks, pairs)
     transforms = transforms_cost(windows, labels.lower.numel(), 1 if labels.fraction is None else 2)
-    transforms *= psfs.element_size() / 4 * (1 - SHARED + SHARED / threads)
-    return direct < transforms
+    return is_direct_faster(direct_cost(count_pairs(labels, dtype), side), transforms * dtype.itemsize / 4)
+
+
+def is_direct_faster(direct: float, transforms: float) -> bool:
+    """Compare what two ways take on one core: of direct work threads share all, of transforms ``SHARED``."""
+    threads = torch.get_num_threads()
+    return direct / threads < transforms * (1 - SHARED + SHARED / threads)
 
 
 def direct_cost(pairs: int, side: int) -> float:

@@ -40,7 +40,7 @@ def blur_then_mix(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
         but no second ones.
     """
     labels, fraction = _labels(lower, fraction, len(image))
-    if goes_directly(psfs, labels):
+    if goes_directly(labels, len(psfs), psfs.shape[-1], psfs.dtype):
         return _MixDirectly.apply(pad_border(image, psfs.shape[-1] // 2, border), psfs, fraction, labels)
     plan = make_plan(labels, len(psfs), psfs.shape[-1])
     spare = (plan.grid.covered_height - plan.grid.height, plan.grid.covered_width - plan.grid.width)

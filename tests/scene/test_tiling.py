@@ -23,7 +23,7 @@ ATOL = {torch.float32: 2e-6, torch.float64: 1e-12}
 def by_transforms():
     """Not directly, which these PSFs would be; see test_direct.py for that."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiling, "goes_directly", lambda psfs, labels: False)
+        patch.setattr(tiling, "goes_directly", lambda *_: False)
         yield
 
 
