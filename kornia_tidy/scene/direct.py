@@ -3,7 +3,7 @@
 A block of 4 x 32 pixels (in float32) is convolved with the PSFs of its own layers and with no other: P x P products a
 pixel for each. For PSFs of up to some 40 pixels that is faster than transforms, whose tiles are larger and hold more
 layers. The work is done in C (``direct.c``), compiled on the machine that it runs on, see
-:mod:`kornia_tidy.scene.compiled`; where that cannot be, everything goes by tiles.
+:mod:`kornia_tidy.compiled`; where that cannot be, everything goes by tiles.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kornia_tidy.scene.compiled import REALS, compiled
+from kornia_tidy.compiled import REALS, compiled
 from kornia_tidy.scene.tiles import SAMPLE, Labels, choose_grid, tile_cost, transforms_cost
 
 SOURCE = Path(__file__).with_name("direct.c")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from kornia_tidy.compiled import compiled
 from kornia_tidy.optics import mutual_intensity
-from kornia_tidy.optics.mutual_intensity import mutual_energies
+from kornia_tidy.optics.mutual_intensity import LARGEST_WINDOW, SOURCE, mutual_energies
 from kornia_tidy.optics.propagation import energy_operations, pixel_energies
 from kornia_tidy.optics.wave_energy import wave_energies
 from tests.base import BaseTester
@@ -21,6 +22,48 @@ def block_numbers(request, monkeypatch):
 @pytest.mark.usefixtures("block_numbers")
 class TestMutualEnergies(EnergiesTester):
     energies = staticmethod(mutual_energies)
+
+
+@pytest.mark.skipif(compiled(SOURCE, torch.float32) is None, reason="no C compiler on this machine")
+class TestInC(BaseTester):
+    """What C makes of it without gradients, against the matrix products that gradients go through."""
+
+    @pytest.mark.parametrize(("states", "cells", "order"), [(1, 5, 1), (5, 23, 3), (3, 16, 2), (2, 33, 4)])
+    @pytest.mark.parametrize("window", [1, 7, 22, LARGEST_WINDOW])
+    def test_feature_equals_the_matrix_products(self, states, cells, order, window, dtype):
+        complex_type = dtype.to_complex()
+        field = torch.randn(states, cells, cells, dtype=complex_type)
+        kernels = torch.randn(3, window, order, cells, dtype=complex_type)
+        weights = torch.rand(states, dtype=dtype)
+        expected = mutual_energies(field, weights.requires_grad_(), kernels).detach()
+        got = mutual_energies(field, weights.detach(), kernels)
+        self.assert_close(got / expected.max(), expected / expected.max(), rtol=0, atol=8 * torch.finfo(dtype).eps)
+
+    def test_feature_any_memory_order_and_number_of_threads(self):
+        field, weights = torch.randn(2, 8, 8, dtype=torch.complex64), torch.rand(2)
+        kernels = torch.randn(2, 9, 5, 8, dtype=torch.complex64).transpose(1, 2)
+        expected, threads = (
+            mutual_energies(field.mT.contiguous().mT.conj().conj(), weights, kernels),
+            torch.get_num_threads(),
+        )
+        try:
+            torch.set_num_threads(3)
+            assert torch.equal(mutual_energies(field, weights, kernels.contiguous()), expected)
+            got = mutual_energies(field.conj(), weights, kernels.conj())  # in memory they are not conjugated
+        finally:
+            torch.set_num_threads(threads)
+        self.assert_close(got, expected, rtol=1e-5, atol=1e-4)
+
+    def test_feature_only_without_gradients_and_for_small_windows(self, monkeypatch):
+        taken = []
+        monkeypatch.setattr(mutual_intensity, "_energies_in_c", lambda *x: taken.append(x[2].shape[1]))
+        for window in (9, LARGEST_WINDOW + 2):
+            field, kernels = (torch.randn(*shape, dtype=torch.complex64) for shape in ((2, 8, 8), (2, window, 2, 8)))
+            mutual_energies(field, torch.ones(2), kernels)
+            mutual_energies(field.requires_grad_(), torch.ones(2), kernels)
+            with torch.no_grad():
+                mutual_energies(field, torch.ones(2), kernels)
+        assert taken == [9, 9]
 
 
 class TestNumerics(BaseTester):

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.compiled import compiled
 from kornia_tidy.scene import tiling
-from kornia_tidy.scene.compiled import compiled
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.direct import SOURCE, STRIP_ROWS, can_go_directly, count_pairs, direct_cost, goes_directly

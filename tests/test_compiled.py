@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import logging
+from itertools import product
+from pathlib import Path
 
 import pytest
 import torch
 
-from kornia_tidy.scene import compiled as module
-from kornia_tidy.scene.compiled import compiled
+from kornia_tidy import compiled as module
+from kornia_tidy.compiled import compiled
 from kornia_tidy.scene.direct import SOURCE
 from tests.base import BaseTester
 
@@ -92,7 +94,9 @@ class TestCompiled(BaseTester):
         assert compiled(source, torch.float32) is None
         assert "twice.c is not used" in caplog.text
 
-    def test_feature_the_sources_of_the_package_have_no_warnings(self, tmp_path, monkeypatch, caplog):
+    def test_feature_the_sources_of_the_package_have_no_warnings(self, monkeypatch, caplog):
         monkeypatch.setattr(module, "FLAGS", (*module.FLAGS, "-Wall", "-Wextra", "-Werror"))
-        for dtype in (torch.float32, torch.float64):
-            assert compiled(SOURCE, dtype) is not None, caplog.text
+        sources = sorted(Path(module.__file__).parent.rglob("*.c"))
+        assert sources
+        for source, dtype in product(sources, module.REALS):
+            assert compiled(source, dtype) is not None, caplog.text
