@@ -384,6 +384,32 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
     }
 }
 
+// What a block of one strip costs, see `direct_cost` in occlusion_direct.py.
+enum { ALONE, PAIRS, COLUMNS, EDGES, COUNTS };
+
+static int64_t count_columns(const ray *rays, int64_t side) {
+    int64_t columns = 0;
+    for (int64_t r = 0; r < side; r++) {
+        const ray *a = rays + r, *b = r < BAND - 1 ? a + side : a;
+        int64_t from = least(a->from, b->from), to = a->to > b->to ? a->to : b->to;
+        if (to > from) columns += to - from;
+    }
+    return columns;
+}
+
+static void count_block(const panes *s, desk *d, int64_t x, int64_t counts[COUNTS]) {
+    int count = list_layers(s, d, s->side + BAND - 1, x, s->side + LANES - 1);
+    const outline *o = &d->outline;
+    counts[PAIRS] += count;
+    for (int n = 0; n < count; n++) {
+        draw_outline(s, d, x, d->members[n], window_pitch(s));
+        counts[COLUMNS] += count_columns(o->light, s->side);
+        if (o->lower_count) counts[COLUMNS] += count_columns(o->lower, s->side);
+        if (o->upper_count) counts[COLUMNS] += count_columns(o->upper, s->side);
+        counts[EDGES] += o->own_count + (n < count - 1 ? o->behind_count : 0);
+    }
+}
+
 // ---- Desks.
 
 static void *take(desk *d, int64_t bytes) {
@@ -420,19 +446,32 @@ static void tear_down(desk *d) {
     for (int n = 0; n < d->count; n++) free(d->all[n]);
 }
 
-static void lay_band(const panes *s, desk *d, const double *tables, int64_t image, int64_t band) {
-    int64_t rows = s->side + BAND - 1, y = least(band * BAND, s->height - BAND);
-    int skip = band * BAND - y;  // rows that the band before has made, maybe on another thread
+// Lays the layers of a band, or with `counts` only counts what that would cost.
+static void lay_band(const panes *s, desk *d, const double *tables, int64_t band, int64_t *counts) {
+    int64_t bands = (s->height + BAND - 1) / BAND, rows = s->side + BAND - 1, image = band / bands;
+    int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
+    int skip = top - y;  // rows that the band before has made, maybe on another thread
     find_runs_of_band(s, d, image, y);
     for (int64_t x = 0, next; x < s->width; x = next) {
-        next = x + LANES;
         int64_t left = least(x, s->width - LANES);
-        if (move_heads(d, rows, left, least(s->side + WIDTH - 1, s->width + s->side - 1 - left)) && left + WIDTH <= s->width) {
-            lay_alone(s, d, tables, image, y, left, skip);
-            next = x + WIDTH;
-        } else
-            lay_over(s, d, tables, image, y, left, skip);
+        int wide = left + WIDTH <= s->width && move_heads(d, rows, left, s->side + WIDTH - 1);
+        next = x + (wide ? WIDTH : LANES);
+        if (!wide) move_heads(d, rows, left, 0);
+        if (counts && wide) counts[ALONE]++;
+        else if (counts) count_block(s, d, left, counts);
+        else if (wide) lay_alone(s, d, tables, image, y, left, skip);
+        else lay_over(s, d, tables, image, y, left, skip);
     }
+}
+
+// Adds up what every `every`-th band would cost. Returns 0, or 1 if there is no memory.
+int count(const panes *s, int64_t every, int64_t *counts) {
+    int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
+    desk d;
+    int well = set_up(s, &d);
+    for (int64_t n = every / 2; well && n < bands; n += every) lay_band(s, &d, 0, n, counts);
+    tear_down(&d);
+    return !well;
 }
 
 // Lays the layers of a scene over one another. Returns 0, or 1 if there is no memory.
@@ -452,7 +491,7 @@ int occlude(const panes *s) {
         }
 #pragma omp for schedule(dynamic, 4)
         for (int64_t n = 0; n < s->images * bands; n++)
-            if (well) lay_band(s, &d, tables, n / bands, n % bands);
+            if (well) lay_band(s, &d, tables, n, 0);
         tear_down(&d);
     }
     free(tables);
