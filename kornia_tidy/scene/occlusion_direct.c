@@ -46,17 +46,22 @@ typedef struct {
     int32_t from, to;
 } ray;
 
-// Where a run begins (sign 1) or ends (-1), as a place in the tables of row ends.
+// Where whole weights begin (sign 1) or end (-1), as a place in the tables of sums.
 typedef struct {
-    int32_t at;
-    int32_t sign;
+    int64_t at;
+    double sign;
 } edge;
+
+// Whole weights in a window: where they begin and end within rows, and from which row to which they fill rows' starts.
+typedef struct {
+    edge *columns, *rows;
+    int column_count, row_count, open;
+} region;
 
 typedef struct {
     ray *light, *lower, *upper;  // of a layer: all of its light; shared weights of runs whose `lower` it is, or is the next
-    edge *own, *behind;          // of whole weights of the layer; and of it and all behind it
-    char *own_first, *behind_first;  // whether rows begin with such a run
-    int own_count, behind_count, lower_count, upper_count;
+    int lower_count, upper_count;
+    region own, behind;  // of whole weights of the layer; and of it and all behind it
 } outline;
 
 // What a thread works with.
@@ -76,7 +81,7 @@ typedef struct {
 
 // ---- Tables: sums over the ends of a PSF's rows.
 // rows (side + 2 BAND - 2, pitch): row BAND - 1 + k holds, rising by u, the sum of row k's samples from column
-// side + LANES - 2 - u on; rows beyond the PSF hold zeros. Then the rows' whole sums, last row first, amid BAND - 1 zeros.
+// side + LANES - 2 - u on; rows beyond the PSF hold zeros. Then the sums of all rows from k = side + BAND - 2 - u on.
 
 static int64_t table_pitch(const panes *s) { return s->side + 2 * LANES; }
 static int64_t table_rows(const panes *s) { return s->side + 2 * BAND - 2; }
@@ -84,6 +89,7 @@ static int64_t table_size(const panes *s) { return table_rows(s) * (table_pitch(
 
 static void fill_table(const panes *s, const REAL *psf, double *table) {
     int64_t pitch = table_pitch(s), rows = table_rows(s);
+    double *ends = table + rows * pitch;
     memset(table, 0, table_size(s) * sizeof(double));
     for (int64_t k = 0; k < s->side; k++) {
         double sum = 0, *row = table + (BAND - 1 + k) * pitch;
@@ -92,8 +98,9 @@ static void fill_table(const panes *s, const REAL *psf, double *table) {
             if (column >= 0 && column < s->side) sum += psf[column * s->side + k];
             row[u] = sum;
         }
-        table[rows * pitch + s->side + BAND - 2 - k] = sum;
+        ends[s->side + BAND - 2 - k] = sum;
     }
+    for (int64_t u = 1; u < rows; u++) ends[u] += ends[u - 1];
 }
 
 // ---- Runs.
@@ -167,35 +174,42 @@ INLINE ray ray_of(const panes *s, extent e, const REAL *light, const REAL *nothi
     return (ray){light, e.from < LANES ? 0 : e.from - LANES + 1, least(e.to, s->side)};
 }
 
+INLINE void add_edge(edge *edges, int *count, int64_t at, int begins) {
+    edges[(*count)++] = (edge){at, begins ? 1 : -1};
+}
+
+INLINE void start_row(region *a, int64_t at, int whole) {
+    if (whole != a->open) add_edge(a->rows, &a->row_count, at, whole);
+    a->open = whole;
+}
+
 // Where a layer is in a window.
 static void draw_outline(const panes *s, desk *d, int64_t x, int32_t layer, int64_t pitch) {
-    int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1, places = table_pitch(s);
+    int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1;
     outline *o = &d->outline;
-    o->own_count = o->behind_count = o->lower_count = o->upper_count = 0;
+    o->own.column_count = o->own.row_count = o->own.open = 0;
+    o->behind.column_count = o->behind.row_count = o->behind.open = 0;
+    o->lower_count = o->upper_count = 0;
     for (int64_t r = 0; r < rows; r++) {
         extent light = {span, 0}, lower = {span, 0}, upper = {span, 0};
-        int was_own = 0, was_behind = 0;
-        o->own_first[r] = o->behind_first[r] = 0;
-        for (const run *p = d->heads[r]; p->start < x + span; p++) {
+        const run *p = d->heads[r];
+        int64_t place = (BAND - 1 + r) * table_pitch(s) + s->side + LANES - 2 + x;  // less the column where a run begins
+        int was_own = p->layer == layer && !p->shared, was_behind = was_own || p->layer < layer;
+        int whole = was_own && p[1].start >= x + span;
+        start_row(&o->own, rows - 1 - r, was_own);
+        start_row(&o->behind, rows - 1 - r, was_behind);
+        for (; p->start < x + span; p++) {
             int32_t from = p->start < x ? 0 : p->start - x, to = least(p[1].start - x, span);
             int own = p->layer == layer && !p->shared, behind = own || p->layer < layer;
             int below = p->layer == layer && p->shared, above = p->layer == layer - 1 && p->shared;
-            int32_t at = (BAND - 1 + r) * places + s->side + LANES - 2 - from;
-            if (own != was_own) {
-                if (from) o->own[o->own_count++] = (edge){at, own ? 1 : -1};
-                else o->own_first[r] = 1;
-            }
-            if (behind != was_behind) {
-                if (from) o->behind[o->behind_count++] = (edge){at, behind ? 1 : -1};
-                else o->behind_first[r] = 1;
-            }
+            if (own != was_own) add_edge(o->own.columns, &o->own.column_count, place - p->start, own);
+            if (behind != was_behind) add_edge(o->behind.columns, &o->behind.column_count, place - p->start, behind);
             was_own = own, was_behind = behind;
             if (own || below || above) reach(&light, from, to);
             if (below) reach(&lower, from, to);
             if (above) reach(&upper, from, to);
         }
         // Rows that are the layer's alone need no mask: null for the plane's own row.
-        int whole = o->own_first[r] && d->heads[r][1].start >= x + span;
         o->light[r] = ray_of(s, light, whole ? 0 : d->rows[0] + r * pitch, d->nothing);
         o->lower[r] = ray_of(s, lower, d->rows[1] + r * pitch, d->nothing);
         o->upper[r] = ray_of(s, upper, d->rows[2] + r * pitch, d->nothing);
@@ -239,19 +253,19 @@ static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec tot
 }
 
 // The blur of whole weights, from where their runs begin and end.
-static void add_edges(const panes *s, const double *table, const edge *edges, int count, const char *first, vec total[BAND]) {
-    int64_t pitch = table_pitch(s), rows = s->side + BAND - 1;
+static void add_edges(const panes *s, const double *table, const region *a, vec total[BAND]) {
+    int64_t pitch = table_pitch(s);
     dvec constant = {0}, sums[BAND][PARTS];
-    for (int64_t r = 0; r < rows; r++)
-        if (first[r]) constant += *(const dloose *)(table + table_rows(s) * pitch + rows - 1 - r);
+    for (const edge *e = a->rows; e < a->rows + a->row_count; e++)
+        constant += e->sign * *(const dloose *)(table + table_rows(s) * pitch + e->at);
     for (int v = 0; v < BAND; v++)
         for (int p = 0; p < PARTS; p++) sums[v][p] = constant[v] - (dvec){0};
-    for (const edge *e = edges; e < edges + count; e++)
+    for (const edge *e = a->columns; e < a->columns + a->column_count; e++)
 #pragma GCC unroll 8
         for (int v = 0; v < BAND; v++)
 #pragma GCC unroll 2
             for (int p = 0; p < PARTS; p++)
-                sums[v][p] += (double)e->sign * *(const dloose *)(table + e->at - v * pitch + p * DOUBLES);
+                sums[v][p] += e->sign * *(const dloose *)(table + e->at - v * pitch + p * DOUBLES);
     for (int v = 0; v < BAND; v++)
         for (int p = 0; p < PARTS; p++) {
             part half = __builtin_convertvector(sums[v][p], part);
@@ -306,15 +320,14 @@ static int64_t window_pitch(const panes *s) { return (s->side + 2 * LANES) / LAN
 // A block of two strips whose window is all of one layer.
 static void lay_alone(const panes *s, desk *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int32_t layer = d->heads[0]->layer;
-    int64_t area = s->side * s->side, rows = s->side + BAND - 1, pitch = table_pitch(s);
+    int64_t area = s->side * s->side, rows = s->side + BAND - 1;
     for (int64_t c = 0; c < s->channels; c++) {
         REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
-        const double *sums = tables + (layer * s->channels + c) * table_size(s) + table_rows(s) * pitch;
-        double whole = 0;
+        REAL whole = 0;
         vec light[2][BAND];
         memset(light, 0, sizeof light);
         if (layer < s->layers) {
-            for (int64_t k = 0; k < s->side; k++) whole += sums[BAND - 1 + k];
+            whole = tables[(layer * s->channels + c) * table_size(s) + table_rows(s) * (table_pitch(s) + 1) - 1];
             for (int64_t r = 0; r < rows; r++) {
                 const REAL *row = s->plane + image * s->plane_image + c * s->plane_channel + (y + r) * s->plane_row + x;
                 d->outline.light[r] = (ray){row, 0, s->side};
@@ -322,8 +335,8 @@ static void lay_alone(const panes *s, desk *d, const double *tables, int64_t ima
             convolve_two(d->outline.light, s->psfs + (layer * s->channels + c) * area, s->side, light);
         }
         REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
-        REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * (REAL)whole : 0;
-        REAL divisor = (whole > 0 ? (REAL)whole : 0) + EPSILON;
+        REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
+        REAL divisor = (whole > 0 ? whole : 0) + EPSILON;
         for (int v = skip; v < BAND; v++)
             for (int strip = 0; strip < 2; strip++)
                 *(loose *)(out + v * s->width + strip * LANES) = ((1 - veil) * light[strip][v] + glow) / divisor;
@@ -358,9 +371,9 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
             vec light[2][BAND], own[2][BAND], seen[BAND], weight[2][BAND];
             mask_light(s, o->light, layer, lower, share, plane, d->rows[0], pitch);
             convolve_one(rays, psf, s->side, light);
-            add_edges(s, table, o->own, o->own_count, o->own_first, own[0]);
+            add_edges(s, table, &o->own, own[0]);
             if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // nothing lies behind
-            else add_edges(s, table, o->behind, o->behind_count, o->behind_first, seen);
+            else add_edges(s, table, &o->behind, seen);
             if (o->lower_count) {
                 convolve_one(o->lower, psf, s->side, weight);
                 for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v], seen[v] += weight[0][v];
@@ -406,7 +419,7 @@ static void count_block(const panes *s, desk *d, int64_t x, int64_t counts[COUNT
         counts[COLUMNS] += count_columns(o->light, s->side);
         if (o->lower_count) counts[COLUMNS] += count_columns(o->lower, s->side);
         if (o->upper_count) counts[COLUMNS] += count_columns(o->upper, s->side);
-        counts[EDGES] += o->own_count + (n < count - 1 ? o->behind_count : 0);
+        counts[EDGES] += o->own.column_count + (n < count - 1 ? o->behind.column_count : 0);
     }
 }
 
@@ -432,10 +445,10 @@ static int set_up(const panes *s, desk *d) {
     o->light = take(d, rows * sizeof(ray));
     o->lower = take(d, rows * sizeof(ray));
     o->upper = take(d, rows * sizeof(ray));
-    o->own = take(d, rows * span * sizeof(edge));
-    o->behind = take(d, rows * span * sizeof(edge));
-    o->own_first = take(d, rows);
-    o->behind_first = take(d, rows);
+    o->own.columns = take(d, rows * span * sizeof(edge));
+    o->behind.columns = take(d, rows * span * sizeof(edge));
+    o->own.rows = take(d, rows * sizeof(edge));
+    o->behind.rows = take(d, rows * sizeof(edge));
     int well = 1;
     for (int n = 0; n < d->count; n++) well &= d->all[n] != 0;
     for (int64_t r = 0; well && r < rows; r++) d->made[r] = -1;
