@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from kornia_tidy.scene.compiled import REALS, compiled
 from kornia_tidy.scene.direct import SHARED
@@ -22,7 +23,7 @@ from kornia_tidy.scene.tiles import SAMPLE, Labels
 
 SOURCE = Path(__file__).with_name("occlusion_direct.c")
 BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion_direct.c
-SMALLEST_SIDE = BAND - 1  # px, of PSFs
+SMALLEST_SIDE = BAND - 1  # px, of PSFs; smaller ones are made as large
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 COUNTED = 12  # bands of blocks, of which costs are known
 
@@ -38,7 +39,7 @@ class _Panes(ctypes.Structure):
 
 
 def can_go_directly(plane: Tensor, psfs: Tensor) -> bool:
-    """Whether there is a way to do this directly: on a processor, with a compiler, PSFs and planes large enough.
+    """Whether there is a way to do this directly: on a processor, with a compiler, and a plane large enough.
 
     Sums keep their relative accuracy only where what is added up is positive.
 
@@ -47,7 +48,7 @@ def can_go_directly(plane: Tensor, psfs: Tensor) -> bool:
         psfs: (D, C, P, P).
     """
     side = psfs.shape[-1]
-    if psfs.device.type != "cpu" or psfs.dtype not in REALS or psfs.dtype != plane.dtype or side < SMALLEST_SIDE:
+    if psfs.device.type != "cpu" or psfs.dtype not in REALS or psfs.dtype != plane.dtype:
         return False
     height, width = (n - side + 1 for n in plane.shape[-2:])
     fits = height >= BAND and width >= 2 * STRIP_BYTES // psfs.element_size()
@@ -67,7 +68,9 @@ def goes_directly(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
     if not can_go_directly(plane, psfs):
         return False
     batch, side, threads = len(plane), psfs.shape[-1], torch.get_num_threads()
-    direct = direct_cost(*count(plane, psfs, lower, fraction), side) * psfs.element_size() / 4 / threads
+    direct = (
+        direct_cost(*count(plane, psfs, lower, fraction), max(side, SMALLEST_SIDE)) * psfs.element_size() / 4 / threads
+    )
     sample = Labels(lower, None if fraction is None else fraction.detach()).every(SAMPLE)
     labels = [label.long().expand(batch, -1, -1) for label in sample.terms()]
     output = (plane.shape[-2] - side + 1, plane.shape[-1] - side + 1)
@@ -78,9 +81,9 @@ def goes_directly(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
 def direct_cost(alone: int, pairs: int, columns: int, edges: int, side: int) -> float:
     r"""Return the time that this takes in nanoseconds a channel, on the core of ``windows_cost`` in float32.
 
-    .. math:: A (300 + 3.5 P^2) + 390 N + 2.3 K + 13 E
+    .. math:: A (250 + 3.7 P^2) + (320 + 3 P) N + 2.3 K + 12 E
 
-    Fitted to 7 to 65 pixels a side, nearest and linear layers, flat scenes and noise; within 15 % from 11 on.
+    Fitted to 7 to 65 pixels a side, nearest and linear layers, flat scenes and noise: within 15 %.
 
     Args:
         alone: A, pairs of blocks whose window is all of one layer.
@@ -90,10 +93,10 @@ def direct_cost(alone: int, pairs: int, columns: int, edges: int, side: int) -> 
         side: P, of PSFs.
 
     Example:
-        >>> f"{direct_cost(1_200, 13_300, 3_500_000, 460_000, 23) * 3e-6:.0f} ms"
-        '64 ms'
+        >>> f"{direct_cost(2_139, 21_603, 5_606_383, 534_148, 23) * 3e-6:.0f} ms"  # Aloe in 21 layers
+        '97 ms'
     """
-    return alone * (300 + 3.5 * side**2) + 390 * pairs + 2.3 * columns + 13 * edges
+    return alone * (250 + 3.7 * side**2) + (320 + 3 * side) * pairs + 2.3 * columns + 12 * edges
 
 
 def count(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None) -> list[int]:
@@ -131,9 +134,8 @@ def occlude_directly(
         (B, C, H, W).
     """
     panes, kept = _panes(plane, psfs, lower, fraction, inside)
-    columns = psfs.flip((-2, -1)).transpose(-2, -1).contiguous()
     coded = plane.new_empty(*plane.shape[:2], panes.height, panes.width)
-    panes.psfs, panes.out = columns.data_ptr(), coded.data_ptr()
+    panes.out = coded.data_ptr()
     if mean is not None and veil is not None:  # both or none
         kept += [mean.to(plane.dtype).contiguous(), veil.to(plane.dtype).contiguous()]
         panes.mean, panes.veil = (x.data_ptr() for x in kept[-2:])
@@ -156,10 +158,14 @@ def _panes(
     lower = lower.to(plane.dtype)
     if fraction is not None:  # what lies in one layer alone lies in `lower`
         full = fraction == 1
-        lower, fraction = lower + full, fraction.detach().to(plane.dtype).masked_fill(full, 0).contiguous()
+        lower, fraction = lower + full, fraction.detach().to(plane.dtype).masked_fill(full, 0)
     if inside is not None:
         lower = lower.masked_fill(inside == 0, len(psfs))
-    plane, lower = plane.contiguous(), lower.contiguous()
+    extra = (max(0, SMALLEST_SIDE - psfs.shape[-1]) // 2,) * 4
+    if extra[0]:  # no light comes from there
+        psfs, plane, lower = pad(psfs, extra), pad(plane, extra), pad(lower, extra, mode="replicate")
+        fraction = None if fraction is None else pad(fraction, extra, mode="replicate")
+    plane, lower, columns = (x.contiguous() for x in (plane, lower, psfs.flip((-2, -1)).transpose(-2, -1)))
     panes = _Panes(
         images=plane.shape[0],
         channels=plane.shape[1],
@@ -174,8 +180,11 @@ def _panes(
         map_image=lower.stride(0) if len(lower) > 1 else 0,
         map_row=lower.stride(1),
         plane=plane.data_ptr(),
+        psfs=columns.data_ptr(),
         lower=lower.data_ptr(),
     )
-    if fraction is not None:
-        panes.share = fraction.data_ptr()
-    return panes, [plane, lower] if fraction is None else [plane, lower, fraction]
+    if fraction is None:
+        return panes, [plane, lower, columns]
+    fraction = fraction.contiguous()
+    panes.share = fraction.data_ptr()
+    return panes, [plane, lower, columns, fraction]

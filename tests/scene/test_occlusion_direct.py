@@ -70,7 +70,12 @@ class TestDirectOcclusion(BaseTester):
     @pytest.mark.parametrize("border", BORDERS)
     @pytest.mark.usefixtures("directly")
     def test_feature_equals_the_dense_render(self, layers, border, device, dtype):
-        for batch, channels, size, height, width in ((2, 3, 7, 31, 46), (1, 1, 9, 61, 101), (3, 2, 15, 30, 55)):
+        for batch, channels, size, height, width in (
+            (2, 3, 7, 31, 46),
+            (1, 1, 9, 61, 101),
+            (3, 2, 15, 30, 55),
+            (1, 1, 5, 15, 39),
+        ):
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
@@ -96,7 +101,7 @@ class TestDirectOcclusion(BaseTester):
     def test_property_equals_the_dense_render_at_any_size(self, data):
         draw = data.draw
         torch.manual_seed(draw(st.integers(0, 99)))
-        radius, border = draw(st.integers(3, 9)), draw(st.sampled_from(BORDERS))
+        radius, border = draw(st.integers(0, 9)), draw(st.sampled_from(BORDERS))
         lost = 2 * radius if border == "valid" else 0
         height, width = draw(st.integers(10, 50)) + lost, draw(st.integers(16, 90)) + lost
         bank = make_bank(draw(st.integers(5, 6)), draw(st.sampled_from([1, 3])), 2 * radius + 1, light=0.7, veil=True)
@@ -184,7 +189,6 @@ class TestDirectOcclusion(BaseTester):
     def test_feature_what_it_cannot_do_goes_by_tiles(self, device):
         plane, psfs = torch.rand(1, 3, 46, 70, device=device), make_bank(size=7, dtype=torch.float32).psfs
         assert can_go_directly(plane, psfs)
-        assert not can_go_directly(plane, psfs[..., :5, :5])
         assert not can_go_directly(plane[..., :13, :], psfs)
         assert not can_go_directly(plane[..., :37], psfs)
         assert not can_go_directly(plane, psfs - 0.001)
