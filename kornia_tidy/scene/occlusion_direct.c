@@ -73,9 +73,11 @@ typedef struct {
     int64_t *stamps;    // by layer: the window it was last seen in
     int64_t window;
     REAL *rows[3];      // masked: light, shared weights of runs whose `lower` the layer is, or is the next
-    REAL *nothing;
+    REAL *nothing;      // a row of zeros
+    ray *rays;          // of one channel
+    vec (*total)[BAND], (*through)[BAND];  // by channel: light of the layers so far, and how much they let through
     outline outline;
-    void *all[16];
+    void *all[20];
     int count;
 } desk;
 
@@ -330,9 +332,9 @@ static void lay_alone(const panes *s, desk *d, const double *tables, int64_t ima
             whole = tables[(layer * s->channels + c) * table_size(s) + table_rows(s) * (table_pitch(s) + 1) - 1];
             for (int64_t r = 0; r < rows; r++) {
                 const REAL *row = s->plane + image * s->plane_image + c * s->plane_channel + (y + r) * s->plane_row + x;
-                d->outline.light[r] = (ray){row, 0, s->side};
+                d->rays[r] = (ray){row, 0, s->side};
             }
-            convolve_two(d->outline.light, s->psfs + (layer * s->channels + c) * area, s->side, light);
+            convolve_two(d->rays, s->psfs + (layer * s->channels + c) * area, s->side, light);
         }
         REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
         REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
@@ -350,10 +352,9 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
     int64_t corner = image * s->map_image + y * s->map_row + x;
     const REAL *lower = s->lower + corner, *share = s->share ? s->share + corner : 0;
     outline *o = &d->outline;
-    vec total[s->channels][BAND], through[s->channels][BAND];
-    memset(total, 0, sizeof total);
+    vec(*total)[BAND] = d->total, (*through)[BAND] = d->through;
     for (int64_t c = 0; c < s->channels; c++)
-        for (int v = 0; v < BAND; v++) through[c][v] = 1 - (vec){0};
+        for (int v = 0; v < BAND; v++) total[c][v] = (vec){0}, through[c][v] = 1 - (vec){0};
     for (int n = 0; n < count; n++) {
         int32_t layer = d->members[n];
         draw_outline(s, d, x, layer, pitch);
@@ -363,14 +364,13 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
             const REAL *psf = s->psfs + (layer * s->channels + c) * area;
             const double *table = tables + (layer * s->channels + c) * table_size(s);
             const REAL *plane = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
-            ray rays[rows];
             for (int64_t r = 0; r < rows; r++) {
-                rays[r] = o->light[r];
-                if (!rays[r].light) rays[r].light = plane + r * s->plane_row;
+                d->rays[r] = o->light[r];
+                if (!d->rays[r].light) d->rays[r].light = plane + r * s->plane_row;
             }
             vec light[2][BAND], own[2][BAND], seen[BAND], weight[2][BAND];
             mask_light(s, o->light, layer, lower, share, plane, d->rows[0], pitch);
-            convolve_one(rays, psf, s->side, light);
+            convolve_one(d->rays, psf, s->side, light);
             add_edges(s, table, &o->own, own[0]);
             if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // nothing lies behind
             else add_edges(s, table, &o->behind, seen);
@@ -442,6 +442,9 @@ static int set_up(const panes *s, desk *d) {
     d->stamps = take(d, (s->layers + 1) * sizeof *d->stamps);
     for (int n = 0; n < 3; n++) d->rows[n] = take(d, rows * pitch * sizeof(REAL));
     d->nothing = take(d, pitch * sizeof(REAL));
+    d->rays = take(d, rows * sizeof(ray));
+    d->total = take(d, s->channels * sizeof *d->total);
+    d->through = take(d, s->channels * sizeof *d->through);
     o->light = take(d, rows * sizeof(ray));
     o->lower = take(d, rows * sizeof(ray));
     o->upper = take(d, rows * sizeof(ray));

@@ -68,9 +68,7 @@ def goes_directly(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
     if not can_go_directly(plane, psfs):
         return False
     batch, side, threads = len(plane), psfs.shape[-1], torch.get_num_threads()
-    direct = (
-        direct_cost(*count(plane, psfs, lower, fraction), max(side, SMALLEST_SIDE)) * psfs.element_size() / 4 / threads
-    )
+    direct = direct_cost(*count(plane, psfs, lower, fraction), max(side, SMALLEST_SIDE)) / threads
     sample = Labels(lower, None if fraction is None else fraction.detach()).every(SAMPLE)
     labels = [label.long().expand(batch, -1, -1) for label in sample.terms()]
     output = (plane.shape[-2] - side + 1, plane.shape[-1] - side + 1)
@@ -79,14 +77,14 @@ def goes_directly(plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
 
 
 def direct_cost(alone: int, pairs: int, columns: int, edges: int, side: int) -> float:
-    r"""Return the time that this takes in nanoseconds a channel, on the core of ``windows_cost`` in float32.
+    r"""Return the time that this takes in nanoseconds a channel, on the core of ``windows_cost``.
 
     .. math:: A (250 + 3.7 P^2) + (320 + 3 P) N + 2.3 K + 12 E
 
     Fitted to 7 to 65 pixels a side, nearest and linear layers, flat scenes and noise: within 15 %.
 
     Args:
-        alone: A, pairs of blocks whose window is all of one layer.
+        alone: A, pairs of blocks whose window is all of one layer; in float64 blocks are half as wide.
         pairs: N, pairs of another block and a layer present in its window.
         columns: K, columns of PSFs that meet a row of light, or of shared weights.
         edges: E, where runs of whole weights begin and end.
