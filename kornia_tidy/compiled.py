@@ -72,8 +72,15 @@ def _private_folder() -> Path:
 
 
 def _digest(source: Path, compiler: str, flags: tuple[str, ...]) -> str:
-    """Name all that a library depends on in 16 digits."""
-    parts = [source.read_bytes(), compiler.encode(), " ".join(flags).encode(), _processor()]
+    """Name all that a library depends on in 16 digits. One source may include others of its folder."""
+    sources = sorted(source.parent.glob("*.c"))
+    parts = [
+        *(path.read_bytes() for path in sources),
+        source.name.encode(),
+        compiler.encode(),
+        " ".join(flags).encode(),
+        _processor(),
+    ]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
 
 

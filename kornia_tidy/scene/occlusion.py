@@ -5,7 +5,8 @@ behind, scatter darkens or brightens the seam. Here layers are laid over one ano
 
 A pixel takes light from a layer through a quotient, and where it sees little of a layer the divisor is small: the
 round-off of a transform in float32, some 1e-7, would be divided by as little as ``EPSILON``. So layers are blurred in
-float64 whatever the type of the image.
+float64 whatever the type of the image. Sums made sample by sample need not be, see
+:mod:`kornia_tidy.scene.occlusion_direct`.
 """
 
 from __future__ import annotations

@@ -133,17 +133,22 @@ def make_plan(
 
 
 def choose_grid(labels: list[Tensor], output: tuple[int, int], count: int, psf_size: int) -> Grid:
-    """Return the grid with the lowest cost, see :func:`windows_cost`.
+    """Return the grid with the lowest cost, see :func:`candidates`."""
+    return candidates([label[:, ::SAMPLE, ::SAMPLE] for label in labels], output, count, psf_size)[0][1]
 
-    Larger tiles waste less on their overlap, smaller ones hold fewer layers. The layers of each candidate are counted
-    on every eighth row and column.
+
+def candidates(labels: list[Tensor], output: tuple[int, int], count: int, psf_size: int) -> list[tuple[float, Grid]]:
+    """Return grids with their costs, the lowest first. See :func:`windows_cost`.
+
+    Larger tiles waste less on their overlap, smaller ones hold fewer layers. ``labels`` are of every eighth row and
+    column of the padded image.
     """
     batch = len(labels[0])
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: a window meets only next neighbours
     sizes = [size for size in SIZES if smallest <= size < 2 * (psf_size - 1 + max(output))]
     grids = [Grid(batch, *output, size, size - psf_size + 1) for size in sizes or [next_fast_size(smallest)]]
-    costs = [windows_cost(layers_of_windows(labels, grid, count).sum(1), grid.size) for grid in grids]
-    return grids[int(torch.stack(costs).argmin())]
+    costs = [windows_cost(_present(labels, grid, count, SAMPLE).sum(1), grid.size) for grid in grids]
+    return sorted(zip(torch.stack(costs).tolist(), grids, strict=True), key=lambda pair: pair[0])
 
 
 def windows_cost(layers: Tensor, size: int) -> Tensor:

@@ -11,11 +11,14 @@ opacity there, so leaving it out changes nothing. What remains is made cheap:
 
 Tiles with as many layers as each other are worked on together, in chunks of bounded memory. For the backward pass only
 the inputs are kept; each chunk is computed again.
+
+Small PSFs are convolved directly instead where that takes less time, see :mod:`kornia_tidy.scene.occlusion_direct`;
+gradients are made by tiles all the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -27,6 +30,7 @@ from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.kept_memory import keep_memory
 from kornia_tidy.scene.layers import layer_weight
 from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
+from kornia_tidy.scene.occlusion_direct import goes_directly, occlude_directly
 from kornia_tidy.scene.occlusion_tiles import Chunk, Corner, Grid, Plan, make_plan
 
 
@@ -65,42 +69,37 @@ class Inputs(NamedTuple):
 def occlude_tiled(
     image: Tensor, lower: Tensor, fraction: Tensor | None, psfs: Tensor, *, veil: Tensor | None, border: str
 ) -> Tensor:
-    """Render with occlusion, tile by tile. See :func:`kornia_tidy.scene.occlusion.occlude_dense`, which it equals.
+    """Render with occlusion, by tiles or directly, as :func:`kornia_tidy.scene.occlusion.occlude_dense` defines it.
 
     It has gradients with respect to image, psfs, fraction and veil, but no second ones.
     """
-    batch, _, height, width = image.shape
     psf_size = psfs.shape[-1]
-    if border == "valid":
-        height, width = height - psf_size + 1, width - psf_size + 1
     sloped = fraction is not None and fraction.requires_grad and torch.is_grad_enabled()
     keep_memory()
 
     # Black beyond the border has no weight; let it lie in layers that are there anyway.
     sides = "replicate" if border == "zero" else border
-    lower = pad_border(lower.to(image.dtype), psf_size // 2, sides)
-    fraction = None if fraction is None else pad_border(fraction, psf_size // 2, sides)
-    plan = make_plan(
-        lower[:, 0].long().expand(batch, -1, -1),
-        None if fraction is None else fraction[:, 0].detach().expand(batch, -1, -1),
-        (height, width),
-        (len(psfs), image.shape[1], psf_size),
+    radius = psf_size // 2
+    lower = pad_border(lower.to(image.dtype), radius, sides)[:, 0]
+    fraction = None if fraction is None else pad_border(fraction, radius, sides)[:, 0]
+    inside = pad_border(torch.ones_like(image[:1, 0]), radius, "zero") if border == "zero" else None
+    light = pad_border(image, radius, border)
+    mean = None if veil is None else image.mean((-2, -1))
+    planes = light, psfs, fraction, mean, veil, lower, inside
+    if goes_directly(light, psfs, lower, fraction):
+        return _OccludeDirectly.apply(*planes, sloped)
+    return _OccludeTiled.apply(*planes, _plan(light, psfs, lower, fraction, sloped=sloped, dark=inside is not None))
+
+
+def _plan(light: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, *, sloped: bool, dark: bool) -> Plan:
+    (batch, channels), psf_size = light.shape[:2], psfs.shape[-1]
+    return make_plan(
+        lower.long().expand(batch, -1, -1),
+        None if fraction is None else fraction.detach().expand(batch, -1, -1),
+        (light.shape[-2] - psf_size + 1, light.shape[-1] - psf_size + 1),
+        (len(psfs), channels, psf_size),
         sloped=sloped,
-        dark=border == "zero",
-    )
-    grid = plan.grid
-    rest = (0, grid.columns * grid.tile - width, 0, grid.rows * grid.tile - height)  # no new layers: nothing to compute
-    light = pad(pad_border(image, psf_size // 2, border), rest, mode="replicate")
-    inside = pad_border(torch.ones_like(image[:1, :1]), psf_size // 2, "zero") if border == "zero" else None
-    return _OccludeTiled.apply(
-        light,
-        psfs,
-        None if fraction is None else pad(fraction, rest, mode="replicate")[:, 0].expand(batch, -1, -1),
-        None if veil is None else image.mean((-2, -1)),
-        veil,
-        pad(lower, rest, mode="replicate")[:, 0].long().expand(batch, -1, -1),
-        None if inside is None else pad(inside, rest, mode="replicate")[0],
-        plan,
+        dark=dark,
     )
 
 
@@ -132,42 +131,84 @@ class _OccludeTiled(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        light, psfs, fraction, mean, veil, lower, inside = ctx.saved_tensors
-        plan: Plan = ctx.plan
-        grid = plan.grid
-        scene = _scene(light, psfs, fraction, mean, veil, lower, inside, plan)
-        grad = pad(grad, (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height))
-        wanted = ctx.needs_input_grad[:5]
-        sources = Inputs(light, scene.spectra, fraction, mean, scene.veil)
-        slopes = {
-            name: torch.zeros_like(source)
-            for name, source, want in zip(Inputs._fields, sources, wanted, strict=True)
-            if want and source is not None
-        }
-        for chunk in plan.chunks:
-            own = torch.stack([grad[i, :, y : y + grid.tile, x : x + grid.tile] for i, y, x in chunk.corners])
-            own[chunk.fillers] = 0
-            leaves = [
-                None if x is None else x.detach().requires_grad_(want)
-                for x, want in zip(_inputs(scene, chunk, grid), wanted, strict=True)
-            ]
-            asked = {n: x for n, x in zip(Inputs._fields, leaves, strict=True) if x is not None and x.requires_grad}
-            if not asked:
-                continue
-            with torch.enable_grad():
-                tiles = _tiles(Inputs._make(leaves), scene, chunk, plan)
-            found = torch.autograd.grad(tiles, list(asked.values()), own.to(tiles.dtype))
-            for name, part in zip(asked, found, strict=True):
-                _add(name, slopes[name], part, chunk, grid)
-        of_psfs = of_veil = None
-        if "spectra" in slopes:  # correlation is the transpose of convolution
-            of_psfs = torch.zeros_like(psfs)
-            own = torch.fft.ifft2(slopes["spectra"], norm="forward").real
-            of_psfs[plan.present] = own[..., : psfs.shape[-2], : psfs.shape[-1]].to(psfs.dtype)
-        if "veil" in slopes:
-            of_veil = torch.zeros_like(veil)
-            of_veil[plan.present] = slopes["veil"]
-        return slopes.get("light"), of_psfs, slopes.get("fraction"), slopes.get("mean"), of_veil, None, None, None
+        return *_slopes(ctx.saved_tensors, ctx.plan, grad, ctx.needs_input_grad[:5]), None, None, None
+
+
+class _OccludeDirectly(torch.autograd.Function):
+    """By direct convolution, with gradients by tiles."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        light: Tensor,
+        psfs: Tensor,
+        fraction: Tensor | None,
+        mean: Tensor | None,
+        veil: Tensor | None,
+        lower: Tensor,
+        inside: Tensor | None,
+        sloped: bool,
+    ) -> Tensor:
+        ctx.save_for_backward(light, psfs, fraction, mean, veil, lower, inside)
+        ctx.sloped = sloped
+        return occlude_directly(light, psfs, lower, fraction, mean, veil, inside)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        light, psfs, fraction, _, _, lower, inside = ctx.saved_tensors
+        plan = _plan(light, psfs, lower, fraction, sloped=ctx.sloped, dark=inside is not None)
+        return *_slopes(ctx.saved_tensors, plan, grad, ctx.needs_input_grad[:5]), None, None, None
+
+
+def _slopes(
+    saved: Sequence[Tensor | None], plan: Plan, grad: Tensor, wanted: Sequence[bool]
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients with respect to light, psfs, fraction, mean and veil, where they are wanted."""
+    light, psfs, fraction, mean, veil, lower, inside = saved
+    assert light is not None
+    assert psfs is not None
+    assert lower is not None
+    grid = plan.grid
+    scene = _scene(light, psfs, fraction, mean, veil, lower, inside, plan)
+    grad = pad(grad, (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height))
+    slopes = {
+        name: torch.zeros_like(source, memory_format=torch.contiguous_format)
+        for name, source, want in zip(
+            Inputs._fields, (scene.light, scene.spectra, scene.fraction, scene.mean, scene.veil), wanted, strict=True
+        )
+        if want and source is not None
+    }
+    for chunk in plan.chunks:
+        own = torch.stack([grad[i, :, y : y + grid.tile, x : x + grid.tile] for i, y, x in chunk.corners])
+        own[chunk.fillers] = 0
+        leaves = [
+            None if x is None else x.detach().requires_grad_(want)
+            for x, want in zip(_inputs(scene, chunk, grid), wanted, strict=True)
+        ]
+        asked = {n: x for n, x in zip(Inputs._fields, leaves, strict=True) if x is not None and x.requires_grad}
+        if not asked:
+            continue
+        with torch.enable_grad():
+            tiles = _tiles(Inputs._make(leaves), scene, chunk, plan)
+        found = torch.autograd.grad(tiles, list(asked.values()), own.to(tiles.dtype))
+        for name, part in zip(asked, found, strict=True):
+            _add(name, slopes[name], part, chunk, grid)
+    of_psfs = of_veil = None
+    if "spectra" in slopes:  # correlation is the transpose of convolution
+        of_psfs = torch.zeros_like(psfs)
+        own = torch.fft.ifft2(slopes["spectra"], norm="forward").real
+        of_psfs[plan.present] = own[..., : psfs.shape[-2], : psfs.shape[-1]].to(psfs.dtype)
+    if "veil" in slopes and veil is not None:
+        of_veil = torch.zeros_like(veil)
+        of_veil[plan.present] = slopes["veil"]
+    of_light, of_fraction = slopes.get("light"), slopes.get("fraction")
+    # What hangs over is not seen by any pixel of the image.
+    if of_light is not None:
+        of_light = of_light[..., : light.shape[-2], : light.shape[-1]]
+    if of_fraction is not None and fraction is not None:
+        of_fraction = of_fraction[..., : fraction.shape[-2], : fraction.shape[-1]].sum_to_size(fraction.shape)
+    return of_light, of_psfs, of_fraction, slopes.get("mean"), of_veil
 
 
 def _scene(
@@ -180,6 +221,13 @@ def _scene(
     inside: Tensor | None,
     plan: Plan,
 ) -> Scene:
+    """Let the last tiles hang over: nothing new is there that would have to be computed."""
+    grid, batch = plan.grid, len(light)
+    rest = (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height)
+    light = pad(light, rest, mode="replicate")
+    fraction = None if fraction is None else pad(fraction, rest, mode="replicate").expand(batch, -1, -1)
+    lower = pad(lower, rest, mode="replicate").long().expand(batch, -1, -1)
+    inside = None if inside is None else pad(inside, rest, mode="replicate")
     spectra = torch.fft.fft2(psfs.index_select(0, plan.present).double(), s=(plan.grid.size, plan.grid.size))
     veil = None if veil is None else veil.index_select(0, plan.present)
     return Scene(light, spectra, lower, fraction, inside, mean, veil)

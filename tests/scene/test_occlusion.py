@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.scene import occlusion_tiles
+from kornia_tidy.scene import occlusion_tiles, occlusion_tiling
 from kornia_tidy.scene.compositing import METHODS, gather, occlusion, render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.layers import layer_weights
@@ -21,6 +21,12 @@ from tests.scene.test_compositing import oracle
 from tests.scene.test_tiling import KINDS, LargestTensor, depth_map
 
 ATOL = {torch.float32: 2e-5, torch.float64: 1e-12}
+
+
+@pytest.fixture
+def tiles_only(monkeypatch):
+    """Direct convolution has tests of its own."""
+    monkeypatch.setattr(occlusion_tiling, "goes_directly", lambda *_: False)
 
 
 @pytest.fixture
@@ -253,6 +259,7 @@ class TestOcclusion(BaseTester):
         self.assert_close(function(image, defocus), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.usefixtures("tiles_only")
 class TestTiledOcclusion(BaseTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
