@@ -3,7 +3,7 @@
 A block of 8 x 16 pixels (in float32) meets the layers in its window, each only in the rows and columns where it is. All
 that is added up is positive, so float32 is enough: no sum is off by more than a share of itself, however small the
 divisor that it becomes. Whole weights along runs of pixels are not even convolved: their blur is known from where runs
-begin and end. The work is done in C (``occlusion_direct.c``), see :mod:`kornia_tidy.scene.compiled`; where that cannot
+begin and end. The work is done in C (``occlusion_direct.c``), see :mod:`kornia_tidy.compiled`; where that cannot
 be, everything goes by tiles.
 """
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_tidy.scene.compiled import REALS, compiled
+from kornia_tidy.compiled import REALS, compiled
 from kornia_tidy.scene.direct import SHARED
 from kornia_tidy.scene.occlusion_tiles import candidates
 from kornia_tidy.scene.tiles import SAMPLE, Labels

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.compiled import compiled
 from kornia_tidy.scene import occlusion_tiling
-from kornia_tidy.scene.compiled import compiled
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.layers import assign_layers
