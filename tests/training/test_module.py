@@ -164,7 +164,8 @@ class TestCheckpoint(BaseTester):
         system = load_trained(tmp_path / "a.safetensors")
         assert not torch.equal(module.optics.masks.phase, before)
         coded = module.eval().see(batch()).coded
-        assert torch.equal(system.head(coded), module(coded))
+        # PSFs with and without gradients are computed in two ways, equal to round-off.
+        torch.testing.assert_close(system.head(coded), module(coded), rtol=1e-5, atol=1e-5)
 
     def test_feature_weights_go_into_objects_of_ones_own(self, saved):
         module, path = saved
