@@ -43,48 +43,46 @@ typedef struct {
 
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
-// One row of light meets rows `from` to `to` of a strip. Columns are taken `step` at a time into sums of their own, so
-// that additions need not wait for one another.
-INLINE void add_row(const REAL *light, const REAL *psf, int64_t side, int strips, int step, int from, int to,
-                    vec sums[2][2][ROWS]) {
+// Two rows of light meet the rows of strips: `upper` those up to `split`, and `lower`, a PSF's height below, the others:
+// each row once. Columns are taken `step` at a time into sums of their own, so that additions need not wait for one
+// another.
+INLINE void add_rows(const REAL *upper, const REAL *lower, const REAL *psf, int64_t side, int split, int strips, int step,
+                     vec sums[2][2][ROWS]) {
     int64_t j = 0;
-    for (; j + step <= side; j += step)
+    for (; j < side; j += step)
 #pragma GCC unroll 2
-        for (int s = 0; s < step; s++)
+        for (int s = 0; s < step; s++) {
+            if (s && j + s == side) break;
 #pragma GCC unroll 2
             for (int strip = 0; strip < strips; strip++) {
-                vec x = *(const loose *)(light + j + s + strip * LANES);
+                vec x = *(const loose *)(upper + j + s + strip * LANES), z = x;
+                if (split < ROWS - 1) z = *(const loose *)(lower + j + s + strip * LANES);
 #pragma GCC unroll 4
-                for (int v = from; v < to; v++) sums[s][strip][v] += psf[(j + s) * side - v] * x;
+                for (int v = 0; v < ROWS; v++)
+                    sums[s][strip][v] += psf[(j + s) * side - v + (v > split ? side : 0)] * (v > split ? z : x);
             }
-    for (; j < side; j++)
-#pragma GCC unroll 2
-        for (int strip = 0; strip < strips; strip++) {
-            vec x = *(const loose *)(light + j + strip * LANES);
-#pragma GCC unroll 4
-            for (int v = from; v < to; v++) sums[0][strip][v] += psf[j * side - v] * x;
         }
 }
 
-// `side` is 1, or at least ROWS - 1. What some rows of light bring is added up apart from the rest: sums of many numbers lose
-// more digits than sums of sums.
+// What some rows of light bring is added up apart from the rest: sums of many numbers lose more digits than sums of sums.
 INLINE void convolve(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, int strips, vec total[2][ROWS]) {
     const int step = strips == 1 ? 2 : 1;
+    const REAL *lower = light + side * pitch;
     for (int strip = 0; strip < strips; strip++)
-        for (int v = 0; v < ROWS; v++) total[strip][v] = (vec){0};
-    for (int64_t first = 0; first < side + ROWS - 1; first += APART) {
+        for (int v = 0; v < ROWS; v++) {
+            vec only = *(const loose *)(light + v * pitch + strip * LANES);
+            total[strip][v] = side == 1 ? *psf * only : (vec){0};
+        }
+    if (side == 1) return;  // lower than a strip
+    for (int64_t first = 0; first < side; first += APART) {
         vec sums[2][2][ROWS];
         memset(sums, 0, sizeof sums);
-        for (int64_t r = first; r < least(first + APART, side + ROWS - 1); r++, light += pitch) {
-            const REAL *p = psf + r;
-            if (r >= ROWS - 1 && r < side) add_row(light, p, side, strips, step, 0, ROWS, sums);
-            else if (side == 1) add_row(light, p, side, strips, step, r, r + 1, sums);
-            else if (r == 0) add_row(light, p, side, strips, step, 0, 1, sums);
-            else if (r == 1) add_row(light, p, side, strips, step, 0, 2, sums);
-            else if (r == 2) add_row(light, p, side, strips, step, 0, 3, sums);
-            else if (r == side) add_row(light, p, side, strips, step, 1, ROWS, sums);
-            else if (r == side + 1) add_row(light, p, side, strips, step, 2, ROWS, sums);
-            else add_row(light, p, side, strips, step, 3, ROWS, sums);
+        for (int64_t r = first; r < least(first + APART, side); r++) {
+            const REAL *x = light + r * pitch, *z = lower + r * pitch, *p = psf + r;
+            if (r >= ROWS - 1) add_rows(x, x, p, side, ROWS - 1, strips, step, sums);
+            else if (r == 0) add_rows(x, z, p, side, 0, strips, step, sums);
+            else if (r == 1) add_rows(x, z, p, side, 1, strips, step, sums);
+            else add_rows(x, z, p, side, 2, strips, step, sums);
         }
         for (int strip = 0; strip < strips; strip++)
             for (int v = 0; v < ROWS; v++)
