@@ -148,7 +148,7 @@ class PlannedScene:
         survey, cut = self._survey, self._cut(fidelity)
         bank = bank_seconds(survey.geometry(fidelity), fidelity, self._computed(fidelity))
         if isinstance(cut, Windows):
-            return survey.captures * (bank + windows_seconds(cut, survey.planes))
+            return survey.captures * (bank + windows_seconds(cut, survey.planes, itemsize=8 if fidelity.double else 4))
         return bank + rendering_seconds(cut, survey.planes, fidelity)
 
     def plan(self, tolerance: float) -> RenderPlan:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,16 @@ class TestCost(BaseTester):
         few, many = (Windows(256, torch.full((40,), number), 21, 2**20) for number in (2, 40))
         assert windows_bytes(many, 3, 4) > windows_bytes(few, 3, 4)
         assert windows_bytes(few, 3, 8) - windows_bytes(few, 3, 4) == 2 * 3 * 4 * 2**20
+
+    def test_feature_the_faster_way_counts(self):
+        small, large = (count_windows(label_pixels(ramp(200, 200), 1, NODES, "nearest"), 21, side) for side in (9, 91))
+        if small.direct is None:
+            pytest.skip("no C compiler on this machine: all is rendered by tiles")
+        for windows, directly in ((small, True), (replace(small, direct=1e12), False)):
+            by_tiles = replace(windows, direct=None)
+            assert (windows_seconds(windows, 3) < windows_seconds(by_tiles, 3)) == directly
+            assert (windows_bytes(windows, 3, 4) < windows_bytes(by_tiles, 3, 4)) == directly
+        assert large.direct > 10 * small.direct
 
     @pytest.mark.slow
     @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of memory is read from Linux's /proc")

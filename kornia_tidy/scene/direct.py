@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.compiled import REALS, compiled
-from kornia_tidy.scene.tiles import SAMPLE, Labels, choose_grid, tile_cost, transforms_cost
+from kornia_tidy.scene.tiles import SAMPLE, Labels, candidates, choose_grid, tile_cost, transforms_cost
 
 SOURCE = Path(__file__).with_name("direct.c")
 STRIP_ROWS, STRIP_BYTES = 4, 64  # a strip of pixels, see direct.c
@@ -54,11 +54,18 @@ def goes_directly(labels: Labels, layers: int, side: int, dtype: torch.dtype) ->
     """Whether direct convolution is possible, and takes less time than transforms. See :func:`can_go_directly`."""
     if not can_go_directly(labels, dtype):
         return False
+    pixels, terms = labels.lower.numel(), 1 if labels.fraction is None else 2
+    direct, scale = direct_cost(count_pairs(labels, dtype), side), dtype.itemsize / 4
+    # First against tiles that hold one layer each, which need not be looked at.
+    windows = min(
+        tile_cost(grid.size, grid.blocks, grid.blocks) for grid in candidates(tuple(labels.lower.shape), side)
+    )
+    if is_direct_faster(direct, scale * transforms_cost(windows, pixels, terms)):
+        return True
     grid = choose_grid(labels, layers, side)
     pairs = int(grid.present(labels.every(SAMPLE), layers, SAMPLE).sum())
     windows = tile_cost(grid.size, grid.blocks, pairs)
-    transforms = transforms_cost(windows, labels.lower.numel(), 1 if labels.fraction is None else 2)
-    return is_direct_faster(direct_cost(count_pairs(labels, dtype), side), transforms * dtype.itemsize / 4)
+    return is_direct_faster(direct, scale * transforms_cost(windows, pixels, terms))
 
 
 def is_direct_faster(direct: float, transforms: float) -> bool:
@@ -70,15 +77,15 @@ def is_direct_faster(direct: float, transforms: float) -> bool:
 def direct_cost(pairs: int, side: int) -> float:
     r"""Return the time that direct convolution takes in nanoseconds a channel, on the core of ``tile_cost``.
 
-    .. math:: N (80 + 1.04 P^2)
+    .. math:: N (70 + 0.95 P^2)
 
     for N pairs of a strip of 64 bytes by 4 rows and a layer present in it, and PSFs of P x P pixels.
 
     Example:
         >>> f"{direct_cost(29_650, 23) * 3e-6:.0f} ms"
-        '56 ms'
+        '51 ms'
     """
-    return pairs * (80 + 1.04 * side**2)
+    return pairs * (70 + 0.95 * side**2)
 
 
 def mix_directly(plane: Tensor, psfs: Tensor, labels: Labels, *, slope: bool = False) -> Tensor:

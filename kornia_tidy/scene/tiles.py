@@ -235,11 +235,7 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     Larger tiles waste less on their overlap, smaller ones hold fewer layers. The pairs of each candidate are counted
     on every eighth row and column.
     """
-    batch, height, width = labels.lower.shape
-    smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
-    whole = psf_size - 1 + max(height, math.ceil(width / 2))
-    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
-    grids = [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
+    grids = candidates(tuple(labels.lower.shape), psf_size)
     if len(grids) == 1:
         return grids[0]
     sample = labels.every(SAMPLE)
@@ -247,6 +243,15 @@ def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
     counted = zip(grids, torch.stack(counts).tolist(), strict=True)
     costs = [tile_cost(grid.size, grid.blocks, pairs) for grid, pairs in counted]
     return grids[costs.index(min(costs))]
+
+
+def candidates(shape: tuple[int, ...], psf_size: int) -> list[Grid]:
+    """Return the grids to choose from, for labels of a shape."""
+    batch, height, width = shape
+    smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
+    whole = psf_size - 1 + max(height, math.ceil(width / 2))
+    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
+    return [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
 
 
 def tile_cost(size: int, blocks: int, pairs: int) -> float:
