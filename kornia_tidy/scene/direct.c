@@ -106,11 +106,17 @@ INLINE int note(member *members, int count, int64_t layer, int strip) {
     return count;
 }
 
-// Lists the layers of a block's pixels, and says how many there are.
+// Lists the layers of a block's pixels, and says how many there are: none if one of them does not exist, as where depth is
+// not a number.
 INLINE int list_members(const scene *s, const int64_t *lower, const REAL *share, member *members) {
-    int64_t other = 0;
+    uint64_t other = 0, last = 0, layers = s->layers;
     for (int v = 0; v < ROWS; v++)
-        for (int i = 0; i < WIDTH; i++) other |= lower[v * s->lower_row + i] ^ lower[0];
+        for (int i = 0; i < WIDTH; i++) {
+            uint64_t layer = lower[v * s->lower_row + i];
+            other |= layer ^ (uint64_t)lower[0];
+            last = layer > last ? layer : last;
+        }
+    if (last >= layers) return 0;
     if (!share && !other) {
         members[0] = (member){lower[0], 3};
         return 1;
@@ -121,7 +127,7 @@ INLINE int list_members(const scene *s, const int64_t *lower, const REAL *share,
             int64_t layer = lower[v * s->lower_row + i];
             REAL f = share ? share[v * s->share_row + i] : 0;
             if (s->slope || f != 1) count = note(members, count, layer, i / LANES);
-            if (s->slope || f > 0) count = note(members, count, layer + 1, i / LANES);
+            if ((s->slope || f > 0) && layer + 1 < s->layers) count = note(members, count, layer + 1, i / LANES);
         }
     return count;
 }
@@ -160,7 +166,7 @@ int64_t count_pairs(const scene *s, int64_t every) {
 }
 
 static void mix_block(const scene *s, const REAL *light, const int64_t *lower, const REAL *share, const member *members,
-                      int count, const REAL *psfs, REAL *out) {
+                      int count, const REAL *psfs, REAL *out, int skip) {
     vec total[2][ROWS], own[2][ROWS], weights[ROWS];
     int64_t stride = s->channels * s->side * s->side;
     if (count == 1 && !share)
@@ -179,30 +185,38 @@ static void mix_block(const scene *s, const REAL *light, const int64_t *lower, c
             }
         }
     }
-    for (int v = 0; v < ROWS; v++)
+    for (int v = skip; v < ROWS; v++)
         for (int strip = 0; strip < 2; strip++) *(loose *)(out + v * s->width + strip * LANES) = total[strip][v];
 }
 
 // Each pixel takes the light that it sees through its own PSFs. Threads work on many bands that follow one another, whose
-// light they share, before few.
-void mix(const scene *s) {
+// light they share, before few. Returns 0, or 1 if a layer does not exist.
+int mix(const scene *s) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH;
+    int failed = 0;
 #pragma omp parallel for schedule(guided, 8) num_threads(s->threads)
     for (int64_t band = 0; band < s->images * bands; band++) {
         int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
         const int64_t *lower = s->lower + image * s->lower_image + y * s->lower_row;
         const REAL *share = s->share ? s->share + image * s->share_image + y * s->share_row : 0;
+        int skip = band % bands * ROWS - y;  // rows that the band before has made, maybe on another thread
         member members[TERMS];
         for (int64_t block = 0; block < blocks; block++) {
             int64_t x = least(block * WIDTH, s->width - WIDTH);
             int count = list_members(s, lower + x, share ? share + x : 0, members);
+            if (count == 0) {
+#pragma omp atomic write
+                failed = 1;
+            }
             for (int64_t c = 0; c < s->channels; c++) {
                 const REAL *light = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
                 REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
-                mix_block(s, light, lower + x, share ? share + x : 0, members, count, s->psfs + c * s->side * s->side, out);
+                mix_block(s, light, lower + x, share ? share + x : 0, members, count, s->psfs + c * s->side * s->side, out,
+                          skip);
             }
         }
     }
+    return failed;
 }
 
 // `count` rows of a PSF's samples against strips: own pixels times the light they see.

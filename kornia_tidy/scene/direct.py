@@ -99,6 +99,9 @@ def mix_directly(plane: Tensor, psfs: Tensor, labels: Labels, *, slope: bool = F
 
     Returns:
         (B, C, H, W).
+
+    Raises:
+        IndexError: if a pixel lies in no layer.
     """
     batch, channels = plane.shape[:2]
     plane = _rows(plane)
@@ -106,7 +109,8 @@ def mix_directly(plane: Tensor, psfs: Tensor, labels: Labels, *, slope: bool = F
     mixed = plane.new_empty(batch, channels, *labels.lower.shape[-2:])
     scene, kept = _scene(plane, psfs.shape, labels)
     scene.psfs, scene.out, scene.slope = columns.data_ptr(), mixed.data_ptr(), slope
-    _library(plane.dtype).mix(ctypes.byref(scene))
+    if _library(plane.dtype).mix(ctypes.byref(scene)):
+        raise IndexError(f"a pixel lies in none of the {len(psfs)} layers: its depth or defocus is not a number")
     del kept
     return mixed
 
@@ -137,7 +141,7 @@ def correlate_directly(plane: Tensor, own: Tensor, labels: Labels, shape: torch.
 def count_pairs(labels: Labels, dtype: torch.dtype) -> int:
     """Return how many pairs of a strip and a layer present in it there are, from every fourth row of strips."""
     plane = torch.empty((), dtype=dtype).expand(len(labels.lower), 1, 1, 1)
-    scene, kept = _scene(plane, torch.Size((1, 1, 1, 1)), labels)
+    scene, kept = _scene(plane, torch.Size((2**31 - 1, 1, 1, 1)), labels)  # however many layers there are
     pairs = _library(dtype).count_pairs(ctypes.byref(scene), EVERY)
     del kept
     return EVERY * pairs

@@ -111,8 +111,10 @@ static void find_runs(const panes *s, const REAL *lower, const REAL *share, run 
     int64_t width = s->width + s->side - 1, count = 0;
     for (int64_t x = 0; x < width; x++) {
         int shared = share && share[x] > 0;
-        if (!x || lower[x] != lower[x - 1] || (share && shared != runs[count - 1].shared))
-            runs[count++] = (run){x, lower[x], shared};
+        if (!x || lower[x] != lower[x - 1] || (share && shared != runs[count - 1].shared)) {
+            int exists = lower[x] >= 0 && lower[x] + shared < s->layers;  // not where depth is not a number
+            runs[count++] = (run){x, exists ? lower[x] : s->layers, exists && shared};
+        }
     }
     runs[count] = (run){width, 0, 0};
 }

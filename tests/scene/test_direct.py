@@ -13,7 +13,15 @@ from kornia_tidy.compiled import compiled
 from kornia_tidy.scene import tiling
 from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import BORDERS
-from kornia_tidy.scene.direct import SOURCE, STRIP_ROWS, can_go_directly, count_pairs, direct_cost, goes_directly
+from kornia_tidy.scene.direct import (
+    SOURCE,
+    STRIP_ROWS,
+    can_go_directly,
+    count_pairs,
+    direct_cost,
+    goes_directly,
+    mix_directly,
+)
 from kornia_tidy.scene.tiles import Labels
 from tests.base import BaseTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
@@ -196,6 +204,16 @@ class TestDirectRender(BaseTester):
         dim = render(image * 1e-39, defocus, bank, layers="nearest")
         self.assert_close(1e39 * dim.double(), render(image, defocus, bank, layers="nearest"), rtol=0, atol=1e-4)
         assert torch.tensor(1e-39) * 0.5 > 0
+
+    @pytest.mark.parametrize("layer", [-(2**63), -1, 3, 2**40])
+    @pytest.mark.parametrize("shared", [False, True])
+    def test_exception_pixels_in_no_layer(self, layer, shared):
+        """What a depth that is not a number may come to."""
+        lower = torch.zeros(1, 9, 70, dtype=torch.int64)
+        lower[0, 8, 69] = layer
+        labels = Labels(lower, torch.full((1, 9, 70), 0.5) if shared else None)
+        with pytest.raises(IndexError, match="a pixel lies in none of the 3 layers"):
+            mix_directly(torch.rand(1, 1, 13, 74), torch.rand(3, 1, 5, 5), labels)
 
 
 class TestChoice(BaseTester):

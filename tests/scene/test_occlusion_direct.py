@@ -207,3 +207,17 @@ class TestDirectOcclusion(BaseTester):
         assert can_go_directly(planes[0], psfs.float())
         coded = occlude_directly(planes[0], psfs.float(), planes[1][:, 0], None, None, None, None)
         self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)
+
+    @pytest.mark.parametrize("layer", [-(2.0**63), -1.0, 3.0, float("nan")])
+    @pytest.mark.parametrize("shared", [False, True])
+    def test_feature_a_pixel_in_no_layer_is_dark_and_no_crash(self, layer, shared, device):
+        """What a depth that is not a number may come to."""
+        lower = torch.ones(1, 40, 60, device=device)
+        lower[0, 20, 30] = layer
+        fraction = torch.full((1, 40, 60), 0.5, device=device) if shared else None
+        light, psfs = torch.rand(1, 1, 40, 60, device=device), torch.rand(3, 1, 7, 7, device=device)
+        inside = torch.ones(1, 40, 60, device=device)
+        inside[0, 20, 30] = 0
+        coded = occlude_directly(light, psfs, lower, fraction, None, None, None)
+        expected = occlude_directly(light, psfs, torch.ones_like(lower), fraction, None, None, inside)
+        self.assert_close(coded, expected, rtol=0, atol=1e-6)
