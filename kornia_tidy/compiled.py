@@ -21,7 +21,8 @@ from pathlib import Path
 import torch
 
 REALS = {torch.float32: "float", torch.float64: "double"}
-FLAGS = ("-O3", "-std=gnu11", "-ffp-contract=fast", "-fPIC", "-shared")
+SHARED = Path(__file__).with_name("vectors.h")  # what sources include
+FLAGS = ("-O3", "-std=gnu11", "-ffp-contract=fast", "-fPIC", "-shared", f"-I{SHARED.parent}")
 NATIVE = {"x86_64": "-march=native", "AMD64": "-march=native"}
 SECONDS = 120  # to wait for a compiler
 
@@ -73,7 +74,7 @@ def _private_folder() -> Path:
 
 def _digest(source: Path, compiler: str, flags: tuple[str, ...]) -> str:
     """Name all that a library depends on in 16 digits. One source may include others of its folder."""
-    sources = sorted(source.parent.glob("*.c"))
+    sources = [SHARED, *sorted(source.parent.glob("*.c"))]
     parts = [
         *(path.read_bytes() for path in sources),
         source.name.encode(),

@@ -6,31 +6,11 @@
 //
 // Compiled by compiled.py with REAL as float or double; exact to rounding, without fast-math.
 
-#include <stdint.h>
 #include <stdlib.h>
-#include <string.h>
 
-#define INLINE static inline __attribute__((always_inline))
+#include "vectors.h"
 
-enum { LANES = 64 / sizeof(REAL), BLOCK = 8 };  // rows of J that stay in registers
-
-typedef REAL vec __attribute__((vector_size(64)));
-
-INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
-
-INLINE REAL sum_of(vec lanes) {
-    typedef REAL half __attribute__((vector_size(32)));
-    typedef REAL quarter __attribute__((vector_size(16)));
-    half halves[2];
-    memcpy(halves, &lanes, sizeof lanes);
-    halves[0] += halves[1];
-    quarter quarters[2];
-    memcpy(quarters, halves, sizeof halves[0]);
-    quarters[0] += quarters[1];
-    REAL sum = 0;
-    for (int i = 0; i < LANES / 4; i++) sum += quarters[0][i];
-    return sum;
-}
+enum { BLOCK = 8 };  // rows of J that stay in registers
 
 // `count` vectors of a wave: a row of the kernel, x, times the field, u.
 INLINE void add_wave(const REAL *x, const vec *u, int64_t cells, int64_t vecs, int count, vec *re, vec *im) {

@@ -9,18 +9,15 @@
 //
 // Compiled by compiled.py with REAL as float or double; exact to rounding, without fast-math.
 
-#include <stdint.h>
 #include <stdlib.h>
-#include <string.h>
 
-#define INLINE static inline __attribute__((always_inline))
+#include "vectors.h"
 
-enum { LANES = 64 / sizeof(REAL), ROWS = 4, WIDTH = 2 * LANES };
+enum { ROWS = 4, WIDTH = 2 * LANES };
 enum { APART = 4 };  // rows of light
 enum { TERMS = 2 * ROWS * WIDTH };        // the most layers that a block lists
 enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // of blocks, whose correlations are added up together
 
-typedef REAL vec __attribute__((vector_size(64)));
 typedef REAL loose __attribute__((vector_size(64), aligned(sizeof(REAL)), may_alias));
 
 // The fields of `_Scene` in direct.py. Strides count elements; widths and heights are those of the output.
@@ -40,8 +37,6 @@ typedef struct {
 typedef struct {
     int32_t layer, strips;
 } member;
-
-INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
 // Two rows of light meet the rows of strips: `upper` those up to `split`, and `lower`, a PSF's height below, the others:
 // each row once. Columns are taken `step` at a time into sums of their own, so that additions need not wait for one
@@ -287,20 +282,6 @@ static void correlate_piece(const scene *s, int64_t image, int64_t channel, int6
             if (members[n].strips == 3) correlate_block(light, s->plane_row, weights, s->side, sums);
             else correlate_strip(light + first * LANES, s->plane_row, weights + first, s->side, sums);
         }
-}
-
-INLINE REAL sum_of(vec lanes) {
-    typedef REAL half __attribute__((vector_size(32)));
-    typedef REAL quarter __attribute__((vector_size(16)));
-    half halves[2];
-    memcpy(halves, &lanes, sizeof lanes);
-    halves[0] += halves[1];
-    quarter quarters[2];
-    memcpy(quarters, halves, sizeof halves[0]);
-    quarters[0] += quarters[1];
-    REAL sum = 0;
-    for (int i = 0; i < LANES / 4; i++) sum += quarters[0][i];
-    return sum;
 }
 
 // What each sample of each layer's PSF has brought from the plane to the layer's own pixels, in sums over slabs of rows.

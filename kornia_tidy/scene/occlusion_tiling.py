@@ -86,12 +86,12 @@ def occlude_tiled(
     light = pad_border(image, radius, border)
     mean = None if veil is None else image.mean((-2, -1))
     planes = light, psfs, fraction, mean, veil, lower, inside
-    if goes_directly(light, psfs, lower, fraction):
-        return _OccludeDirectly.apply(*planes, sloped)
-    return _OccludeTiled.apply(*planes, _plan(light, psfs, lower, fraction, sloped=sloped, dark=inside is not None))
+    return _Occlude.apply(*planes, sloped, goes_directly(light, psfs, lower, fraction))
 
 
-def _plan(light: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, *, sloped: bool, dark: bool) -> Plan:
+def _plan(
+    light: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, inside: Tensor | None, *, sloped: bool
+) -> Plan:
     (batch, channels), psf_size = light.shape[:2], psfs.shape[-1]
     return make_plan(
         lower.long().expand(batch, -1, -1),
@@ -99,11 +99,11 @@ def _plan(light: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, *
         (light.shape[-2] - psf_size + 1, light.shape[-1] - psf_size + 1),
         (len(psfs), channels, psf_size),
         sloped=sloped,
-        dark=dark,
+        dark=inside is not None,
     )
 
 
-class _OccludeTiled(torch.autograd.Function):
+class _Occlude(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -114,10 +114,14 @@ class _OccludeTiled(torch.autograd.Function):
         veil: Tensor | None,
         lower: Tensor,
         inside: Tensor | None,
-        plan: Plan,
+        sloped: bool,
+        directly: bool,
     ) -> Tensor:
         ctx.save_for_backward(light, psfs, fraction, mean, veil, lower, inside)
-        ctx.plan = plan
+        ctx.sloped, ctx.plan = sloped, None
+        if directly:
+            return occlude_directly(light, psfs, lower, fraction, mean, veil, inside)
+        plan = ctx.plan = _plan(light, psfs, lower, fraction, inside, sloped=sloped)
         scene = _scene(light, psfs, fraction, mean, veil, lower, inside, plan)
         grid = plan.grid
         coded = light.new_empty(*light.shape[:2], grid.height, grid.width)
@@ -131,34 +135,9 @@ class _OccludeTiled(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        return *_slopes(ctx.saved_tensors, ctx.plan, grad, ctx.needs_input_grad[:5]), None, None, None
-
-
-class _OccludeDirectly(torch.autograd.Function):
-    """By direct convolution, with gradients by tiles."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        light: Tensor,
-        psfs: Tensor,
-        fraction: Tensor | None,
-        mean: Tensor | None,
-        veil: Tensor | None,
-        lower: Tensor,
-        inside: Tensor | None,
-        sloped: bool,
-    ) -> Tensor:
-        ctx.save_for_backward(light, psfs, fraction, mean, veil, lower, inside)
-        ctx.sloped = sloped
-        return occlude_directly(light, psfs, lower, fraction, mean, veil, inside)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         light, psfs, fraction, _, _, lower, inside = ctx.saved_tensors
-        plan = _plan(light, psfs, lower, fraction, sloped=ctx.sloped, dark=inside is not None)
-        return *_slopes(ctx.saved_tensors, plan, grad, ctx.needs_input_grad[:5]), None, None, None
+        plan = ctx.plan or _plan(light, psfs, lower, fraction, inside, sloped=ctx.sloped)
+        return *_slopes(ctx.saved_tensors, plan, grad, ctx.needs_input_grad[:5]), None, None, None, None
 
 
 def _slopes(

@@ -24,6 +24,7 @@ from kornia_tidy.scene.direct import (
 )
 from kornia_tidy.scene.tiles import Labels
 from tests.base import BaseTester
+from tests.scene.render_tester import RenderTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
 from tests.scene.test_tiling import ATOL, KINDS, depth_map
 
@@ -55,7 +56,7 @@ def all_direct(directly):
     assert all(directly)
 
 
-class TestDirectRender(BaseTester):
+class TestDirectRender(RenderTester):
     @pytest.fixture
     def device(self):
         """Direct convolution is for processors."""
@@ -85,8 +86,7 @@ class TestDirectRender(BaseTester):
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
-            expected = render(image, defocus, bank, method="dense", **options)
-            self.assert_close(render(image, defocus, bank, **options), expected, rtol=0, atol=ATOL[dtype])
+            self.assert_equals_dense(image, defocus, bank, "gather", ATOL[dtype], **options)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("kind", KINDS)
@@ -95,8 +95,7 @@ class TestDirectRender(BaseTester):
         bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 37, 51)
         defocus = depth_map(kind, bank, 37, 51)
-        expected = render(image, defocus, bank, layers=layers, method="dense")
-        self.assert_close(render(image, defocus, bank, layers=layers), expected, rtol=0, atol=ATOL[dtype])
+        self.assert_equals_dense(image, defocus, bank, "gather", ATOL[dtype], layers=layers)
 
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
@@ -109,8 +108,7 @@ class TestDirectRender(BaseTester):
         bank = make_bank(draw(st.integers(1, 6)), draw(st.sampled_from([1, 3])), 2 * radius + 1, dtype=dtype)
         image, defocus = make_scene(bank, draw(st.integers(1, 3)), height, width)
         options = {"layers": draw(st.sampled_from(["nearest", "linear"])), "border": border}
-        expected = render(image, defocus, bank, method="dense", **options)
-        self.assert_close(render(image, defocus, bank, **options), expected, rtol=0, atol=ATOL[dtype])
+        self.assert_equals_dense(image, defocus, bank, "gather", ATOL[dtype], **options)
 
     @pytest.mark.usefixtures("all_direct")
     def test_feature_equals_the_sum_over_pixels(self, device):
@@ -154,18 +152,8 @@ class TestDirectRender(BaseTester):
     def test_feature_gradients_equal_those_of_the_dense_render(self, layers, border, size, device, dtype):
         bank = make_bank(5, 2, size, dtype=dtype, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, 2, 151, 51)
-        slopes = []
-        for method in ("dense", "tiled"):
-            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs, bank.veil)]
-            scene = Bank(inputs[2], bank.defocus, inputs[3])
-            coded = render(inputs[0], inputs[1], scene, layers=layers, border=border, method=method)
-            slopes.append(torch.autograd.grad(coded.square().mean(), inputs, allow_unused=layers == "nearest"))
-        for expected, slope in zip(*slopes, strict=True):
-            if expected is None:
-                assert slope is None
-            else:
-                scale = float(expected.abs().max())
-                self.assert_close(slope, expected, rtol=0, atol=scale * (2e-5 if dtype == torch.float32 else 1e-12))
+        atol = 2e-5 if dtype == torch.float32 else 1e-12
+        self.assert_gradients_equal_dense(image, defocus, bank, "gather", atol, layers=layers, border=border)
 
     @pytest.mark.usefixtures("all_direct")
     def test_feature_gradients_on_nodes_are_those_of_the_interval_above(self, device):

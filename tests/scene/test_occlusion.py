@@ -16,6 +16,7 @@ from kornia_tidy.scene.layers import layer_weights
 from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
 from kornia_tidy.scene.occlusion_tiles import choose_grid, make_plan
 from tests.base import BaseTester
+from tests.scene.render_tester import RenderTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
 from tests.scene.test_compositing import oracle
 from tests.scene.test_tiling import KINDS, LargestTensor, depth_map
@@ -260,7 +261,7 @@ class TestOcclusion(BaseTester):
 
 
 @pytest.mark.usefixtures("tiles_only")
-class TestTiledOcclusion(BaseTester):
+class TestTiledOcclusion(RenderTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
     @pytest.mark.usefixtures("small_tiles")
@@ -270,9 +271,7 @@ class TestTiledOcclusion(BaseTester):
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
             for psi in (defocus, steps(bank, height, width), steps(bank, height, width, 30)):
-                expected = render(image, psi, bank, "occlusion", method="dense", **options)
-                coded = render(image, psi, bank, "occlusion", **options)
-                self.assert_close(coded, expected, rtol=0, atol=ATOL[dtype])
+                self.assert_equals_dense(image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("kind", KINDS)
@@ -281,9 +280,7 @@ class TestTiledOcclusion(BaseTester):
         bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 37, 51)
         defocus = depth_map(kind, bank, 37, 51)
-        expected = render(image, defocus, bank, "occlusion", layers=layers, method="dense")
-        coded = render(image, defocus, bank, "occlusion", layers=layers)
-        self.assert_close(coded, expected, rtol=0, atol=ATOL[dtype])
+        self.assert_equals_dense(image, defocus, bank, "occlusion", ATOL[dtype], layers=layers)
 
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
@@ -338,19 +335,8 @@ class TestTiledOcclusion(BaseTester):
         bank = make_bank(5, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 31, 46)
         defocus = steps(bank, 31, 46, 15).expand(maps, -1, -1, -1) + 0.5
-        slopes = []
-        for method in ("dense", "tiled"):
-            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs, bank.veil)]
-            scene = Bank(inputs[2], bank.defocus, inputs[3])
-            options = {"layers": layers, "border": border, "method": method}
-            coded = render(inputs[0], inputs[1], scene, "occlusion", **options)
-            slopes.append(torch.autograd.grad(coded.square().mean(), inputs, allow_unused=layers == "nearest"))
-        for expected, slope in zip(*slopes, strict=True):
-            if expected is None:
-                assert slope is None
-            else:
-                scale = float(expected.abs().max())
-                self.assert_close(slope, expected, rtol=0, atol=scale * (2e-5 if dtype == torch.float32 else 1e-10))
+        atol = 2e-5 if dtype == torch.float32 else 1e-10
+        self.assert_gradients_equal_dense(image, defocus, bank, "occlusion", atol, layers=layers, border=border)
 
     @pytest.mark.parametrize("kind", ["an odd number of tiles of one layer", "depths on the nodes"])
     @pytest.mark.usefixtures("small_tiles")

@@ -13,7 +13,7 @@ from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.layers import assign_layers
 from kornia_tidy.scene.occlusion_direct import SOURCE, can_go_directly, goes_directly, occlude_directly
-from tests.base import BaseTester
+from tests.scene.render_tester import RenderTester
 from tests.scene.scenes import Bank, make_bank, make_scene
 
 ATOL = {torch.float32: 2e-5, torch.float64: 1e-12}
@@ -65,7 +65,7 @@ KINDS = ("one layer", "checkerboard", "ramp", "steep ramp", "squares", "speck", 
 
 
 @needs_compiler
-class TestDirectOcclusion(BaseTester):
+class TestDirectOcclusion(RenderTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
     @pytest.mark.usefixtures("directly")
@@ -80,9 +80,7 @@ class TestDirectOcclusion(BaseTester):
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
             for psi in (defocus, defocus[:1], label_map("squares", bank, height, width)):
-                expected = render(image, psi, bank, "occlusion", method="dense", **options)
-                coded = render(image, psi, bank, "occlusion", **options)
-                self.assert_close(coded, expected, rtol=0, atol=ATOL[dtype])
+                self.assert_equals_dense(image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", ["reflect", "zero"])
@@ -93,8 +91,7 @@ class TestDirectOcclusion(BaseTester):
         image, _ = make_scene(bank, 1, 45, 83)
         psi = label_map(kind, bank, 45, 83)
         options = {"layers": layers, "border": border}
-        expected = render(image, psi, bank, "occlusion", method="dense", **options)
-        self.assert_close(render(image, psi, bank, "occlusion", **options), expected, rtol=0, atol=ATOL[dtype])
+        self.assert_equals_dense(image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
@@ -162,19 +159,8 @@ class TestDirectOcclusion(BaseTester):
         bank = make_bank(5, 2, 7, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 31, 46)
         defocus = (label_map("squares", bank, 31, 46) + 0.5).expand(maps, -1, -1, -1)
-        slopes = []
-        for method in ("dense", "tiled"):
-            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs, bank.veil)]
-            scene = Bank(inputs[2], bank.defocus, inputs[3])
-            options = {"layers": layers, "border": border, "method": method}
-            coded = render(inputs[0], inputs[1], scene, "occlusion", **options)
-            slopes.append(torch.autograd.grad(coded.square().mean(), inputs, allow_unused=layers == "nearest"))
-        for expected, slope in zip(*slopes, strict=True):
-            if expected is None:
-                assert slope is None
-            else:
-                scale = float(expected.abs().max())
-                self.assert_close(slope, expected, rtol=0, atol=scale * (2e-5 if dtype == torch.float32 else 1e-10))
+        atol = 2e-5 if dtype == torch.float32 else 1e-10
+        self.assert_gradients_equal_dense(image, defocus, bank, "occlusion", atol, layers=layers, border=border)
 
     # When it is chosen
 

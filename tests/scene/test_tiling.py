@@ -13,6 +13,7 @@ from kornia_tidy.scene.compositing import render
 from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.tiles import Labels, choose_grid, make_plan
 from tests.base import BaseTester
+from tests.scene.render_tester import RenderTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
 
 COMPOSITINGS = ("gather", "scatter")
@@ -61,7 +62,7 @@ KINDS = (
 )
 
 
-class TestTiledRender(BaseTester):
+class TestTiledRender(RenderTester):
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     def test_smoke_a_scene_of_many_tiles(self, compositing, device, dtype):
         bank = make_bank(6, 3, 9, dtype=dtype, device=device)
@@ -81,9 +82,7 @@ class TestTiledRender(BaseTester):
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
-            expected = render(image, defocus, bank, compositing, method="dense", **options)
-            coded = render(image, defocus, bank, compositing, **options)
-            self.assert_close(coded, expected, rtol=0, atol=ATOL[dtype])
+            self.assert_equals_dense(image, defocus, bank, compositing, ATOL[dtype], **options)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
@@ -93,8 +92,7 @@ class TestTiledRender(BaseTester):
         bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 37, 51)
         defocus = depth_map(kind, bank, 37, 51)
-        expected = render(image, defocus, bank, compositing, layers=layers, method="dense")
-        self.assert_close(render(image, defocus, bank, compositing, layers=layers), expected, rtol=0, atol=ATOL[dtype])
+        self.assert_equals_dense(image, defocus, bank, compositing, ATOL[dtype], layers=layers)
 
     @given(data=st.data())
     @settings(max_examples=60, deadline=None)
@@ -160,19 +158,8 @@ class TestTiledRender(BaseTester):
     def test_feature_gradients_equal_those_of_the_dense_render(self, compositing, layers, border, maps, device, dtype):
         bank = make_bank(5, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, 2, 31, 46)
-        slopes = []
-        for method in ("dense", "tiled"):
-            inputs = [x.clone().requires_grad_() for x in (image, defocus[:maps], bank.psfs, bank.veil)]
-            scene = Bank(inputs[2], bank.defocus, inputs[3])
-            options = {"layers": layers, "border": border, "method": method}
-            coded = render(inputs[0], inputs[1], scene, compositing, **options)
-            slopes.append(torch.autograd.grad(coded.square().mean(), inputs, allow_unused=layers == "nearest"))
-        for expected, slope in zip(*slopes, strict=True):
-            if expected is None:
-                assert slope is None
-            else:
-                scale = float(expected.abs().max())
-                self.assert_close(slope, expected, rtol=0, atol=scale * (2e-5 if dtype == torch.float32 else 1e-12))
+        atol = 2e-5 if dtype == torch.float32 else 1e-12
+        self.assert_gradients_equal_dense(image, defocus[:maps], bank, compositing, atol, layers=layers, border=border)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("wanted", range(3))
