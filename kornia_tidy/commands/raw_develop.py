@@ -213,4 +213,4 @@ def clipped_in_words(image: Tensor) -> str:
         '25 % of its values lie above white and 25 % below black, and are clipped'
     """
     above, below = (100 * float(share.float().mean()) for share in (image > 1, image < 0))
-    return f"{above:.2g} % of its values lie above white and {below:.2g} % below black, and are clipped"
+    return f"{above:.3g} % of its values lie above white and {below:.3g} % below black, and are clipped"

@@ -78,4 +78,4 @@ def clamped_in_words(optics: TiDyOptics, depth: Tensor) -> str:
     count = optics.clamped_pixels
     if not count:
         return "no pixel lies beyond the camera's range"
-    return f"{count} of {depth.numel()} pixels ({100 * count / depth.numel():.2g} %) lie beyond the camera's range"
+    return f"{count} of {depth.numel()} pixels ({100 * count / depth.numel():.3g} %) lie beyond the camera's range"

@@ -55,6 +55,12 @@ class TestSimulate(BaseTester):
         assert float((read_image("out.png") - coded).abs().max()) <= 0.5 / 255 + 1e-6
         assert float((image - coded).abs().mean()) > 0.05  # it did something
 
+    @pytest.mark.filterwarnings("ignore:.*beyond the camera's range:UserWarning")
+    def test_feature_a_scene_all_beyond_the_range_is_told_in_plain_numbers(self, scene, capsys):
+        write_depth("near.pfm", torch.full_like(read_rgbd("image.png", "depth.pfm").depth, 0.01))
+        assert main(["simulate", "image.png", "--depth", "near.pfm", "-o", "out.png"]) == 0
+        assert "(100 %) lie beyond the camera's range" in capsys.readouterr().out
+
     @pytest.mark.filterwarnings("always")
     @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
     def test_feature_every_option_reaches_the_camera(self, scene, capsys, compositing):
