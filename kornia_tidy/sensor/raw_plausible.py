@@ -12,16 +12,22 @@ MOST_ABOVE_WHITE = 1e-3  # of the counts: hot pixels may lie there
 # What a white level that lies looks like: so many counts lie above it by such a factor. Channels that saturate one
 # after the other, and noise, stay within 10 %; hot pixels are few.
 LIES = ((1e-2, 1.1), (1e-3, 1.5))
-C330_ROW = 2464  # bytes: Y Cb Y Cr ...
+C330_ROWS, C330_ROW = 912, 2464  # bytes: Y Cb Y Cr ...
+C330_BLOCK, C330_GAP = 32, 16  # rows, in the longer files
 MOST_LUMA_STEP, MOST_CHROMA_STEP = 32, 16  # on average, from one sample to the next; text and noise have more
+GREY, MOST_COLOR = 128, 64  # of chroma, and how far from it a picture's may lie on average
 
 
 def is_c330(data: bytes) -> bool:
-    """Return whether bytes are like those of a picture of a Kodak C330: YCbCr, half as many Cb and Cr, no header."""
-    rows = np.frombuffer(data, np.uint8)[: len(data) // C330_ROW * C330_ROW].reshape(-1, C330_ROW).astype(np.int16)
-    luma, chroma = rows[:, ::2], (rows[:, 1::4], rows[:, 3::4])
-    smooth = all(np.abs(np.diff(plane)).mean() < MOST_CHROMA_STEP for plane in chroma)
-    return bool(smooth and np.abs(np.diff(luma)).mean() < MOST_LUMA_STEP)
+    """Return whether bytes, whole rows, are like those of a Kodak C330: YCbCr, half as many Cb and Cr, no header."""
+    rows = np.frombuffer(data, np.uint8).reshape(-1, C330_ROW).astype(np.int16)
+    if len(rows) > C330_ROWS:
+        rows = rows[np.arange(len(rows)) % (C330_BLOCK + C330_GAP) < C330_BLOCK]
+    luma, blue, red = rows[:C330_ROWS, ::2], rows[:C330_ROWS, 1::4], rows[:C330_ROWS, 3::4]
+    return all(
+        np.abs(np.diff(plane)).mean() < most
+        for plane, most in ((luma, MOST_LUMA_STEP), (blue, MOST_CHROMA_STEP), (red, MOST_CHROMA_STEP))
+    ) and all(abs(plane.mean() - GREY) < MOST_COLOR for plane in (blue, red))
 
 
 def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, length: int) -> None:

@@ -175,7 +175,7 @@ def tiff_directories(data: bytes) -> Iterator[Directory]:
     for base in _tiff_headers(data):
         order = "<" if data[base : base + 2] == b"II" else ">"
         waiting = list(_unpack(data, f"{order}I", base + 4, base))
-        seen = set(waiting)
+        seen = {0, *waiting}  # 0: none follows
         while waiting and left:
             left -= 1
             directory, following = _directory(data, base, order, waiting.pop(0))
@@ -196,26 +196,31 @@ def _tiff_headers(data: bytes) -> list[int]:
 
 
 def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directory, tuple[Any, ...]]:
+    """Return a directory, and where the next one begins. What cannot be read, or is said twice, has no values."""
     start = base + offset
     count = min((_unpack(data, f"{order}H", start) or (0,))[0], MOST_ENTRIES)
     directory: Directory = {}
     for entry in range(start + 2, start + 2 + 12 * count, 12):
         tag, kind, number = _unpack(data, f"{order}HHI", entry) or (0, 0, 0)
-        if kind not in TYPES or tag not in WANTED:
-            continue
-        code = TYPES[kind]
-        size = number * struct.calcsize(f"={code}")
-        if not 0 < size <= MOST_BYTES:
-            continue
-        place = _unpack(data, f"{order}I", entry + 8) if size > 4 else (entry + 8 - base,)
-        letters = f"{number}s" if code == "s" else code * number
-        values = _unpack(data, order + letters, base + place[0]) if place else ()
-        if len(code) == 2:
-            values = tuple(a / b if b else math.nan for a, b in zip(values[::2], values[1::2], strict=True))
-        if tag in directory and directory[tag] != values:
-            values = ()  # said twice and differently: LibRaw may believe the other
-        directory[tag] = values
+        if tag in WANTED:
+            values = _entry_values(data, base, order, entry + 8, kind, number)
+            # Said twice and differently, LibRaw may believe the other.
+            directory[tag] = values if directory.get(tag, values) == values else ()
     return directory, _unpack(data, f"{order}I", start + 2 + 12 * count)
+
+
+def _entry_values(data: bytes, base: int, order: str, field: int, kind: int, number: int) -> tuple[Any, ...]:
+    """Return the values of an entry, which lie in its last field or where that points to."""
+    code = TYPES.get(kind, "")
+    size = number * struct.calcsize(f"={code}")
+    if not 0 < size <= MOST_BYTES:
+        return ()
+    place = _unpack(data, f"{order}I", field) if size > 4 else (field - base,)
+    letters = f"{number}s" if code == "s" else code * number
+    values = _unpack(data, order + letters, base + place[0]) if place else ()
+    if len(code) == 2:
+        values = tuple(a / b if b else math.nan for a, b in zip(values[::2], values[1::2], strict=True))
+    return values
 
 
 def _unpack(data: bytes, layout: str, offset: int, least: int = 0) -> tuple[Any, ...]:

@@ -8,6 +8,7 @@ from datetime import datetime
 
 import numpy as np
 import pytest
+import rawpy
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from kornia_tidy.sensor.filter_array import filter_tile, tile_planes
 from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 from tests.base import DATA, BaseTester, needs_data
+from tests.sensor.c330 import LENGTHS, ramp
 from tests.sensor.dng import XTRANS, dng
 
 # As the README of the data says: filter array, black, white, rows, columns.
@@ -239,9 +241,78 @@ class TestOpen(BaseTester):
         assert (raw.pattern, raw.colors, raw.counts.shape) == (None, "", (1, 36, 48))
         self.assert_close(raw.planes(), raw.mosaic())
 
-    def test_feature_a_white_level_that_lies_is_told(self):
+    def test_feature_one_black_level_of_three_channels(self):
+        """LibRaw then takes it off the white level, and not off the counts: 959 instead of 1023."""
+        counts = random_counts(36, 48, 3)
+        one, three = (RawCapture.open(dng(counts, None, black=(64,) * number)) for number in (1, 3))
+        assert one.black.tolist() == three.black.tolist() == [64, 64, 64]
+        assert one.white == three.white == 1023
+        assert torch.equal(one.mosaic(), three.mosaic())
+
+    @pytest.mark.parametrize(("white", "most"), [(255, 54998), (500, 999)])
+    def test_feature_a_white_level_that_lies_gives_way_to_the_counts(self, white, most):
+        counts = np.random.default_rng(0).integers(64, most + 1, (36, 48))
+        counts[0, 0] = most
+        told = f"its white level {white} lies, as its counts reach {most}, which is taken for white: .*--white N"
+        with pytest.warns(UserWarning, match=told) as caught:
+            raw = RawCapture.open(dng(counts, white=white))
+        assert len(caught) == 1
+        assert raw.white == most
+        assert raw.mosaic().max() == 1
+
+    def test_feature_white_that_is_given_counts(self):
+        raw = RawCapture.open(dng(random_counts(), white=500), white=999)
+        assert raw.white == 999
+        assert RawCapture.open(dng(random_counts(), white=64), white=1023).white == 1023
         with pytest.warns(UserWarning, match="of the counts lie above the white level 500, up to 999: it may be wrong"):
-            RawCapture.open(dng(random_counts(), white=500))
+            assert RawCapture.open(dng(random_counts()), white=500).white == 500
+
+    def test_feature_channels_that_saturate_later_are_told_and_left(self):
+        """A tenth above white, as where blue saturates after green: nothing changes, or highlights would turn pink."""
+        counts = random_counts()
+        counts[:4] = 1000
+        with pytest.warns(UserWarning, match=r"11 % of the counts lie above the white level 950, up to 1000"):
+            assert RawCapture.open(dng(counts.clip(max=950) + (counts == 1000) * 50, white=950)).white == 950
+
+    def test_feature_hot_pixels_are_no_white_level(self):
+        counts = random_counts(100, 100)
+        counts[:3, :3] = 60000
+        assert RawCapture.open(dng(counts)).white == 1023
+
+    @pytest.mark.parametrize(("white", "reason"), [(0, "white must be positive"), (64, "not above its black level 64")])
+    def test_exception_white_that_makes_no_sense(self, white, reason):
+        with pytest.raises(ValueError, match=reason):
+            RawCapture.open(dng(random_counts()), white=white)
+
+    @pytest.mark.parametrize("length", LENGTHS)
+    def test_feature_kodak_c330(self, length):
+        """Four planes of LibRaw's, the last of which is empty; they are sRGB's colours, linear."""
+        data = ramp(length)
+        with pytest.warns(
+            UserWarning, match=f"has no header: by its length of {length} bytes it is taken for a picture"
+        ):
+            raw = RawCapture.open(data)
+        with rawpy.imread(io.BytesIO(data)) as file:
+            theirs = file.raw_image_visible.copy()
+        assert theirs.shape == (912, 1216, 4)
+        assert not theirs[..., 3].any()
+        np.testing.assert_array_equal(raw.counts.permute(1, 2, 0).numpy(), theirs[..., :3])
+        assert (raw.pattern, raw.colors, raw.white, raw.info.camera) == (None, "RGB", 65535, "Kodak C330")
+        picture = raw.to_rgb(encoded=False)
+        self.assert_close(picture, raw.counts / 65535, atol=1e-6)
+        grey = picture[:, :600]
+        assert (grey.amax(0) - grey.amin(0)).max() == 0
+        assert (grey[0].diff(dim=1) >= 0).all()
+        assert (picture[0, 600:750] > picture[1:, 600:750].amax(0)).all()
+        assert (picture[2, 750:] > picture[:2, 750:].amax(0)).all()
+
+    @pytest.mark.parametrize("length", LENGTHS)
+    def test_exception_other_bytes_of_that_length_are_no_kodak_c330(self, length):
+        text = (b"the quick brown fox jumps over the lazy dog; " * (length // 45 + 1))[:length]
+        counts = (1000 + np.arange(length // 2) % 1232 * 37).astype("<u2").tobytes()
+        for data in (text, counts, np.random.default_rng(0).bytes(length), bytes(length)):
+            with pytest.raises(ValueError, match="does not begin as raw files do"):
+                RawCapture.open(data)
 
     @pytest.mark.parametrize(
         ("data", "reason"),
