@@ -179,9 +179,9 @@ def tiff_directories(data: bytes) -> Iterator[Directory]:
         while waiting and left:
             left -= 1
             directory, following = _directory(data, base, order, waiting.pop(0))
-            below = [offset for tag in SUB_DIRECTORIES for offset in _whole_numbers(directory, tag)]
+            below = [offset for tag in SUB_DIRECTORIES for offset in _whole_numbers(directory, tag)[:MOST_DIRECTORIES]]
             fresh = [offset for offset in dict.fromkeys([*below, *following]) if offset not in seen]
-            waiting += fresh[:MOST_DIRECTORIES]  # of thousands none beyond would be read
+            waiting += fresh
             seen.update(fresh)
             yield directory
 
