@@ -1,4 +1,4 @@
-"""White balance by what a capture shows, where its file does not say in what light it was taken."""
+"""Automatic white balance: factors from the counts of a capture, for files that hold none."""
 
 from __future__ import annotations
 

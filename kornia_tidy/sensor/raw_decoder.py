@@ -108,7 +108,7 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
 
 
 def finished_colors() -> dict[str, Any]:
-    """Return what a Kodak C330 does not say: it wrote YCbCr of a picture that it had balanced, which is sRGB's."""
+    """Return the colours, the balance and the name of a Kodak C330, whose YCbCr is balanced and of sRGB."""
     return {
         "camera_to_srgb": [[float(row == column) for column in range(4)] for row in range(3)],
         "white_balance": [1.0] * 4,

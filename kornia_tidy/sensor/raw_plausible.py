@@ -9,8 +9,8 @@ from torch import Tensor
 
 LEAST_BITS = 0.05  # a pixel; lossy compression of an empty picture takes twice as many
 MOST_ABOVE_WHITE = 1e-3  # of the counts: hot pixels may lie there
-# What a white level that lies looks like: so many counts lie above it by such a factor. Channels that saturate one
-# after the other, and noise, stay within 10 %; hot pixels are few.
+# A white level is taken for wrong if more than this share of the counts is above this multiple of it. Noise, and
+# channels that saturate one after the other, stay within 10 % of white; hot pixels are few.
 LIES = ((1e-2, 1.1), (1e-3, 1.5))
 C330_ROWS, C330_ROW = 912, 2464  # bytes: Y Cb Y Cr ...
 C330_BLOCK, C330_GAP = 32, 16  # rows, in the longer files

@@ -34,7 +34,7 @@ STORED = ((0x0111, 0x0117), (0x0144, 0x0145))  # where strips and tiles begin, a
 QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
 CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
 
-# What is looked for; other tags are not read, as each may hold as much as a hostile file says.
+# Tags that are read; a hostile file may hold 64 KiB behind each of the others.
 WANTED = frozenset(
     [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, *STORED) for tag in tags]
     + [SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, KODAK_MATRIX, PHOTOMETRIC]
@@ -81,7 +81,7 @@ def white_levels(data: bytes) -> set[int]:
 
 
 def filter_array_fault(data: bytes) -> str | None:
-    """Return what is wrong with what a DNG says of its filter array, in words; None if nothing is, or it is no DNG.
+    """Return how the filter array tags of a DNG contradict each other, as a sentence; None if they agree or it is no DNG.
 
     LibRaw takes colours from beyond its tables where a pattern speaks of colours that are not there, and takes the
     array for another one or for none where sizes do not fit. Every directory counts, as LibRaw takes the pattern from
@@ -103,7 +103,7 @@ def _behind_filters(directory: Directory) -> bool:
 
 
 def _fault(directory: Directory) -> str | None:
-    """Return what is wrong with the filter array of one directory."""
+    """Return how the filter array tags of one directory contradict each other."""
     pattern = _codes(directory, FILTER_PATTERN)
     if not pattern:
         return "its CFAPattern is missing or cannot be read"

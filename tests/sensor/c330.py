@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-ROWS, COLUMNS = 912, 1232  # 16 columns of which are a margin
+ROWS, COLUMNS = 912, 1232  # the last 16 columns are a margin
 LENGTHS = (2247168, 3370752)
 GAP_AFTER, GAP = 32, 39424  # rows and bytes, in the longer file
 

@@ -8,7 +8,6 @@ from datetime import datetime
 
 import numpy as np
 import pytest
-import rawpy
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 from kornia_tidy.sensor.filter_array import filter_tile, tile_planes
 from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 from tests.base import DATA, BaseTester, needs_data
-from tests.sensor.c330 import LENGTHS, ramp
 from tests.sensor.dng import XTRANS, dng
 
 # As the README of the data says: filter array, black, white, rows, columns.
@@ -283,36 +281,6 @@ class TestOpen(BaseTester):
     def test_exception_white_that_makes_no_sense(self, white, reason):
         with pytest.raises(ValueError, match=reason):
             RawCapture.open(dng(random_counts()), white=white)
-
-    @pytest.mark.parametrize("length", LENGTHS)
-    def test_feature_kodak_c330(self, length):
-        """Four planes of LibRaw's, the last of which is empty; they are sRGB's colours, linear."""
-        data = ramp(length)
-        with pytest.warns(
-            UserWarning, match=f"has no header: by its length of {length} bytes it is taken for a picture"
-        ):
-            raw = RawCapture.open(data)
-        with rawpy.imread(io.BytesIO(data)) as file:
-            theirs = file.raw_image_visible.copy()
-        assert theirs.shape == (912, 1216, 4)
-        assert not theirs[..., 3].any()
-        np.testing.assert_array_equal(raw.counts.permute(1, 2, 0).numpy(), theirs[..., :3])
-        assert (raw.pattern, raw.colors, raw.white, raw.info.camera) == (None, "RGB", 65535, "Kodak C330")
-        picture = raw.to_rgb(encoded=False)
-        self.assert_close(picture, raw.counts / 65535, atol=1e-6)
-        grey = picture[:, :600]
-        assert (grey.amax(0) - grey.amin(0)).max() == 0
-        assert (grey[0].diff(dim=1) >= 0).all()
-        assert (picture[0, 600:750] > picture[1:, 600:750].amax(0)).all()
-        assert (picture[2, 750:] > picture[:2, 750:].amax(0)).all()
-
-    @pytest.mark.parametrize("length", LENGTHS)
-    def test_exception_other_bytes_of_that_length_are_no_kodak_c330(self, length):
-        text = (b"the quick brown fox jumps over the lazy dog; " * (length // 45 + 1))[:length]
-        counts = (1000 + np.arange(length // 2) % 1232 * 37).astype("<u2").tobytes()
-        for data in (text, counts, np.random.default_rng(0).bytes(length), bytes(length)):
-            with pytest.raises(ValueError, match="does not begin as raw files do"):
-                RawCapture.open(data)
 
     @pytest.mark.parametrize(
         ("data", "reason"),

@@ -128,7 +128,7 @@ class TestCameraTags(BaseTester):
 
 
 class TestFilterArrayFault(BaseTester):
-    """DNG files of our own writer, some bytes of which are changed."""
+    """Tags of DNG files of our own writer are changed one at a time."""
 
     @pytest.fixture
     def data(self):
