@@ -81,7 +81,7 @@ def white_levels(data: bytes) -> set[int]:
 
 
 def filter_array_fault(data: bytes) -> str | None:
-    """Return how the filter array tags of a DNG contradict each other, as a sentence; None if they agree or it is no DNG.
+    """Return how the filter array tags of a DNG contradict each other, in words; None if they agree or it is no DNG.
 
     LibRaw takes colours from beyond its tables where a pattern speaks of colours that are not there, and takes the
     array for another one or for none where sizes do not fit. Every directory counts, as LibRaw takes the pattern from
