@@ -126,8 +126,8 @@ def gather(
         defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians; with ``nodes`` and ``layers`` it gives the weights O.
         nodes: (D,) ascending defocus of the layers in radians.
         psfs: h, (D, C, P, P) with P odd.
-        veil: v, (D, C) fraction of the image's mean light that is added, or None. With the border ``"zero"`` as much of it
-            as stays in the image, see :func:`kornia_tidy.scene.stray_light.share_within`.
+        veil: v, (D, C) fraction of the image's mean light that is added, or None. With the border ``"zero"`` as much of
+            it as stays in the image, see :func:`kornia_tidy.scene.stray_light.share_within`.
         layers: ``"linear"`` or ``"nearest"``.
         border: what lies beyond the image, see :func:`render`.
         correlate: turn the PSFs by 180 degrees.
