@@ -18,6 +18,7 @@ from torch import Tensor
 
 from kornia_tidy.scene.convolution import from_spectrum, pad_border, padded_size, to_spectrum
 from kornia_tidy.scene.layers import layer_weight, present_layers
+from kornia_tidy.scene.stray_light import normalised_share
 
 EPSILON = 1e-6  # added to the divisor: white stays white to this, over the share of the PSF that a layer is seen by
 
@@ -72,6 +73,7 @@ def occlude_dense(
     fraction = None if fraction is None else fraction.double()
     mean = image.mean((-2, -1), keepdim=True)
     psf_size = psfs.shape[-1]
+    veil = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
     size = padded_size(*image.shape[-2:], psf_size, border)
 
     def blur(plane: Tensor, spectrum: Tensor) -> Tensor:
