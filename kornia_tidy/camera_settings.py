@@ -6,6 +6,7 @@ are neither parameters nor buffers by their values. Private attributes, paramete
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import math
@@ -22,6 +23,7 @@ EXTRA_STATE = "_extra_state"  # how PyTorch calls the entry of a state that is n
 _PAGE = 4096  # bytes; settings of about the same length fill the same tensor, as distributed checkpoints want it
 _MOST_VALUES = 1 << 16  # of a tensor that is written out; larger ones are told apart by their digest
 _WORDS = ("name", "source")  # fields that name a setting and change nothing
+_NOT_SET = object()
 _REMEDY = f"without its {EXTRA_STATE!r} entry the state is loaded as weights alone"
 
 
@@ -43,7 +45,7 @@ def settings_of(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return {"is": type(value).__name__, **_described({f.name: getattr(value, f.name) for f in fields(value)})}
     if isinstance(value, Tensor):
-        return digest_of(value) if value.numel() > _MOST_VALUES or value.is_complex() else value.detach().tolist()
+        return digest_of(value) if value.numel() > _MOST_VALUES or value.is_complex() else _packed(value)
     if isinstance(value, (tuple, list)):
         return [settings_of(entry) for entry in value]
     if isinstance(value, Mapping):
@@ -137,14 +139,32 @@ def _described(values: Mapping[str, Any]) -> dict[str, Any]:
     return {str(name): settings_of(value) for name, value in values.items()}
 
 
+def _packed(tensor: Tensor) -> dict[str, Any]:
+    data = tensor.detach().cpu().double().contiguous().numpy().tobytes()  # apertures are mostly zeros and ones
+    return {"is": "tensor", "shape": list(tensor.shape), "values": base64.b64encode(zlib.compress(data)).decode()}
+
+
+def _unpacked(packed: Mapping[str, Any]) -> Tensor:
+    shape, size = packed["shape"], 8 * math.prod(packed["shape"])
+    if size > 8 * _MOST_VALUES:
+        raise ValueError(f"a tensor of {shape} is too large for settings")
+    data = zlib.decompressobj().decompress(base64.b64decode(packed["values"]), max(size, 1))
+    return torch.frombuffer(bytearray(data), dtype=torch.float64).reshape(shape).clone() if size else torch.empty(shape)
+
+
 def _difference(saved: Any, here: Any, place: str) -> tuple[str, Any, Any] | None:
     """Return the first place where settings differ, and both values there."""
     if isinstance(saved, dict) and isinstance(here, dict) and saved.get("is") == here.get("is"):
-        for name in dict.fromkeys([*saved, *here]):
+        if here.get("is") == "tensor":
+            alike = saved == here or (
+                saved["shape"] == here["shape"]
+                and torch.allclose(_unpacked(saved), _unpacked(here), rtol=1e-9, atol=1e-15, equal_nan=True)
+            )
+            return None if alike else (place, saved, here)
+        for name in dict.fromkeys([*here, *saved]):
             if name in _WORDS and "is" in here:
                 continue
-            missing = "not set"
-            found = _difference(saved.get(name, missing), here.get(name, missing), f"{place}.{name}")
+            found = _difference(saved.get(name, _NOT_SET), here.get(name, _NOT_SET), f"{place}.{name}")
             if found:
                 return found
         return None
@@ -161,13 +181,15 @@ def _same(one: Any, other: Any) -> bool:
         whether = isinstance(one, bool) or isinstance(other, bool)
         close = math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-15) or (one != one and other != other)  # noqa: PLR0124
         return one is other if whether else close
-    return type(one) is type(other) and one == other
+    return type(one) is type(other) and one == other and one is not _NOT_SET
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, dict) and value.get("is") == "tensor":
+        return f"a tensor of shape {tuple(value['shape'])} and check sum {zlib.crc32(value['values'].encode()):08x}"
     if isinstance(value, dict) and "is" in value:
         return f"a {value['is']}"
-    text = repr(value)
+    text = "not set" if value is _NOT_SET else repr(value)
     return text if len(text) < 80 else f"{text[:76]} ..."
 
 
@@ -194,8 +216,10 @@ def _made(current: Any, saved: Any, place: str) -> Any:
     if is_dataclass(current) and isinstance(saved, dict) and isinstance(here, dict) and saved.keys() == here.keys():
         values = {f.name: getattr(current, f.name) for f in fields(current) if f.init}
         return replace(current, **{n: _made(v, saved[n], f"{place}.{n}") for n, v in values.items()})  # type: ignore[type-var]
-    if isinstance(current, Tensor) and isinstance(saved, list):
-        return current.new_tensor(saved)
+    if isinstance(saved, dict) and saved.get("is") == "tensor" and (current is None or isinstance(current, Tensor)):
+        return _unpacked(saved) if current is None else _unpacked(saved).to(current)
+    if isinstance(current, Tensor) and saved is None:
+        return None
     numbers = isinstance(current, (int, float)) and isinstance(saved, (int, float)) and not isinstance(saved, bool)
     if isinstance(current, bool):
         numbers = isinstance(saved, bool)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
@@ -31,6 +31,7 @@ from kornia_tidy.threads import CaptureNotes
 if TYPE_CHECKING:
     from kornia_tidy.render_plan import RenderPlan
 
+_OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
 # What a capture in float32 of three channels takes at its peak beyond image and capture: for tiles, and a pixel.
@@ -101,6 +102,8 @@ class TiDyOptics(CodedLens):
         >>> optics.masks.phase.grad.shape
         torch.Size([5, 23, 23])
     """
+
+    _SETTABLE: ClassVar = {**CodedLens._SETTABLE, **{name: name for name in _OWN_SETTINGS}}
 
     def __init__(
         self,
@@ -430,8 +433,13 @@ class TiDyOptics(CodedLens):
 
     def settings(self) -> dict[str, Any]:
         """Return what shapes a capture besides the weights, by the names of the parts."""
-        names = ("sensor", "compositing", "color_space", "border")
-        return {**super().settings(), **{name: settings_of(getattr(self, name)) for name in names}}
+        return {**super().settings(), **{name: settings_of(getattr(self, name)) for name in _OWN_SETTINGS}}
+
+    def _take_over(self, saved: Mapping[str, Any]) -> None:
+        for name, allowed in (("compositing", COMPOSITING), ("color_space", COLOR_SPACES), ("border", BORDERS)):
+            if name in saved:
+                check_choice(name, saved[name], tuple(allowed))
+        super()._take_over(saved)
 
     # ------------------------------------------------------------------ inside
 

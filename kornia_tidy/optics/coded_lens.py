@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, Literal, Self, cast, overload
+from typing import Any, ClassVar, Literal, Self, cast, overload
 
 import torch
 from torch import Tensor, nn
@@ -55,6 +55,8 @@ class CodedLens(CameraState):
         >>> lens.psf_bank(defocus=[-10.0, 0.0]).psfs.shape[:2]
         torch.Size([2, 3])
     """
+
+    _SETTABLE: ClassVar = {**dict(zip(_PARTS, _PARTS, strict=True)), "aperture": "_aperture"}  # settings: attributes
 
     _state: int | None = None  # the one state looked through, if not all
     _bank: PSFBank | None = None  # measured, in the place of the masks' own
@@ -351,7 +353,7 @@ class CodedLens(CameraState):
         fidelity = saved.get("fidelity")
         if isinstance(fidelity, dict):
             saved = {**saved, "fidelity": {**fidelity, "window": saved.get("fixed_window")}}
-        take_over(self, saved, self.settings(), {name: name for name in _PARTS} | {"aperture": "_aperture"})
+        take_over(self, saved, self.settings(), self._SETTABLE)
         self.__dict__.update(_window=None, _pupil=None)
 
     def _check_window(self, window: int) -> None:
