@@ -108,8 +108,9 @@ def check_settings(saved: Mapping[str, Any], here: Mapping[str, Any]) -> None:
         if name in saved and (found := _difference(saved[name], here[name], name)):
             place, there, own = found
             raise ValueError(
-                f"the state is that of another camera: {place} is {_short(there)} in the state and {_short(own)} here; make "
-                f"this camera like it, or take its settings over with load_state_dict(state, take_over=True); {_REMEDY}"
+                f"the state is that of another camera: {place} is {_short(there)} in the state and {_short(own)} here; "
+                f"make this camera like it, or take its settings over by load_state_dict(state, take_over=True); "
+                f"{_REMEDY}"
             )
 
 
@@ -220,13 +221,17 @@ def _made(current: Any, saved: Any, place: str) -> Any:
         return _unpacked(saved) if current is None else _unpacked(saved).to(current)
     if isinstance(current, Tensor) and saved is None:
         return None
-    numbers = isinstance(current, (int, float)) and isinstance(saved, (int, float)) and not isinstance(saved, bool)
-    if isinstance(current, bool):
-        numbers = isinstance(saved, bool)
-    plain = current is None or isinstance(current, (tuple, str)) or numbers
-    if not plain or isinstance(saved, dict) or (isinstance(current, str) and not isinstance(saved, str)):
-        if not (saved is None and isinstance(current, (int, float))):
-            raise ValueError(_no_way(place, saved, here))
+    number, text = isinstance(saved, (int, float)), isinstance(saved, str)
+    if isinstance(current, bool) or isinstance(saved, bool):
+        fits = isinstance(current, bool) and isinstance(saved, bool)
+    elif isinstance(current, (int, float)):
+        fits = number or saved is None
+    elif isinstance(current, tuple):
+        fits = isinstance(saved, list) or saved is None
+    else:
+        fits = text if isinstance(current, str) else current is None and not isinstance(saved, dict)
+    if not fits:
+        raise ValueError(_no_way(place, saved, here))
     return _tuples(saved)
 
 

@@ -29,12 +29,13 @@ class CameraState(nn.Module):
     """
 
     fidelity: Fidelity
+    _lock: SharedLock  # of the parts and the window, which belong together
     _window: int | None
     _held: tuple[float, float]
 
     def __init__(self) -> None:
         super().__init__()
-        self.__dict__["_lock"] = SharedLock()  # of the parts and the window, which belong together
+        self._lock = SharedLock()
         self.register_load_state_dict_post_hook(_measure_window)
 
     @abstractmethod

@@ -217,10 +217,9 @@ class TiDyOptics(CodedLens):
         with torch.autocast(image.device.type, enabled=False):
             now = self._now(image)
             check_border(now.border, *image.shape[-2:], now.window)
-            rows = now._rows_at_once(image, depth)
             if len(image) == 0:
                 coded = now._no_capture(image, depth)
-            elif rows is None:
+            elif (rows := now._rows_at_once(image, depth)) is None:
                 coded = now._capture_at_once(image, depth, params, generator)
             else:
                 coded = now._capture_in_bands(image, depth, rows, params, generator)
@@ -355,7 +354,7 @@ class TiDyOptics(CodedLens):
         blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
         blank, depth, _ = self._checked(blank, depth)
         if len(blank) == 0 or len(depth) == 0:
-            raise ValueError("a plan needs at least one depth map and, if images are given, one image; the batch is empty")
+            raise ValueError(f"a plan needs at least one image and its depth, got {len(blank)} and {len(depth)}")
         light = None if image is None else self.decode(blank.to(self._compute_dtype(blank)))
         defocus = self._defocus(depth, depth)
         return Planner(self, blank.shape[1]).scene(defocus, light).plan(tolerance)

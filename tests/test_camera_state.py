@@ -202,7 +202,9 @@ class TestTheSameCamera(BaseTester):
             return TiDyOptics(
                 RadialMask(2, material=FUSED_SILICA, constraint="sigmoid", generator=torch.Generator().manual_seed(0)),
                 ThinLensCamera(focus_distance=torch.tensor(0.595), lens_material=FUSED_SILICA, depth_range=(0.5, 5.0)),
-                SpatialLightModulator(GreyLevels(5), Switching(4e-3, dwell=LearnableDwellTimes((1, 2))), fill_factor=0.9),
+                SpatialLightModulator(
+                    GreyLevels(5), Switching(4e-3, dwell=LearnableDwellTimes((1, 2))), fill_factor=0.9
+                ),
                 SensorNoise.physical(10000, 2.4),
                 Fidelity.preset("draft").replace(wavelengths=2),
                 "scatter",
@@ -221,9 +223,17 @@ class TestTheSameCamera(BaseTester):
 
 
 OTHERS = [
-    ("camera", {"camera": ThinLensCamera(pixel_pitch=9e-6)}, r"camera.pixel_pitch is 9e-06 in the state and 8e-06 here"),
+    (
+        "camera",
+        {"camera": ThinLensCamera(pixel_pitch=9e-6)},
+        r"camera.pixel_pitch is 9e-06 in the state and 8e-06 here",
+    ),
     ("no depths", {"camera": DefocusRange()}, "camera is a DefocusRange in the state and a ThinLensCamera here"),
-    ("depths", {"camera": ThinLensCamera(depth_range=(0.4, math.inf))}, r"depth_range is \[0.4, inf\] in the state and"),
+    (
+        "depths",
+        {"camera": ThinLensCamera(depth_range=(0.4, math.inf))},
+        r"depth_range is \[0.4, inf\] in the state and",
+    ),
     (
         "focus",
         {"camera": ThinLensCamera(focus_distance=torch.tensor(0.595))},
@@ -234,11 +244,19 @@ OTHERS = [
     ("sensor", {"sensor": SensorNoise(0.02)}, "sensor.sigma is 0.02 in the state and 0.01 here"),
     ("no sensor", {"sensor": None}, "sensor is None in the state and a SensorNoise here"),
     ("fidelity", {"fidelity": "balanced"}, r"fidelity.pixel_tolerance is 0.02 in the state and 0.1 here"),
-    ("spectrum", {"spectrum": Spectrum((6e-7, 5e-7, 4e-7), torch.eye(3).tolist())}, r"spectrum.wavelengths is \[6e-07, "),
+    (
+        "spectrum",
+        {"spectrum": Spectrum((6e-7, 5e-7, 4e-7), torch.eye(3).tolist())},
+        r"spectrum.wavelengths is \[6e-07, ",
+    ),
     ("compositing", {"compositing": "scatter"}, "compositing is 'scatter' in the state and 'gather' here"),
     ("colour", {"color_space": "linear"}, "color_space is 'linear' in the state and 'srgb' here"),
     ("border", {"border": "zero"}, "border is 'zero' in the state and 'reflect' here"),
-    ("aperture", {"aperture": 0.9 * circular_aperture(23, 0.12)}, r"aperture is a tensor of shape \(23, 23\) .* and None here"),
+    (
+        "aperture",
+        {"aperture": 0.9 * circular_aperture(23, 0.12)},
+        r"aperture is a tensor of shape \(23, 23\) .* and None here",
+    ),
     ("family", {"masks": RadialMask(2)}, "masks is a RadialMask in the state and a PixelwiseMask here"),
     ("limits", {"masks": PixelwiseMask(2, constraint="clamp")}, "constraint is 'clamp' in the state and 'none' here"),
     ("material", {"masks": PixelwiseMask(2, material=FUSED_SILICA)}, r"masks.material.dispersion is "),
@@ -262,7 +280,7 @@ class TestAnotherCamera(BaseTester):
         saved, optics = trained(small(**changes)), small()
         before = optics.settings()
         if name in {"no depths", "focus", "modulator", "no sensor", "family", "material", "pixels"}:
-            with pytest.raises(ValueError, match="settings cannot be taken over: .* in the state and .* here"):
+            with pytest.raises(ValueError, match=r"settings cannot be taken over: .* in the state and .* here"):
                 optics.load_state_dict(saved.state_dict(), take_over=True)
             assert optics.settings() == before
             return
@@ -281,11 +299,15 @@ class TestAnotherCamera(BaseTester):
         assert optics.window == 9
 
     def test_feature_another_size_of_machine_or_name_is_the_same_camera(self):
-        optics = small(fidelity=Fidelity.preset("draft").replace(name="mine"), memory_budget=1 << 20, check_inputs=False)
+        optics = small(
+            fidelity=Fidelity.preset("draft").replace(name="mine"), memory_budget=1 << 20, check_inputs=False
+        )
         small().load_state_dict(optics.state_dict())
 
     def test_exception_nothing_to_take_over(self):
-        with pytest.raises(ValueError, match=r"no settings to take over: the state has no entry '_extra_state', only x"):
+        with pytest.raises(
+            ValueError, match=r"no settings to take over: the state has no entry '_extra_state', only x"
+        ):
             small().load_state_dict({"x": torch.ones(1)}, take_over=True)
 
     def test_exception_a_damaged_state_tells_so(self):

@@ -361,7 +361,7 @@ class CodedLens(CameraState):
         if fixed not in (None, window):
             raise ValueError(
                 f"the state is that of another camera: its PSF window is {window} px, and this one's is fixed to "
-                f"{fixed} px; set Fidelity.window, or take its settings over with load_state_dict(state, take_over=True)"
+                f"{fixed} px; set Fidelity.window, or take its settings over by load_state_dict(state, take_over=True)"
             )
 
     # ------------------------------------------------------------------ inside
