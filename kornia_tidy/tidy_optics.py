@@ -380,7 +380,7 @@ class TiDyOptics(CodedLens):
     def clamped_pixels(self) -> int:
         """Pixels of the last capture whose defocus lay outside the camera's range and was clamped to its end.
 
-        Of a burst, those of one shot; of a moving scene, those of all its states.
+        Of a burst, those of one shot; of a moving scene, those of all its moments.
         """
         return 0 if self._clamped is None else int(self._clamped)
 

@@ -20,7 +20,7 @@ from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
-from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
 from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
@@ -51,6 +51,7 @@ class CodedLens(nn.Module):
         torch.Size([2, 3])
     """
 
+    _moment: int | None = None  # the one moment looked at, if not the whole exposure
     _state: int | None = None  # the one state looked through, if not all
     _bank: PSFBank | None = None  # measured, in the place of the masks' own
 
@@ -72,7 +73,8 @@ class CodedLens(nn.Module):
         self.modulator = DwellTimes() if modulator is None else modulator
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
-        self._memories: dict[int | None, BankMemory] = defaultdict(BankMemory)  # of each state, and of their average
+        # Of each moment and state, and of their averages.
+        self._memories: dict[tuple[int | None, int | None], BankMemory] = defaultdict(BankMemory)
         if self.fidelity.propagation == "paper":
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
         self.register_load_state_dict_post_hook(_refit_window)
@@ -134,6 +136,10 @@ class CodedLens(nn.Module):
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
         return self._states(dtype)[1]
 
+    def timeline(self, dtype: torch.dtype) -> Timeline:
+        """Return what the modulator shows of the masks during one exposure, and when."""
+        return timeline_of(self.modulator, self.masks.phase.to(dtype))
+
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
         """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
@@ -171,8 +177,33 @@ class CodedLens(nn.Module):
         count = len(self.state_weights(torch.float32))
         if not 0 <= state < count:
             raise ValueError(f"state must be from 0 to {count - 1}, got {state}")
+        return self._looking(_state=state)
+
+    def through_moment(self, moment: int) -> Self:
+        """Return this lens with what its modulator shows at one moment shown all the time: one state, or some at once.
+
+        The parts and the window are shared.
+
+        Args:
+            moment: index among the moments of :meth:`timeline`.
+
+        Raises:
+            ValueError: if there is no such moment.
+
+        Example:
+            >>> from kornia_tidy.optics import DiffractionEfficiency
+            >>> lens = CodedLens(modulator=DiffractionEfficiency(0.75))
+            >>> lens.through_moment(2).state_weights(torch.float32)
+            tensor([0.7500, 0.2500])
+        """
+        count = len(self.timeline(torch.float32).durations)
+        if not 0 <= moment < count:
+            raise ValueError(f"moment must be from 0 to {count - 1}, got {moment}")
+        return self._looking(_moment=moment)
+
+    def _looking(self, **where: int) -> Self:
         other, window = self._sharing_parts(), self.window
-        other.__dict__.update(_state=state, _window=window, _memories=self._memories)  # PSFs remembered by both
+        other.__dict__.update(_window=window, _memories=self._memories, **where)  # PSFs remembered by both
         return other
 
     def with_bank(self, bank: PSFBank) -> Self:
@@ -295,7 +326,8 @@ class CodedLens(nn.Module):
 
     def _states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """What the modulator shows over the pupil, and for what share of the exposure."""
-        states, weights = self.modulator(self.masks.phase.to(dtype))
+        shown = self.timeline(dtype)
+        states, weights = (shown.states, shown.weights) if self._moment is None else shown.moment(self._moment)
         if self._state is not None:
             states, weights = states[self._state : self._state + 1], torch.ones_like(weights[:1])
         return central_square(states), weights
@@ -350,9 +382,8 @@ class CodedLens(nn.Module):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
-        return self._memories[state if self._state is None else self._state].recall(
-            setting, states, weights, nodes, build
-        )
+        memory = self._memories[self._moment, state if self._state is None else self._state]
+        return memory.recall(setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
