@@ -15,6 +15,7 @@ from torch.utils.data import get_worker_info
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_positive
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.following import is_followed, is_value_unknown, refuse_torchscript
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.coded_lens import CodedLens
 from kornia_tidy.optics.phase_masks import PhaseMasks, adam_groups
@@ -207,6 +208,8 @@ class TiDyOptics(CodedLens):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Take a picture of an image and its depth. See :meth:`forward`."""
+        if torch.jit.is_tracing():
+            refuse_torchscript()
         image, depth, batched = self._checked(image, depth)
         check_border(self.border, *image.shape[-2:], self.window)
         with torch.autocast(image.device.type, enabled=False):
@@ -407,7 +410,7 @@ class TiDyOptics(CodedLens):
         veiled = self.fidelity.stray_light == "veil"
         # Beyond a zero border there is nothing that hides, which black pixels would.
         unseen = self.compositing == "occlusion" and self.border == "zero"
-        if learning or torch.compiler.is_compiling() or veiled or unseen:
+        if learning or is_followed() or veiled or unseen:
             return None
         itemsize = self._compute_dtype(image).itemsize
         row = _BYTES_A_PIXEL * itemsize // 4 * image.shape[0] * image.shape[-1]
@@ -416,7 +419,7 @@ class TiDyOptics(CodedLens):
 
     def _defocus(self, depth: Tensor, image: Tensor) -> Tensor:
         """The defocus of a depth map in the type that an image is computed in."""
-        look = self.check_inputs and not torch.compiler.is_compiling()
+        look = self.check_inputs and not is_value_unknown()
         return self.camera.defocus(depth.to(self._compute_dtype(image)), check_inputs=look)
 
     def _compute_dtype(self, image: Tensor) -> torch.dtype:
@@ -439,7 +442,7 @@ class TiDyOptics(CodedLens):
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
                 f"{tuple(depth.shape)}"
             )
-        if self.check_inputs and not torch.compiler.is_compiling():
+        if self.check_inputs and not is_value_unknown():
             check_finite("image", image)
         return image, depth, batched
 
@@ -448,7 +451,7 @@ class TiDyOptics(CodedLens):
 
         Half a thousandth of a radian of rounding is not beyond.
         """
-        if torch.compiler.is_compiling():
+        if is_value_unknown():
             return torch.zeros(2)
         lo, hi = self.camera.defocus_range
         extremes, pixels, clamped = [], 0, torch.tensor(0)

@@ -8,12 +8,13 @@ from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, Literal, Self, cast, overload
+from typing import Any, Literal, NoReturn, Self, cast, overload
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.following import is_followed, refuse_torchscript
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
@@ -138,6 +139,8 @@ class CodedLens(nn.Module):
 
     def timeline(self, dtype: torch.dtype) -> Timeline:
         """Return what the modulator shows of the masks during one exposure, and when."""
+        if torch.jit.is_tracing():
+            refuse_torchscript()
         return timeline_of(self.modulator, self.masks.phase.to(dtype))
 
     @property
@@ -318,6 +321,10 @@ class CodedLens(nn.Module):
         if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
             self.__dict__.update(_window=None, _pupil=None)
 
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Refuse ``torch.jit.script``, of this camera and of what it is a part of."""
+        refuse_torchscript()
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: no PSFs."""
         return {**super().__getstate__(), "_memories": defaultdict(BankMemory)}
@@ -378,7 +385,7 @@ class CodedLens(nn.Module):
         step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
         build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
         learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
-        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
+        if is_followed() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
