@@ -24,7 +24,7 @@ from torch import Tensor
 
 from kornia_tidy import PixelwiseMask, TiDyOptics, moving_capture
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.motion import scenes_by_homography, state_times
+from kornia_tidy.motion import moment_times, scenes_by_homography
 
 
 @torch.no_grad()
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, tuple[float, float
     result, rows = {}, []
     for name, masks in cameras.items():
         optics = TiDyOptics(masks, sensor=None, color_space="linear", border="replicate")
-        way = options.pixels * (state_times(optics) - 0.5)
+        way = options.pixels * (moment_times(optics) - 0.5)
         right, left = (moving_capture(optics, *moved(image, depth, sign * way)) for sign in (1, -1))
         still = optics(image, depth)
         blurred = sum(moved(still, depth, way)[0].unbind(1)) / len(way)
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, tuple[float, float
 
 
 def moved(image: Tensor, depth: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the scene moved to the right by so many pixels in each state."""
+    """Return the scene moved to the right by so many pixels at each moment."""
     moves = torch.eye(3).repeat(len(pixels), 1, 1)
     moves[:, 0, 2] = pixels
     return scenes_by_homography(image, depth, moves)

@@ -1,4 +1,4 @@
-"""Motion during the exposure: each state of the modulator sees the scene as it is while that state is shown."""
+"""Motion during the exposure: at each moment the modulator's states see the scene as it is then."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from kornia.geometry import remap
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.multi_shot import linear_through_state
-from kornia_tidy.optics.modulator import SpatialLightModulator
-from kornia_tidy.optics.switching import Switching
+from kornia_tidy.multi_shot import linear_through_moment
+from kornia_tidy.optics.modulator import Timeline
 from kornia_tidy.tidy_optics import TiDyOptics
 
 
@@ -24,18 +23,20 @@ def moving_capture(
 ) -> Tensor:
     r"""Take one picture of a scene that moves during the exposure.
 
-    .. math:: I = \sum_s w_s \, \mathcal{R}(L_s, z_s, h_s) + \text{noise}
+    .. math:: I = \sum_m t_m \, \mathcal{R}(L_m, z_m, h_m) + \text{noise}
 
-    with the light :math:`L_s` and the depth :math:`z_s` of the scene while state s is shown, rendered through the PSFs
-    :math:`h_s` of that state, and its share :math:`w_s` of the exposure. Mask and motion are not independent, so that
-    it is not the motion blur of the picture taken at rest.
+    with the light :math:`L_m` and the depth :math:`z_m` of the scene at moment m, rendered through the PSFs :math:`h_m`
+    of the states shown then, and its share :math:`t_m` of the exposure. Mask and motion are not independent, so that it
+    is not the motion blur of the picture taken at rest.
 
     Args:
-        optics: the camera. Its modulator says how many states there are: K masks, and with
-            :class:`~kornia_tidy.optics.switching.Switching` the states between them, which follow after all masks.
-        images: (B, S, C, H, W) or (S, C, H, W) in the camera's colour space, one for each state in the modulator's
-            order. :func:`state_times` says when each is shown.
-        depths: (B, S, 1, H, W) or (S, 1, H, W).
+        optics: the camera. Its modulator says how many moments there are: K masks, and with
+            :class:`~kornia_tidy.optics.switching.Switching` what lies between them, which follows after all masks.
+            States that are there at once, as with :class:`~kornia_tidy.optics.modulator.DiffractionEfficiency`, are of
+            one moment and see one scene.
+        images: (B, M, C, H, W) or (M, C, H, W) in the camera's colour space, one for each moment in the modulator's
+            order. :func:`moment_times` says when they are.
+        depths: (B, M, 1, H, W) or (M, 1, H, W).
         params: noise drawn before by ``optics.draw(images[:, 0])``.
         generator: source of the noise. Default: the global generator.
 
@@ -44,19 +45,19 @@ def moving_capture(
 
     Raises:
         TypeError: if images or depths are not floating-point tensors.
-        ValueError: if there is not one scene for each state, or images and depths do not fit.
+        ValueError: if there is not one scene for each moment, or images and depths do not fit.
 
     Convention:
-        - A scene stands still while one state stands. Where it moves by more than a pixel meanwhile, show each mask
-          several times with a share of its dwell time: more states, each with its own scene.
+        - A scene stands still within a moment. Where it moves by more than a pixel meanwhile, show each mask
+          several times with a share of its dwell time: more moments, each with its own scene.
         - A scene that stands still gives the same picture as ``optics(image, depth)``, to rounding, with the
           compositing ``"gather"`` and ``"scatter"`` and ``stray_light`` ``"discard"`` or ``"veil"``, and with
           ``"occlusion"`` where ``Fidelity.occlusion_states`` is ``"each"``. ``"renormalize"`` scales the PSFs of each
-          state to a sum of one, not their average: a state that keeps less light in the window weighs a little more.
+          moment to a sum of one, not their average: one that keeps less light in the window weighs a little more.
         - Light is added in linear light; the sensor sees the sum once.
-        - Eager: torch.compile cannot trace the copies of the camera that look through one state each.
-        - Cost: S captures and the PSFs of S states, instead of one of their average: about S times as long, with
-          gradients about S / 2 to 2 S / 3 times (measured with 5 and 9 states, 256 pixels, one core).
+        - Eager: torch.compile cannot trace the copies of the camera that look at one moment each.
+        - Cost: M captures and the PSFs of M moments, instead of one of their average: about M times as long, with
+          gradients about M / 2 to 2 M / 3 times (measured with 5 and 9 moments, 256 pixels, one core).
 
     Example:
         >>> from kornia_tidy import PixelwiseMask
@@ -68,26 +69,27 @@ def moving_capture(
         torch.Size([1, 3, 80, 80])
     """
     batched = not isinstance(images, Tensor) or images.ndim != 4
-    check_float_tensor("images", images, 5 if batched else 4, "(B, S, C, H, W) or (S, C, H, W)")
-    check_float_tensor("depths", depths, images.ndim, "(B, S, 1, H, W) or (S, 1, H, W), as images are batched or not")
+    check_float_tensor("images", images, 5 if batched else 4, "(B, M, C, H, W) or (M, C, H, W)")
+    check_float_tensor("depths", depths, images.ndim, "(B, M, 1, H, W) or (M, 1, H, W), as images are batched or not")
     if not batched:
         images, depths = images[None], depths[None]
     wide = optics.fidelity.double or images.dtype == torch.float64
     dtype = torch.float64 if wide else torch.float32
     with torch.autocast(images.device.type, enabled=False):
-        weights = optics.state_weights(dtype)
+        optics = optics.snapshot(dtype)  # every moment is of the same masks
+        durations = optics.timeline(dtype).durations
         for name, scenes in (("images", images), ("depths", depths)):
-            if scenes.shape[1] != len(weights):
+            if scenes.shape[1] != len(durations):
                 raise ValueError(
-                    f"{name} must have one scene for each of the {len(weights)} states of the exposure, got "
+                    f"{name} must have one scene for each of the {len(durations)} moments of the exposure, got "
                     f"{scenes.shape[1]}"
                 )
         total, warned, clamped = torch.zeros(()), False, 0
-        for state, share in enumerate(weights):
-            one = linear_through_state(optics, state)
+        for moment, share in enumerate(durations):
+            one = linear_through_moment(optics, moment)
             one._warned |= warned  # say once what is beyond the camera's range
-            light = one(optics.decode(images[:, state].to(dtype)), depths[:, state]) * share
-            total, warned = light if state == 0 else total + light, one._warned
+            light = one(optics.decode(images[:, moment].to(dtype)), depths[:, moment]) * share
+            total, warned = light if moment == 0 else total + light, one._warned
             clamped += one.clamped_pixels
         optics._clamped = torch.tensor(clamped)
         if optics.sensor is not None:
@@ -96,41 +98,56 @@ def moving_capture(
     return coded if batched else coded[0]
 
 
-def state_times(optics: TiDyOptics) -> Tensor:
-    """Return when each state of the exposure is shown: its middle, as a share of the exposure in [0, 1].
+def moment_times(optics: TiDyOptics) -> Tensor:
+    """Return when each moment of the exposure is: its middle, as a share of the exposure in [0, 1].
 
     Args:
-        optics: the camera. States of :class:`~kornia_tidy.optics.switching.Switching` are known to be the masks and
-            then what lies between them; those of any other modulator are taken to follow one another.
+        optics: the camera. Moments are those of :meth:`~kornia_tidy.optics.coded_lens.CodedLens.timeline`; the states
+            of a modulator that does not say when it shows them are taken to follow one another.
+
+    Returns:
+        (M,) float32 or better, in the modulator's order: what :func:`moving_capture` wants scenes for.
+
+    Example:
+        >>> from kornia_tidy import DwellTimes, PixelwiseMask
+        >>> moment_times(TiDyOptics(PixelwiseMask(2), modulator=DwellTimes((1, 3))))
+        tensor([0.1250, 0.6250])
+    """
+    return _timeline(optics).moment_times().detach()
+
+
+def state_times(optics: TiDyOptics) -> Tensor:
+    """Return the mean time at which each state of the exposure is shown, as a share of the exposure in [0, 1].
+
+    A state that is there all the time is shown in the middle. For scenes, see :func:`moment_times`.
+
+    Args:
+        optics: the camera.
 
     Returns:
         (S,) float32 or better, in the modulator's order.
 
     Example:
-        >>> from kornia_tidy import DwellTimes, PixelwiseMask
-        >>> state_times(TiDyOptics(PixelwiseMask(2), modulator=DwellTimes((1, 3))))
-        tensor([0.1250, 0.6250])
+        >>> state_times(TiDyOptics.from_preset("ikoma2021"))
+        tensor([0.5000, 0.5000])
     """
-    phase = optics.masks.phase
-    phase = phase.detach().to(torch.promote_types(phase.dtype, torch.float32))
-    modulator = optics.modulator
-    last = modulator.parts[-1] if isinstance(modulator, SpatialLightModulator) else modulator
-    if isinstance(last, Switching):
-        return last.middle_times(phase).detach()
-    weights = optics.state_weights(phase.dtype).detach()
-    return weights.cumsum(0) - weights / 2
+    return _timeline(optics).state_times().detach()
+
+
+def _timeline(optics: TiDyOptics) -> Timeline:
+    return optics.timeline(torch.promote_types(optics.masks.phase.dtype, torch.float32))
 
 
 def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
-    """Move a scene by a homography for each state, such as a camera's turn or shift during the exposure.
+    """Move a scene by a homography for each moment, such as a camera's turn or shift during the exposure.
 
     Args:
         image: (B, C, H, W).
         depth: (B, 1, H, W).
-        homographies: (S, 3, 3) or (B, S, 3, 3): from pixels (x, y, 1) of the image to where they are in each state.
+        homographies: (M, 3, 3) or (B, M, 3, 3): from pixels (x, y, 1) of the image to where they are at each moment.
 
     Returns:
-        Images (B, S, C, H, W) and depths (B, S, 1, H, W).
+        Images (B, M, C, H, W) and depths (B, M, 1, H, W).
 
     Raises:
         ValueError: if shapes do not fit.
@@ -150,7 +167,7 @@ def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> 
     """
     _check_scene(image, depth)
     if homographies.ndim not in (3, 4) or tuple(homographies.shape[-2:]) != (3, 3):
-        raise ValueError(f"homographies must have shape (S, 3, 3) or (B, S, 3, 3), got {tuple(homographies.shape)}")
+        raise ValueError(f"homographies must have shape (M, 3, 3) or (B, M, 3, 3), got {tuple(homographies.shape)}")
     height, width = image.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     there = torch.stack([x, y, torch.ones_like(x)], -1).to(homographies)
@@ -160,16 +177,16 @@ def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> 
 
 
 def scenes_by_flow(image: Tensor, depth: Tensor, flows: Tensor) -> tuple[Tensor, Tensor]:
-    """Move a scene by an optical flow for each state.
+    """Move a scene by an optical flow for each moment.
 
     Args:
         image: (B, C, H, W).
         depth: (B, 1, H, W).
-        flows: (S, 2, H, W) or (B, S, 2, H, W), pixels (x, y): how far what is seen at a pixel *in the state* has moved
-            since the image; a point seen at p in the state was at p - flow(p) in the image.
+        flows: (M, 2, H, W) or (B, M, 2, H, W), pixels (x, y): how far what is seen at a pixel *at the moment* has
+            moved since the image; a point seen at p then was at p - flow(p) in the image.
 
     Returns:
-        Images (B, S, C, H, W) and depths (B, S, 1, H, W).
+        Images (B, M, C, H, W) and depths (B, M, 1, H, W).
 
     Raises:
         ValueError: if shapes do not fit.
@@ -186,7 +203,7 @@ def scenes_by_flow(image: Tensor, depth: Tensor, flows: Tensor) -> tuple[Tensor,
     height, width = image.shape[-2:]
     if flows.ndim not in (4, 5) or tuple(flows.shape[-3:]) != (2, height, width):
         raise ValueError(
-            f"flows must have shape (S, 2, {height}, {width}) or (B, S, 2, {height}, {width}), got {tuple(flows.shape)}"
+            f"flows must have shape (M, 2, {height}, {width}) or (B, M, 2, {height}, {width}), got {tuple(flows.shape)}"
         )
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     return _warped(image, depth, torch.stack([x, y], -1).to(flows) - flows.movedim(-3, -1))
@@ -202,18 +219,18 @@ def _check_scene(image: Tensor, depth: Tensor) -> None:
 
 
 def _warped(image: Tensor, depth: Tensor, came: Tensor) -> tuple[Tensor, Tensor]:
-    """Take image and depth from pixels (x, y), (S, H, W, 2) or (B, S, H, W, 2)."""
+    """Take image and depth from pixels (x, y), (M, H, W, 2) or (B, M, H, W, 2)."""
     batch = image.shape[0]
     if came.ndim == 5 and came.shape[0] != batch:
         raise ValueError(f"motion must be that of {batch} images, got {came.shape[0]}")
     came = came.expand(batch, *came.shape[-4:])
-    states, places = came.shape[1], came.flatten(0, 1)
+    moments, places = came.shape[1], came.flatten(0, 1)
 
     def taken(plane: Tensor, mode: str) -> Tensor:
         dtype = torch.promote_types(plane.dtype, torch.float32)
-        repeated = plane.to(dtype).repeat_interleave(states, 0)
+        repeated = plane.to(dtype).repeat_interleave(moments, 0)
         x, y = places.to(dtype).unbind(-1)
         moved = remap(repeated, x, y, mode, "border", align_corners=True)
-        return moved.unflatten(0, (batch, states)).to(plane.dtype)
+        return moved.unflatten(0, (batch, moments)).to(plane.dtype)
 
     return taken(image, "bilinear"), taken(depth, "nearest")

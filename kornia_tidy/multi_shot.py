@@ -55,7 +55,8 @@ def burst(
     converter of its own. One exposure of ``optics`` in the same interval loses no light and reads out once.
 
     Args:
-        optics: the camera. Its modulator gives masks and dwell shares; what it shows between masks is hidden here.
+        optics: the camera. Its modulator gives masks and dwell shares; what it shows between masks is hidden here, and
+            light that passes beside the mask at all times is in every shot.
         image: (B, C, H, W) or (C, H, W), in the camera's colour space.
         depth: (B, 1, H, W) or (1, H, W).
         dead_time: seconds between shots in which no light is collected: readout or switching, whichever is longer.
@@ -88,10 +89,12 @@ def burst(
     batched = image.ndim != 3
     if not batched:
         image, depth = image[None], depth[None]
+    wide = optics.fidelity.double or image.dtype == torch.float64
+    optics = optics.snapshot(torch.float64 if wide else torch.float32)  # every shot is of the same masks
     light = optics.decode(image)
     shots = []
-    for k, share in enumerate(burst_shares(_dwell_shares(optics), dead_time, exposure)):
-        one = linear_through_state(optics, k)
+    for k, share in enumerate(burst_shares(_dwell_shares(optics, light.dtype), dead_time, exposure)):
+        one = linear_through_moment(optics, k)
         one.check_inputs = optics.check_inputs and k == 0  # say once what is wrong
         shot = one(light, depth) * share.to(light)
         optics._clamped = one._clamped  # every shot sees the same depths
@@ -100,19 +103,18 @@ def burst(
     return stack if batched else stack[0]
 
 
-def _dwell_shares(optics: TiDyOptics) -> Tensor:
-    """Return the dwell shares of the masks: the weights of a modulator's first K states, without what lies between."""
-    phase = optics.masks.phase
-    _, weights = optics.modulator(phase.to(torch.promote_types(phase.dtype, torch.float32)))
-    shown = weights[: phase.shape[0]]
+def _dwell_shares(optics: TiDyOptics, image_dtype: torch.dtype) -> Tensor:
+    """Return the dwell shares of the masks: a modulator's first K moments, without what lies between."""
+    dtype = torch.float64 if optics.fidelity.double or image_dtype == torch.float64 else torch.float32
+    shown = optics.timeline(dtype).durations[: optics.masks.phase.shape[0]]
     if not bool(shown.sum() > 0):
         raise ValueError("a burst needs masks that are shown for a time, but switching takes the whole exposure")
     return shown / shown.sum()
 
 
-def linear_through_state(optics: TiDyOptics, state: int) -> TiDyOptics:
-    """Return the camera with one of its states shown all the time, in linear light and without noise."""
-    one = optics.through_state(state)
+def linear_through_moment(optics: TiDyOptics, moment: int) -> TiDyOptics:
+    """Return the camera with one moment of its exposure shown all the time, in linear light and without noise."""
+    one = optics.through_moment(moment)
     one.sensor, one.color_space = None, "linear"
     return one
 

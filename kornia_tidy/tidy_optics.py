@@ -16,6 +16,7 @@ from kornia_tidy.camera_settings import settings_of
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_positive
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.following import is_followed, is_value_unknown, refuse_torchscript
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.coded_lens import CodedLens
 from kornia_tidy.optics.phase_masks import PhaseMasks, adam_groups
@@ -213,6 +214,8 @@ class TiDyOptics(CodedLens):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Take a picture of an image and its depth. See :meth:`forward`."""
+        if torch.jit.is_tracing():
+            refuse_torchscript()
         image, depth, batched = self._checked(image, depth)
         with torch.autocast(image.device.type, enabled=False):
             now = self._now(image)
@@ -399,7 +402,7 @@ class TiDyOptics(CodedLens):
     def clamped_pixels(self) -> int:
         """Pixels of the last capture whose defocus lay outside the camera's range and was clamped to its end.
 
-        Of a burst, those of one shot; of a moving scene, those of all its states. Each thread sees those of the last
+        Of a burst, those of one shot; of a moving scene, those of all its moments. Each thread sees those of the last
         capture that it took itself, be it with this camera or with a view of it such as ``with_fidelity`` returns.
         """
         return 0 if self._clamped is None else int(self._clamped)
@@ -447,7 +450,7 @@ class TiDyOptics(CodedLens):
         if not isinstance(image, Tensor):
             return self
         with torch.autocast(image.device.type, enabled=False):
-            return self.at_this_moment(self._compute_dtype(image))
+            return self.snapshot(self._compute_dtype(image))
 
     def _rows_at_once(self, image: Tensor, depth: Tensor) -> int | None:
         """Rows whose capture fits the memory allowed; None where all do, or where the whole image is needed."""
@@ -457,7 +460,7 @@ class TiDyOptics(CodedLens):
         veiled = self.fidelity.stray_light == "veil"
         # Beyond a zero border there is nothing that hides, which black pixels would.
         unseen = self.compositing == "occlusion" and self.border == "zero"
-        if learning or torch.compiler.is_compiling() or veiled or unseen:
+        if learning or is_followed() or veiled or unseen:
             return None
         itemsize = self._compute_dtype(image).itemsize
         row = _BYTES_A_PIXEL * itemsize // 4 * image.shape[0] * image.shape[-1]
@@ -466,7 +469,7 @@ class TiDyOptics(CodedLens):
 
     def _defocus(self, depth: Tensor, image: Tensor) -> Tensor:
         """The defocus of a depth map in the type that an image is computed in."""
-        look = self.check_inputs and not torch.compiler.is_compiling()
+        look = self.check_inputs and not is_value_unknown()
         return self.camera.defocus(depth.to(self._compute_dtype(image)), check_inputs=look)
 
     def _compute_dtype(self, image: Tensor) -> torch.dtype:
@@ -489,7 +492,7 @@ class TiDyOptics(CodedLens):
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
                 f"{tuple(depth.shape)}"
             )
-        if self.check_inputs and not torch.compiler.is_compiling():
+        if self.check_inputs and not is_value_unknown():
             check_finite("image", image)
         return image, depth, batched
 
@@ -498,7 +501,7 @@ class TiDyOptics(CodedLens):
 
         Half a thousandth of a radian of rounding is not beyond.
         """
-        if torch.compiler.is_compiling():
+        if is_value_unknown():
             return torch.zeros(2)
         lo, hi = self.camera.defocus_range
         extremes, pixels, clamped = [], 0, torch.tensor(0)

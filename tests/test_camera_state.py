@@ -243,7 +243,7 @@ OTHERS = [
     ("dwell", {"modulator": DwellTimes((3, 1))}, r"modulator.shares is \[0.75, 0.25\] in the state and None here"),
     ("sensor", {"sensor": SensorNoise(0.02)}, "sensor.sigma is 0.02 in the state and 0.01 here"),
     ("no sensor", {"sensor": None}, "sensor is None in the state and a SensorNoise here"),
-    ("fidelity", {"fidelity": "balanced"}, r"fidelity.pixel_tolerance is 0.02 in the state and 0.1 here"),
+    ("fidelity", {"fidelity": "balanced"}, r"fidelity.pixel_tolerance is 0.01 in the state and 0.1 here"),
     (
         "spectrum",
         {"spectrum": Spectrum((6e-7, 5e-7, 4e-7), torch.eye(3).tolist())},

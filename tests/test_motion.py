@@ -50,18 +50,18 @@ class TestMovingCapture(BaseTester):
         optics = camera()
         images, depths = at_rest(optics, *scene())
         with pytest.raises(
-            ValueError, match="images must have one scene for each of the 3 states of the exposure, got 2"
+            ValueError, match="images must have one scene for each of the 3 moments of the exposure, got 2"
         ):
             moving_capture(optics, images[:, :2], depths)
         with pytest.raises(
-            ValueError, match="depths must have one scene for each of the 3 states of the exposure, got 1"
+            ValueError, match="depths must have one scene for each of the 3 moments of the exposure, got 1"
         ):
             moving_capture(optics, images, depths[:, :1])
-        with pytest.raises(ValueError, match="one scene for each of the 5 states of the exposure, got 3"):
+        with pytest.raises(ValueError, match="one scene for each of the 5 moments of the exposure, got 3"):
             moving_capture(camera(modulator=Switching(4e-3)), images, depths)
-        with pytest.raises(ValueError, match=r"depths must have shape \(B, S, 1, H, W\)"):
+        with pytest.raises(ValueError, match=r"depths must have shape \(B, M, 1, H, W\)"):
             moving_capture(optics, images, depths[0])
-        with pytest.raises(ValueError, match=r"images must have shape \(B, S, C, H, W\)"):
+        with pytest.raises(ValueError, match=r"images must have shape \(B, M, C, H, W\)"):
             moving_capture(optics, images[0, 0], depths[0, 0])
         with pytest.raises(TypeError, match=r"images must be a torch\.Tensor"):
             moving_capture(optics, images.numpy(), depths)
@@ -231,11 +231,11 @@ class TestScenes(BaseTester):
     @pytest.mark.parametrize(
         ("make", "motion", "sentence"),
         [
-            (scenes_by_homography, torch.eye(3), r"homographies must have shape \(S, 3, 3\) or \(B, S, 3, 3\), got"),
+            (scenes_by_homography, torch.eye(3), r"homographies must have shape \(M, 3, 3\) or \(B, M, 3, 3\), got"),
             (
                 scenes_by_flow,
                 torch.zeros(1, 2, 5, 5),
-                r"flows must have shape \(S, 2, 26, 22\) or .* got \(1, 2, 5, 5\)",
+                r"flows must have shape \(M, 2, 26, 22\) or .* got \(1, 2, 5, 5\)",
             ),
             (scenes_by_homography, torch.eye(3).repeat(3, 1, 1, 1), "motion must be that of 2 images, got 3"),
         ],

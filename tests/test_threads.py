@@ -236,7 +236,7 @@ class TestThreads(BaseTester):
     def test_feature_a_part_of_all_kinds_is_read_at_one_moment(self):
         """Masks and dwell times made of parameters that an optimiser moves in place."""
         optics = camera(masks=ZernikeMask(2), modulator=LearnableDwellTimes((1, 1)))
-        now = optics.at_this_moment(torch.float32)
+        now = optics.snapshot(torch.float32)
         with torch.no_grad():
             before = now.psf_bank().psfs
             for parameter in optics.parameters():

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, ClassVar, Literal, Self, cast, overload
+from typing import Any, ClassVar, Literal, NoReturn, Self, cast, overload
 
 import torch
 from torch import Tensor, nn
@@ -16,13 +16,14 @@ from torch import Tensor, nn
 from kornia_tidy.camera_settings import digest_of, settings_of, take_over
 from kornia_tidy.camera_state import CameraState
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.following import is_followed, refuse_torchscript
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
-from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
 from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
@@ -58,9 +59,10 @@ class CodedLens(CameraState):
 
     _SETTABLE: ClassVar = {**dict(zip(_PARTS, _PARTS, strict=True)), "aperture": "_aperture"}  # settings: attributes
 
+    _moment: int | None = None  # the one moment looked at, if not the whole exposure
     _state: int | None = None  # the one state looked through, if not all
     _bank: PSFBank | None = None  # measured, in the place of the masks' own
-    _shown: tuple[Tensor, Tensor] | None = None  # states and weights of a moment, which masks that change leave alone
+    _shown: Timeline | None = None  # what a snapshot shows, which masks that change leave alone
 
     _seen: Spectrum  # what PSFs are computed at: the spectrum, at no more wavelengths than the fidelity allows
 
@@ -80,7 +82,8 @@ class CodedLens(CameraState):
         self.modulator = DwellTimes() if modulator is None else modulator
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
-        self._memories: dict[int | None, BankMemory] = {}  # of each state, and of their average
+        # Of each moment and state, and of their averages.
+        self._memories: dict[tuple[int | None, int | None], BankMemory] = {}
         if self.fidelity.propagation == "paper":
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
         self.fit_window()
@@ -130,7 +133,7 @@ class CodedLens(CameraState):
             if states or defocus is not None:
                 raise ValueError("PSFs that were measured are known at their own defocus and for the whole exposure")
             return self._measured_bank(spectrum, dtype)
-        now = self.at_this_moment(dtype)
+        now = self.snapshot(dtype)
         nodes, stray_light = now.defocus_nodes if defocus is None else tuple(defocus), now.fidelity.stray_light
         if not states:
             return now._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(stray_light)
@@ -141,6 +144,14 @@ class CodedLens(CameraState):
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
         return self._states(dtype)[1]
+
+    def timeline(self, dtype: torch.dtype) -> Timeline:
+        """Return what the modulator shows of the masks during one exposure, and when."""
+        if torch.jit.is_tracing():
+            refuse_torchscript()
+        if self._shown is not None:
+            return self._shown.map(lambda part: part.to(dtype))
+        return timeline_of(self.modulator, self.masks.phase.to(dtype))
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
@@ -179,8 +190,33 @@ class CodedLens(CameraState):
         count = len(self.state_weights(torch.float32))
         if not 0 <= state < count:
             raise ValueError(f"state must be from 0 to {count - 1}, got {state}")
+        return self._looking(_state=state)
+
+    def through_moment(self, moment: int) -> Self:
+        """Return this lens with what its modulator shows at one moment shown all the time: one state, or some at once.
+
+        The parts and the window are shared.
+
+        Args:
+            moment: index among the moments of :meth:`timeline`.
+
+        Raises:
+            ValueError: if there is no such moment.
+
+        Example:
+            >>> from kornia_tidy.optics import DiffractionEfficiency
+            >>> lens = CodedLens(modulator=DiffractionEfficiency(0.75))
+            >>> lens.through_moment(2).state_weights(torch.float32)
+            tensor([0.7500, 0.2500])
+        """
+        count = len(self.timeline(torch.float32).durations)
+        if not 0 <= moment < count:
+            raise ValueError(f"moment must be from 0 to {count - 1}, got {moment}")
+        return self._looking(_moment=moment)
+
+    def _looking(self, **where: int) -> Self:
         other, window = self._sharing_parts(), self.window
-        other.__dict__.update(_state=state, _window=window, _memories=self._memories)  # PSFs remembered by both
+        other.__dict__.update(_window=window, _memories=self._memories, **where)  # PSFs remembered by both
         return other
 
     def with_bank(self, bank: PSFBank) -> Self:
@@ -213,7 +249,7 @@ class CodedLens(CameraState):
                 other.__dict__[kind] = dict(self.__dict__[kind])
         return other
 
-    def at_this_moment(self, dtype: torch.dtype) -> Self:
+    def snapshot(self, dtype: torch.dtype) -> Self:
         """Return this lens as it is now, for one capture: what other threads change meanwhile is seen by the next one.
 
         Masks that another thread changes in place, as an optimiser does, are copied until they stand still. The parts
@@ -222,7 +258,7 @@ class CodedLens(CameraState):
         Args:
             dtype: float32 or float64, in which the masks are needed.
         """
-        if self._shown is not None or torch.compiler.is_compiling():
+        if self._shown is not None or is_followed():
             return self
         with self._lock:
             shown = _settled(self.masks, self.modulator, dtype)
@@ -329,6 +365,10 @@ class CodedLens(CameraState):
             if name in ("masks", "modulator"):
                 self.__dict__["_shown"] = None
 
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Refuse ``torch.jit.script``, of this camera and of what it is a part of."""
+        refuse_torchscript()
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: no PSFs."""
         return {**super().__getstate__(), "_memories": {}}
@@ -347,6 +387,7 @@ class CodedLens(CameraState):
             "aperture": settings_of(self._aperture),
             "measured PSFs": None if bank is None else digest_of(bank.psfs, bank.defocus, bank.energy),
             "state": self._state,
+            "moment": self._moment,
         }
 
     def _take_over(self, saved: Mapping[str, Any]) -> None:
@@ -368,10 +409,8 @@ class CodedLens(CameraState):
 
     def _states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """What the modulator shows over the pupil, and for what share of the exposure."""
-        if self._shown is None:
-            states, weights = self.modulator(self.masks.phase.to(dtype))
-        else:
-            states, weights = (part.to(dtype) for part in self._shown)
+        shown = self.timeline(dtype)
+        states, weights = (shown.states, shown.weights) if self._moment is None else shown.moment(self._moment)
         if self._state is not None:
             states, weights = states[self._state : self._state + 1], torch.ones_like(weights[:1])
         return central_square(states), weights
@@ -422,12 +461,12 @@ class CodedLens(CameraState):
         step, tolerance = self._pixel_step(), self.fidelity.pixel_tolerance
         build = partial(self._build, states, weights, spectrum, step, self.window, tolerance)
         learning = any(isinstance(x, Tensor) and x.requires_grad for x in (states, weights, step))
-        if torch.compiler.is_compiling() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
+        if is_followed() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
-        memory = self._memories.setdefault(state if self._state is None else self._state, BankMemory())
-        return memory.recall(spectrum, setting, states, weights, nodes, build)
+        key = self._moment, state if self._state is None else self._state
+        return self._memories.setdefault(key, BankMemory()).recall(spectrum, setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
@@ -478,13 +517,13 @@ class CodedLens(CameraState):
         )
 
 
-def _settled(masks: PhaseMasks, modulator: nn.Module, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Return a copy of the states shown and their weights, read while no other thread changed the masks."""
+def _settled(masks: PhaseMasks, modulator: nn.Module, dtype: torch.dtype) -> Timeline:
+    """Return a copy of what is shown, made while no other thread changed the masks."""
     alone = threading.active_count() == 1
     for _ in range(_READS):
         before = [] if alone else [p.detach().clone() for part in (masks, modulator) for p in part.parameters()]
-        states, weights = (shown.clone() for shown in modulator(masks.phase.to(dtype)))
+        shown = timeline_of(modulator, masks.phase.to(dtype)).map(Tensor.clone)
         after = [] if alone else [p for part in (masks, modulator) for p in part.parameters()]
         if all(map(torch.equal, before, after)):
             break
-    return states, weights
+    return shown

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.following import is_followed, is_value_unknown
 from kornia_tidy.optics.psf_bank import PSFBank
 
 TAPS = {"cubic": 4, "bandlimited": 10}
@@ -165,12 +166,12 @@ def interpolated_bank(
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them while compiling, which cannot look."""
-    if torch.compiler.is_compiling():
+    """Return the nodes that a defocus map lies between; all of them where it cannot be looked at."""
+    if is_value_unknown():
         return nodes
     lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
     # On a node the next layer has no weight but a slope: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad)
+    extra = int(defocus.requires_grad or is_followed())
     first = max(0, bisect_right(nodes, lowest) - 1 - extra)
     last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
     return nodes[min(first, last) : last + 1]

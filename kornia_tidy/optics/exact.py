@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.following import is_followed
 from kornia_tidy.optics.propagation import pixel_energies, sensor_kernels
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
@@ -99,7 +100,7 @@ def _kernels(
     spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
-    if torch.compiler.is_compiling():
+    if is_followed():
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
     keys = [(psi, step, geometry, gaps, device, dtype) for psi in defocus]
     missing = [key for key in keys if key not in _CACHE]

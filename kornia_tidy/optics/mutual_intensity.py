@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.compiled import REALS, compiled
+from kornia_tidy.following import is_followed
 from kornia_tidy.optics.recomputed import recomputed
 
 SOURCE = Path(__file__).with_name("mutual_intensity.c")
@@ -71,7 +72,7 @@ def goes_in_c(window: int, dtype: torch.dtype) -> bool:
 
 def _is_plain(*tensors: Tensor) -> bool:
     """Whether these are in a processor's memory, and no one asks for gradients or follows what is done with them."""
-    if torch.compiler.is_compiling() or any(x.device.type != "cpu" for x in tensors):
+    if is_followed() or any(x.device.type != "cpu" for x in tensors):
         return False
     return not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
 

@@ -34,6 +34,8 @@ def gauss_legendre_order(half_range: float, tolerance: float) -> int:
         >>> gauss_legendre_order(1.2, 1e-3), gauss_legendre_order(6.0, 1e-7)
         (3, 9)
     """
+    if not math.isfinite(half_range):  # no order is enough
+        raise ValueError(f"a phase across an interval must be finite radians, got {half_range}")
     b = np.linspace(0, half_range, 33)
     exact = np.sinc(b / np.pi)
     order = 1

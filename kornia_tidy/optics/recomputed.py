@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.following import is_followed
+
 Energies = Callable[..., Tensor]
 Gradients = Callable[..., tuple[Tensor | None, ...]]
 
@@ -21,7 +23,7 @@ def recomputed(energies: Energies, gradients: Gradients, *matrices: Tensor) -> T
             each matrix, None where it is not needed. It is differentiated in turn.
         *matrices: their inputs.
     """
-    if torch.compiler.is_compiling():  # the compiler makes an instance of a Function, which warns
+    if is_followed():  # the compiler makes an instance of a Function, which warns; others want one for each of them
         return energies(*matrices)
     return _Recomputed.apply(energies, gradients, *matrices)
 

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.optics.modulator import DwellTimes
+from kornia_tidy.optics.modulator import DwellTimes, Modulator, Timeline, timeline_of
 from kornia_tidy.optics.propagation import gauss_legendre
 
 BETWEEN = ("random", "linear", "exponential")
 SETTLED = 0.99  # share of a step done at the end of the switching time, where the response is exponential
 
 
-class Switching(nn.Module):
+class Switching(Modulator):
     r"""A modulator that needs time from each mask to the next; the capture holds the light of the states in between.
 
     With S swaps of duration t in an exposure T, mask k is shown for :math:`s_k (1 - S t / T)` of it, where s are the
@@ -97,9 +97,21 @@ class Switching(nn.Module):
         self.dwell = DwellTimes() if dwell is None else dwell
         self.cyclic, self.samples, self.seed = cyclic, samples, seed
 
-    def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states shown and their weights."""
-        masks, shares = self.dwell(phase)
+    def timeline(self, phase: Tensor) -> Timeline:
+        """Return what is shown of these masks, and when: the masks, then what lies between them.
+
+        Example:
+            >>> shown = Switching(20e-3).timeline(torch.zeros(3, 5, 5))
+            >>> shown.durations, shown.moment_times()
+            (tensor([0.2000, 0.2000, 0.2000, 0.2000, 0.2000]), tensor([0.1000, 0.5000, 0.9000, 0.3000, 0.7000]))
+        """
+        dwell = timeline_of(self.dwell, phase)
+        if dwell.mixture is not None:
+            raise ValueError(
+                f"dwell must show one state after another, got {type(self.dwell).__name__}, which shows some at once: "
+                f"make it and Switching two parts of a SpatialLightModulator"
+            )
+        masks, shares = dwell.states, dwell.durations
         swaps = len(masks) if self.cyclic and len(masks) > 1 else len(masks) - 1
         swap = self.switching_time / self.exposure
         if swaps * swap > 1 + 1e-9:
@@ -108,39 +120,20 @@ class Switching(nn.Module):
                 f"{self.exposure * 1e3:g} ms, got {swaps * self.switching_time * 1e3:g} ms"
             )
         if swaps * swap == 0:
-            return masks, shares
+            return dwell
         if self.between == "random":
             between, times = random_phases(self.seed, swaps, *phase.shape[-2:]).to(phase), phase.new_ones(1)
+            inside = phase.new_full((1,), 0.5)
         else:
             response, times = (values.to(phase) for values in sampled_response(self.between, self.samples))
             before, after = masks[:swaps], masks.roll(-1, 0)[:swaps]
             between = torch.lerp(before, after, response[:, None, None, None]).flatten(0, 1)
-        weights = (times[:, None] * swap).expand(-1, swaps).flatten()
-        return torch.cat([masks, between]), torch.cat([shares * max(0.0, 1 - swaps * swap), weights])
-
-    def middle_times(self, phase: Tensor) -> Tensor:
-        """Return when each state is shown, as a share of the exposure: its middle. The states are not in this order.
-
-        Args:
-            phase: (K, N, N), as for :meth:`forward`.
-
-        Returns:
-            (S',), in the order of the states.
-
-        Example:
-            >>> Switching(20e-3)(torch.zeros(3, 5, 5))[1], Switching(20e-3).middle_times(torch.zeros(3, 5, 5))
-            (tensor([0.2000, 0.2000, 0.2000, 0.2000, 0.2000]), tensor([0.1000, 0.5000, 0.9000, 0.3000, 0.7000]))
-        """
-        weights = self(phase)[1]
-        masks = len(phase)
-        swap = self.switching_time / self.exposure
-        ends = weights[:masks].cumsum(0) + swap * torch.arange(masks).to(weights)
-        swaps = masks if self.cyclic and masks > 1 else masks - 1
-        inside = [0.5]
-        if self.between != "random":
-            inside = (gauss_legendre(self.samples)[0] + 0.5).tolist()
-        between = [ends[:swaps] + share * swap for share in inside] if len(weights) > masks else []
-        return torch.cat([ends - weights[:masks] / 2, *between])
+            inside = (gauss_legendre(self.samples)[0] + 0.5).to(phase)
+        shown = shares * max(0.0, 1 - swaps * swap)
+        ends = shown.cumsum(0) + swap * torch.arange(len(masks), device=shown.device, dtype=shown.dtype)
+        middles = torch.cat([ends - shown / 2, (ends[:swaps] + swap * inside[:, None]).flatten()])
+        durations = torch.cat([shown, (times[:, None] * swap).expand(-1, swaps).flatten()])
+        return Timeline(torch.cat([masks, between]), durations, middles=middles)
 
     def extra_repr(self) -> str:
         """Describe the swaps in a person's words."""

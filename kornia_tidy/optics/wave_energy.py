@@ -49,14 +49,14 @@ def _energies(first: Tensor, weights: Tensor, left: Tensor, second: Tensor) -> T
     """Energies (D, P, P) of first (2N, K 2N), weights (K,), left (D, P, q, 2N) and second (D, 2 q P, 2N)."""
     depths, window, order, _ = left.shape
     rows = weights.repeat(order)
-    energies = left.new_empty(depths, window, window)
+    energies = []
     with torch.autocast(left.device.type, enabled=False):
         for depth, row in _blocks(len(weights), left.shape):
             _, wave = _waves(first, left[depth, row], second[depth])
             squares = wave.square() if wave.requires_grad else wave.square_()
             lines = torch.matmul(rows, squares.view(-1, len(rows), wave.shape[-1]))
-            energies[depth, row] = lines.view(len(wave), -1, 2 * order, window).sum(2)
-    return energies
+            energies.append(lines.view(-1, 2 * order, window).sum(1))
+    return torch.cat(energies).view(depths, window, window)
 
 
 def _gradients(

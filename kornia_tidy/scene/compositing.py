@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.following import is_followed
 from kornia_tidy.scene.convolution import check_border, from_spectrum, pad_border, padded_size, to_spectrum
 from kornia_tidy.scene.layers import assign_layers, layer_weight, present_layers
 from kornia_tidy.scene.occlusion import occlude_dense
@@ -66,8 +67,8 @@ def render(
         border: ``"reflect"``, ``"replicate"``, ``"zero"``, ``"circular"`` or ``"valid"``, see
             :mod:`kornia_tidy.scene.convolution`.
         correlate: turn the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
-        method: ``"tiled"``, or ``"dense"`` for the slow reference with second derivatives. While compiling, which
-            cannot look at the scene, dense is used.
+        method: ``"tiled"``, or ``"dense"`` for the slow reference. While compiling and under torch.func, which need
+            plain operations of torch, dense is used; for second derivatives, a backward pass like it.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or
@@ -274,7 +275,7 @@ def _composite(
         psfs = psfs.flip((-2, -1)) if correlate else psfs
         veil = None if veil is None else veil.to(dtype)
         fraction = fraction.to(dtype) if layers == "linear" else None
-        sum_layers = methods["dense" if torch.compiler.is_compiling() else method]
+        sum_layers = methods["dense" if is_followed() else method]
         coded = sum_layers(image.to(dtype), lower, fraction, psfs.to(dtype), veil=veil, border=border)
     return coded.to(image.dtype)
 

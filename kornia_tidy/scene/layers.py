@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.following import is_followed, is_value_unknown
 
 LAYER_MODES = ("nearest", "linear")
 
@@ -68,7 +69,7 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     """
     check_choice("layers", mode, LAYER_MODES)
     check_float_tensor("nodes", nodes, 1, "(D,)")
-    if not torch.compiler.is_compiling() and not bool((nodes.diff() > 0).all()):
+    if not is_value_unknown() and not bool((nodes.diff() > 0).all()):
         raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
@@ -95,7 +96,7 @@ def _even_spacing(nodes: Tensor) -> Tensor | None:
 
     None too where nodes are learnt, or on a device that one would have to wait for.
     """
-    if torch.compiler.is_compiling() or nodes.device.type != "cpu" or nodes.requires_grad or len(nodes) == 1:
+    if is_followed() or nodes.device.type != "cpu" or nodes.requires_grad or len(nodes) == 1:
         return None
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
     even = nodes[0] + spacing * torch.arange(len(nodes), dtype=nodes.dtype)
@@ -145,8 +146,9 @@ def layer_weights(defocus: Tensor, nodes: Tensor, mode: str) -> Tensor:
 def present_layers(lower: Tensor, fraction: Tensor | None, count: int) -> list[int]:
     """Return the layers out of ``count`` that a scene contains, ascending. Waits for the device once, for all layers.
 
-    While compiling, all layers are returned: which are present depends on the data. Where gradients with respect to
-    defocus are wanted, both neighbours of a pixel count: on a node the next layer's weight is zero, its slope is not.
+    While compiling or under torch.func, all layers are returned: which are present depends on the data. Where gradients
+    with respect to defocus are wanted, both neighbours of a pixel count: on a node the next layer's weight is zero, its
+    slope is not.
 
     Args:
         lower: (B, 1, H, W) int64 index of the layer below, from :func:`assign_layers`.
@@ -158,7 +160,7 @@ def present_layers(lower: Tensor, fraction: Tensor | None, count: int) -> list[i
         >>> present_layers(torch.tensor([0, 3]), torch.tensor([1.0, 0.5]), count=6)
         [1, 3, 4]
     """
-    if torch.compiler.is_compiling():
+    if is_followed():
         return list(range(count))
     present = torch.zeros(count, dtype=torch.bool, device=lower.device)
     if fraction is None:

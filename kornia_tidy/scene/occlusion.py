@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator
 import torch
 from torch import Tensor
 
-from kornia_tidy.scene.convolution import from_spectrum, pad_border, padded_size, to_spectrum
+from kornia_tidy.scene.convolution import from_spectrum, pad_border, to_spectrum
 from kornia_tidy.scene.layers import layer_weight, present_layers
 from kornia_tidy.scene.stray_light import normalised_share
 
@@ -69,22 +69,57 @@ def occlude_dense(
     image: Tensor, lower: Tensor, fraction: Tensor | None, psfs: Tensor, *, veil: Tensor | None, border: str
 ) -> Tensor:
     """Render with occlusion, the whole image for every layer: the definition. See :func:`lay_over`."""
-    image, psfs = image.double(), psfs.double()
-    fraction = None if fraction is None else fraction.double()
-    mean = image.mean((-2, -1), keepdim=True)
-    psf_size = psfs.shape[-1]
+    radius = psfs.shape[-1] // 2
+    # Black beyond the border has no weight; let it lie in layers that are there anyway.
+    sides = "replicate" if border == "zero" else border
+    lower = pad_border(lower.to(image.dtype), radius, sides).long()[:, 0]
+    fraction = None if fraction is None else pad_border(fraction, radius, sides)[:, 0]
+    inside = pad_border(torch.ones_like(image[:1, 0]), radius, "zero") if border == "zero" else None
+    mean = None if veil is None else image.mean((-2, -1))
     veil = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
-    size = padded_size(*image.shape[-2:], psf_size, border)
+    return occlude_planes(pad_border(image, radius, border), psfs, fraction, mean, veil, lower=lower, inside=inside)
+
+
+def occlude_planes(
+    light: Tensor,
+    psfs: Tensor,
+    fraction: Tensor | None,
+    mean: Tensor | None,
+    veil: Tensor | None,
+    *,
+    lower: Tensor,
+    inside: Tensor | None,
+) -> Tensor:
+    """Render planes that hold what lies beyond the border, by transforms of the whole for every layer.
+
+    Args:
+        light: (B, C, H + P - 1, W + P - 1).
+        psfs: (D, C, P, P).
+        fraction: share of the next layer, (B or 1, H + P - 1, W + P - 1), or None.
+        mean: (B, C) mean light of each image, where there is a veil.
+        veil: (D, C) how much of it each layer takes on, or None.
+        lower: index of each pixel's layer, of the fraction's shape.
+        inside: (1, H + P - 1, W + P - 1) 1 on the image and 0 in the dark beyond it, or None for no dark.
+
+    Returns:
+        (B, C, H, W) float64.
+    """
+    light, psfs = light.double(), psfs.double()
+    lower, fraction = lower[:, None], None if fraction is None else fraction[:, None].double()
+    size, side = (light.shape[-2], light.shape[-1]), psfs.shape[-1]
 
     def blur(plane: Tensor, spectrum: Tensor) -> Tensor:
-        return from_spectrum(to_spectrum(pad_border(plane, psf_size // 2, border), size) * spectrum, size, psf_size)
+        plane = plane if inside is None else plane * inside[:, None]
+        return from_spectrum(to_spectrum(plane, size) * spectrum, size, side)
 
     def near_to_far() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         for index in reversed(present_layers(lower, fraction, len(psfs))):
             spectrum = to_spectrum(psfs[index], size)
             own = layer_weight(lower, fraction, index).double()
             behind = weight_behind(lower, fraction, index).double()
-            light = image if veil is None else torch.lerp(image, mean, veil[index, :, None, None].double())
-            yield blur(own * light, spectrum), blur(own, spectrum), blur(behind, spectrum)
+            lit = light
+            if mean is not None and veil is not None:  # both or none
+                lit = torch.lerp(light, mean.double()[..., None, None], veil[index, :, None, None].double())
+            yield blur(own * lit, spectrum), blur(own, spectrum), blur(behind, spectrum)
 
     return lay_over(near_to_far())

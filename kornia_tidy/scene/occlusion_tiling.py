@@ -19,20 +19,21 @@ gradients are made by tiles all the same.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.kept_memory import keep_memory
 from kornia_tidy.scene.layers import layer_weight
-from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
+from kornia_tidy.scene.occlusion import EPSILON, lay_over, occlude_planes, weight_behind
 from kornia_tidy.scene.occlusion_direct import goes_directly, occlude_directly
 from kornia_tidy.scene.occlusion_tiles import Chunk, Corner, Grid, Plan, make_plan
 from kornia_tidy.scene.stray_light import normalised_share
+from kornia_tidy.scene.summed import differentiable_slopes
 
 
 class Scene(NamedTuple):
@@ -72,7 +73,8 @@ def occlude_tiled(
 ) -> Tensor:
     """Render with occlusion, by tiles or directly, as :func:`kornia_tidy.scene.occlusion.occlude_dense` defines it.
 
-    It has gradients with respect to image, psfs, fraction and veil, but no second ones.
+    It has gradients with respect to image, psfs, fraction and veil; where they are differentiated in turn, they are
+    made by :func:`kornia_tidy.scene.occlusion.occlude_planes`.
     """
     psf_size = psfs.shape[-1]
     sloped = fraction is not None and fraction.requires_grad and torch.is_grad_enabled()
@@ -135,11 +137,14 @@ class _Occlude(torch.autograd.Function):
         return coded
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        light, psfs, fraction, _, _, lower, inside = ctx.saved_tensors
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,), wanted, saved = grad_outputs, ctx.needs_input_grad[:5], ctx.saved_tensors
+        light, psfs, fraction, _, _, lower, inside = saved
+        if torch.is_grad_enabled():  # it is differentiated in turn
+            render = partial(occlude_planes, lower=lower.long(), inside=inside)
+            return *differentiable_slopes(render, saved[:5], grad, wanted), None, None, None, None
         plan = ctx.plan or _plan(light, psfs, lower, fraction, inside, sloped=ctx.sloped)
-        return *_slopes(ctx.saved_tensors, plan, grad, ctx.needs_input_grad[:5]), None, None, None, None
+        return *_slopes(saved, plan, grad, wanted), None, None, None, None
 
 
 def _slopes(

@@ -11,17 +11,17 @@ Small PSFs are convolved directly instead where that takes less time, see :mod:`
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.direct import correlate_directly, goes_directly, mix_directly
 from kornia_tidy.scene.kept_memory import keep_memory
+from kornia_tidy.scene.summed import differentiable_slopes, mix_layers, spread_layers
 from kornia_tidy.scene.tiles import Chunk, Labels, Plan, make_plan
 
 
@@ -36,8 +36,8 @@ def blur_then_mix(image: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor |
         border: what lies beyond the image, see :mod:`kornia_tidy.scene.convolution`.
 
     Returns:
-        (B, C, H, W), or smaller by P - 1 for ``"valid"``. It has gradients with respect to image, psfs and fraction,
-        but no second ones.
+        (B, C, H, W), or smaller by P - 1 for ``"valid"``. It has gradients with respect to image, psfs and fraction;
+        where they are differentiated in turn, they are made by :mod:`kornia_tidy.scene.summed`.
     """
     labels, fraction = _labels(lower, fraction, len(image))
     if goes_directly(labels, len(psfs), psfs.shape[-1], psfs.dtype):
@@ -79,10 +79,29 @@ def _labels(lower: Tensor, fraction: Tensor | None, batch: int) -> tuple[Labels,
     return Labels.of(lower[:, 0].expand(batch, -1, -1), fraction), fraction
 
 
+def _twice(
+    render: Callable[..., Tensor], planes: Sequence[Tensor | None], labels: Labels, grad: Tensor, wanted: Sequence[bool]
+) -> list[Tensor | None]:
+    """Return the gradients with respect to plane, psfs and fraction so that they can be differentiated in turn.
+
+    The plane may have spare rows and columns, which no pixel of the output sees.
+    """
+    psfs = planes[1]
+    assert psfs is not None
+    height, width = labels.lower.shape[-2:]
+    if render is mix_layers:
+        height, width = height + psfs.shape[-1] - 1, width + psfs.shape[-1] - 1
+
+    def rendered(plane: Tensor, psfs: Tensor, fraction: Tensor | None) -> Tensor:
+        return render(plane[..., :height, :width], psfs, fraction, labels.lower)
+
+    return differentiable_slopes(rendered, planes, grad, wanted[:3])
+
+
 class _BlurThenMix(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plane: Tensor, psfs: Tensor, fraction: Tensor | None, plan: Plan) -> Tensor:
-        ctx.save_for_backward(plane, psfs)
+        ctx.save_for_backward(plane, psfs, fraction)
         ctx.plan = plan
         work = _Work(plan, psfs, psfs.shape[-1] - 1)
         mixed = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
@@ -92,9 +111,11 @@ class _BlurThenMix(torch.autograd.Function):
         return mixed
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        plane, psfs = ctx.saved_tensors
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,) = grad_outputs
+        if torch.is_grad_enabled():
+            return *_twice(mix_layers, ctx.saved_tensors, ctx.plan.labels, grad, ctx.needs_input_grad), None
+        plane, psfs, _ = ctx.saved_tensors
         return *_mix_slopes(plane, psfs, grad, ctx.plan, ctx.needs_input_grad), None
 
 
@@ -125,15 +146,17 @@ def _mix_slopes(
 class _MixDirectly(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plane: Tensor, psfs: Tensor, fraction: Tensor | None, labels: Labels) -> Tensor:
-        ctx.save_for_backward(plane, psfs)
+        ctx.save_for_backward(plane, psfs, fraction)
         ctx.labels = labels
         return mix_directly(plane, psfs, labels)
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (plane, psfs), labels = ctx.saved_tensors, ctx.labels
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,) = grad_outputs
+        (plane, psfs, _), labels = ctx.saved_tensors, ctx.labels
         wanted = ctx.needs_input_grad
+        if torch.is_grad_enabled():
+            return *_twice(mix_layers, ctx.saved_tensors, labels, grad, wanted), None
         of_plane = of_psfs = of_fraction = None
         if wanted[0]:  # a pixel's light goes to pixels of many layers: by tiles
             plan = make_plan(labels, len(psfs), psfs.shape[-1])
@@ -148,7 +171,7 @@ class _MixDirectly(torch.autograd.Function):
 class _SplitThenBlur(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plane: Tensor, psfs: Tensor, fraction: Tensor | None, plan: Plan) -> Tensor:
-        ctx.save_for_backward(plane, psfs)
+        ctx.save_for_backward(plane, psfs, fraction)
         ctx.plan = plan
         work = _Work(plan, psfs, 0)
         full = work.tiled_plane(plane)
@@ -158,9 +181,11 @@ class _SplitThenBlur(torch.autograd.Function):
         return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (plane, psfs), plan = ctx.saved_tensors, ctx.plan
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,) = grad_outputs
+        (plane, psfs, _), plan = ctx.saved_tensors, ctx.plan
+        if torch.is_grad_enabled():
+            return *_twice(spread_layers, ctx.saved_tensors, plan.labels, grad, ctx.needs_input_grad), None
         work = _Work(plan, psfs, 0)
         slopes = _Slopes(ctx.needs_input_grad, plane, work)
         mixed = torch.empty_like(plane) if slopes.plane else None

@@ -1,0 +1,49 @@
+"""Who follows what torch does: its compiler, the transforms of torch.func, forward-mode derivatives, torch.jit.
+
+What is written in C, remembered between calls or decided by looking at values is not for those who follow: they need
+plain operations of torch, from start to end.
+"""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+import torch
+from torch.autograd import forward_ad
+
+TORCHSCRIPT = (
+    "a programmable camera cannot become TorchScript, which knows no PSFs computed from masks: export it with "
+    "torch.export.export(optics, (image, depth)), or compile it with torch.compile"
+)
+
+
+def is_followed() -> bool:
+    """Whether only plain operations of torch will do, of which nothing may be remembered.
+
+    Example:
+        >>> torch.func.grad(lambda x: x * is_followed())(torch.tensor(0.0)), is_followed()
+        (tensor(1.), False)
+    """
+    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
+        return True
+    return torch._C._functorch.peek_interpreter_stack() is not None
+
+
+def is_value_unknown() -> bool:
+    """Whether values cannot be looked at: while compiling, and under ``torch.vmap``, which has many at once.
+
+    Example:
+        >>> torch.vmap(lambda x: x * is_value_unknown())(torch.ones(2)), is_value_unknown()
+        (tensor([1., 1.]), False)
+    """
+    if torch.compiler.is_compiling():
+        return True
+    functorch = torch._C._functorch
+    if functorch.peek_interpreter_stack() is None:
+        return False
+    return any(level.key() == functorch.TransformType.Vmap for level in functorch.get_interpreter_stack() or ())
+
+
+def refuse_torchscript() -> NoReturn:
+    """Raise the error that names what works instead."""
+    raise NotImplementedError(TORCHSCRIPT)
