@@ -85,9 +85,7 @@ def burst(
         >>> burst(optics, torch.rand(3, 80, 80), torch.ones(1, 80, 80), dead_time=10e-3).shape
         torch.Size([2, 3, 80, 80])
     """
-    batched = image.ndim != 3
-    if not batched:
-        image, depth = image[None], depth[None]
+    image, depth, batched = optics._checked(image, depth)
     light = optics.decode(image)
     shots = []
     for k, share in enumerate(burst_shares(_dwell_shares(optics), dead_time, exposure)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -12,7 +12,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_positive
+from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_part, check_positive
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
@@ -25,6 +25,7 @@ from kornia_tidy.scene.compositing import COMPOSITING, render
 from kornia_tidy.scene.convolution import BORDERS, check_border
 from kornia_tidy.sensor.noise import STRIP, SensorNoise
 from kornia_tidy.systems import published_system
+from kornia_tidy.units import check_image, layout_remedy, misread_depth, tell_once, values_are_visible
 
 if TYPE_CHECKING:
     from kornia_tidy.render_plan import RenderPlan
@@ -115,7 +116,7 @@ class TiDyOptics(CodedLens):
         memory_budget: int = 512 << 20,
     ) -> None:
         check_positive("memory_budget", memory_budget, "bytes")
-        fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        fidelity = Fidelity.of(fidelity)
         paper = fidelity.propagation == "paper"
         color_space = color_space or ("paper" if paper else "srgb")
         check_choice("color_space", color_space, COLOR_SPACES)
@@ -133,6 +134,8 @@ class TiDyOptics(CodedLens):
                 "compositing 'occlusion' needs colours without spectra of their own, got a spectrum with a basis: "
                 "leave reflectance=True out, or use 'gather' or 'scatter'"
             )
+        if sensor is not None:
+            check_part("sensor", sensor, nn.Module, "a sensor such as SensorNoise(0.01), or None for no noise")
         self.sensor = sensor
         self.compositing = compositing
         self.color_space = color_space
@@ -141,6 +144,7 @@ class TiDyOptics(CodedLens):
         self.memory_budget = memory_budget
         self._clamped: Tensor | None = None
         self._warned = False
+        self._told: set[Hashable] = set()  # what else was warned of, shared with the cameras made of this one
 
     @classmethod
     def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
@@ -207,6 +211,7 @@ class TiDyOptics(CodedLens):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Take a picture of an image and its depth. See :meth:`forward`."""
+        check_generator(generator)
         image, depth, batched = self._checked(image, depth)
         check_border(self.border, *image.shape[-2:], self.window)
         with torch.autocast(image.device.type, enabled=False):
@@ -429,19 +434,26 @@ class TiDyOptics(CodedLens):
         batched = not isinstance(image, Tensor) or image.ndim != 3
         check_float_tensor("image", image, 4 if batched else 3, "(B, C, H, W) or (C, H, W)")
         check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
+        remedy = layout_remedy(tuple(image.shape), len(self.spectrum.weights))
         if not batched:
             image, depth = image[None], depth[None]
-        self._spectrum(image.shape[1])
+        self._spectrum(image.shape[1], remedy)
         if image.numel() == 0:
             raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
         if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
             raise ValueError(
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
-                f"{tuple(depth.shape)}"
+                f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
             )
-        if self.check_inputs and not torch.compiler.is_compiling():
-            check_finite("image", image)
+        self._check_values(image)
         return image, depth, batched
+
+    def _check_values(self, image: Tensor) -> None:
+        """Refuse values without sense; warn once of those that seem to be in another unit."""
+        if self.check_inputs and values_are_visible():
+            said = check_image(image, encoded=self.color_space != "linear")
+            if said is not None:
+                tell_once(self._told, "image", said, stacklevel=8)
 
     def _survey(self, parts: Iterable[Tensor]) -> Tensor:
         """Return the lowest and highest defocus of a map given in parts; count pixels beyond the range, say so once.
@@ -461,7 +473,9 @@ class TiDyOptics(CodedLens):
                 clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
         lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
         self._clamped = clamped
-        if self.check_inputs and not self._warned and (count := int(clamped)):
+        if self.check_inputs and (said := misread_depth(self.camera, lowest, highest)) is not None:
+            tell_once(self._told, "depth", said, stacklevel=8)
+        elif self.check_inputs and not self._warned and (count := int(clamped)):
             self._warned = True
             warnings.warn(
                 f"{count} of {pixels} pixels have a defocus between {float(lowest):+.2f} and {float(highest):+.2f} "

@@ -10,9 +10,11 @@ from functools import partial
 from math import ceil, floor, pi
 from typing import Any, Literal, Self, cast, overload
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.checks import check_finite, check_part
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
@@ -20,6 +22,7 @@ from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
+from kornia_tidy.optics.lens_limits import PARTS, check_defocus_range
 from kornia_tidy.optics.modulator import DwellTimes
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
@@ -27,6 +30,7 @@ from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.state_bank import StateBank
+from kornia_tidy.units import values_are_visible
 
 
 class CodedLens(nn.Module):
@@ -66,11 +70,13 @@ class CodedLens(nn.Module):
         aperture: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        self.fidelity = Fidelity.of(fidelity)
         self.masks = PixelwiseMask() if masks is None else masks
         self.camera = ThinLensCamera() if camera is None else camera
         self.modulator = DwellTimes() if modulator is None else modulator
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
+        if aperture is not None:
+            check_part("aperture", aperture, (Tensor, np.ndarray), "a tensor of amplitudes (N, N) such as 23x23")
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
         self._memories: dict[int | None, BankMemory] = defaultdict(BankMemory)  # of each state, and of their average
         if self.fidelity.propagation == "paper":
@@ -150,7 +156,7 @@ class CodedLens(nn.Module):
             fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
         """
         other = self._sharing_parts()
-        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        other.fidelity = Fidelity.of(fidelity)
         return other
 
     def through_state(self, state: int) -> Self:
@@ -227,6 +233,7 @@ class CodedLens(nn.Module):
 
     def _check_layers(self) -> None:
         settings = self.fidelity
+        check_defocus_range(self.camera.defocus_range, self._pixel_step(), settings, self._fixed_window)
         if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
             raise ValueError(
                 f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
@@ -278,6 +285,8 @@ class CodedLens(nn.Module):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; a part that shapes the PSFs makes wavelengths, window and pupil to be found anew."""
+        if name in PARTS:
+            check_part(name, value, *PARTS[name])
         if name in ("spectrum", "fidelity"):
             both = {**self.__dict__, name: value}
             if "spectrum" in both and "fidelity" in both:
@@ -326,6 +335,9 @@ class CodedLens(nn.Module):
         tolerance: float,
         nodes: tuple[float, ...],
     ) -> PSFBank:
+        if values_are_visible():
+            check_finite("the phase of the masks", states)
+            check_finite("the weights of the modulator", weights)
         dispersion, shift = self._colours(spectrum)
         if self.fidelity.propagation == "paper":
             if self.pupil.fill_factor != 1:
@@ -393,13 +405,13 @@ class CodedLens(nn.Module):
         """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
         return self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
 
-    def _spectrum(self, channels: int) -> Spectrum:
+    def _spectrum(self, channels: int, remedy: str = "") -> Spectrum:
         if channels == len(self.spectrum.weights):
             return self._seen
         if channels == 1:
             return Spectrum.monochrome()
         raise ValueError(
-            f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}"
+            f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )
 
 

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.checks import check_part, described
+
 
 class DwellTimes(nn.Module):
     """An ideal modulator: it shows each mask for its share of the exposure and switches in no time.
@@ -33,6 +35,7 @@ class DwellTimes(nn.Module):
 
     def __init__(self, shares: Sequence[float] | None = None) -> None:
         super().__init__()
+        _check_numbers(shares)
         if shares is not None and not (sum(shares) > 0 and all(0 <= s < math.inf for s in shares)):
             raise ValueError(f"dwell shares must be finite, not negative and not all zero, got {tuple(shares)}")
         self.shares = None if shares is None else tuple(s / sum(shares) for s in shares)
@@ -72,6 +75,7 @@ class LearnableDwellTimes(nn.Module):
 
     def __init__(self, shares: Sequence[float]) -> None:
         super().__init__()
+        _check_numbers(shares)
         if not shares or not all(0 < s < math.inf for s in shares):
             raise ValueError(f"dwell shares to learn must be positive and finite, got {tuple(shares)}")
         self.logits = nn.Parameter(torch.tensor([math.log(s) for s in shares]))
@@ -133,7 +137,7 @@ class SpatialLightModulator(nn.Module):
         parts: modules, each taking what the one before gives: first those that turn masks (K, N, N) into masks as the
             panel shows them, such as :class:`~kornia_tidy.optics.phase_panel.GreyLevels` and
             :class:`~kornia_tidy.optics.phase_panel.PixelCrosstalk`; last one that gives states and weights, such as
-            :class:`DwellTimes` or :class:`~kornia_tidy.optics.switching.Switching`.
+            :class:`DwellTimes` or :class:`~kornia_tidy.optics.switching.Switching`. Default: equal dwell times.
         fill_factor: share of the area of each pixel that modulates: a square in its middle. Light through the gaps
             between the squares passes with phase zero; see :func:`~kornia_tidy.optics.exact.exact_psf_bank`.
 
@@ -160,7 +164,9 @@ class SpatialLightModulator(nn.Module):
         super().__init__()
         if not 0 < fill_factor <= 1:
             raise ValueError(f"fill_factor must be above 0 and at most 1, got {fill_factor}")
-        self.parts = nn.Sequential(*parts)
+        for part in parts:
+            check_part("each part of a modulator", part, nn.Module, "a module such as GreyLevels(8) or DwellTimes()")
+        self.parts = nn.Sequential(*(parts or (DwellTimes(),)))
         self.fill_factor = fill_factor
 
     def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
@@ -176,6 +182,11 @@ class SpatialLightModulator(nn.Module):
     def extra_repr(self) -> str:
         """Describe the panel in a person's words."""
         return f"fill factor {self.fill_factor:g}"
+
+
+def _check_numbers(shares: object) -> None:
+    if shares is not None and not (isinstance(shares, Sequence) and all(isinstance(s, int | float) for s in shares)):
+        raise TypeError(f"dwell shares must be a number for each mask, such as (3, 1), got {described(shares)}")
 
 
 def _check_count(shares: int, masks: int) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.units import check_head_image, layout_remedy, values_are_visible
 
 
 class ReconstructionHead(nn.Module, ABC):
@@ -33,6 +35,7 @@ class ReconstructionHead(nn.Module, ABC):
     """
 
     stride: int
+    _looked = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -45,7 +48,12 @@ class ReconstructionHead(nn.Module, ABC):
         """Return the estimated maps, (B, out_channels, H, W)."""
         check_float_tensor("image", image, 4, "(B, C, H, W)")
         if image.shape[1] != self.in_channels:
-            raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}")
+            remedy = layout_remedy(tuple(image.shape), self.in_channels)
+            raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}{remedy}")
+        if not self._looked and values_are_visible():
+            self._looked = True  # at the first image only: a look waits for the device
+            if (said := check_head_image(image)) is not None:
+                warnings.warn(said, stacklevel=4)
         height, width = image.shape[-2:]
         (left, right, top, bottom), mode = border_padding((height, width), self.stride)
         if bottom or right:
