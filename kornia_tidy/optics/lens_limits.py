@@ -25,10 +25,10 @@ MOST_LAYERS = 4096
 def check_defocus_range(
     defocus_range: tuple[float, float], step: float | Tensor, fidelity: Fidelity, window: int | None
 ) -> None:
-    r"""Refuse a range of defocus whose PSFs would take minutes and gigabytes, before any work.
+    """Refuse a range of defocus whose PSFs would take minutes and gigabytes, before any work.
 
-    Out of focus a point is a disc, by rays of diameter :math:`2 |\psi| \lambda_0 / (\pi s)` pixels: the gradient of
-    the phase :math:`\psi \rho^2` at the edge of the pupil.
+    Out of focus a point is a disc, by rays of diameter ``2 |psi| 530 nm / (pi s)`` pixels: the gradient of the phase
+    ``psi rho^2`` at the edge of the pupil.
 
     Args:
         defocus_range: in radians.
