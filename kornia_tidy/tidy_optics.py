@@ -63,7 +63,8 @@ class TiDyOptics(CodedLens):
             one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
             has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
-        check_inputs: look at the values of images and depths before any work, eagerly.
+        check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
+            unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
             through in bands of 64 rows or more, which changes nothing but the last digits.
 
@@ -75,8 +76,9 @@ class TiDyOptics(CodedLens):
           is valid is cropped like the depth.
 
     Raises:
-        TypeError: if image or depth are not floating-point tensors.
-        ValueError: if shapes do not fit, a value is NaN, a depth is not positive, or options contradict each other.
+        TypeError: if image or depth are not floating-point tensors, or an argument is of another type.
+        ValueError: if shapes do not fit, a value or a mask is NaN, an sRGB value is above 16, a depth is not positive,
+            the defocus needs PSFs too large, or options contradict each other.
         KeyError: if a mapping has no image or no depth.
 
     Convention:
@@ -448,6 +450,18 @@ class TiDyOptics(CodedLens):
         self._check_values(image)
         return image, depth, batched
 
+    def check_scene(self, image: Tensor, depth: Tensor) -> None:
+        """Look at an image and its depth as a capture does: refuse what makes no sense, warn of other units."""
+        image, depth, _ = self._checked(image, depth)
+        self._tell_of_depth(*torch.aminmax(self._defocus(depth, image).detach()))
+
+    def _tell_of_depth(self, lowest: Tensor, highest: Tensor) -> bool:
+        """Warn once of depths that seem to be in another unit; return whether they do."""
+        said = misread_depth(self.camera, lowest, highest) if self.check_inputs else None
+        if said is not None:
+            tell_once(self._told, "depth", said, stacklevel=9)
+        return said is not None
+
     def _check_values(self, image: Tensor) -> None:
         """Refuse values without sense; warn once of those that seem to be in another unit."""
         if self.check_inputs and values_are_visible():
@@ -473,9 +487,8 @@ class TiDyOptics(CodedLens):
                 clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
         lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
         self._clamped = clamped
-        if self.check_inputs and (said := misread_depth(self.camera, lowest, highest)) is not None:
-            tell_once(self._told, "depth", said, stacklevel=8)
-        elif self.check_inputs and not self._warned and (count := int(clamped)):
+        told = self._tell_of_depth(lowest, highest)
+        if self.check_inputs and not told and not self._warned and (count := int(clamped)):
             self._warned = True
             warnings.warn(
                 f"{count} of {pixels} pixels have a defocus between {float(lowest):+.2f} and {float(highest):+.2f} "

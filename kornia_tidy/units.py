@@ -6,7 +6,7 @@ import math
 import threading
 import warnings
 from collections.abc import Hashable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor
@@ -128,9 +128,10 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
     """
     if float(highest) > camera.defocus_range[0] + SAME_FOCUS or not hasattr(camera, "depth_range"):
         return None
-    nearest, farthest = (float(camera.depth(psi).detach()) for psi in (highest, lowest))
-    first, last = camera.depth_range
-    alike = math.pi * camera.aperture_radius**2 / 530e-9 / SAME_FOCUS  # from here on all is as at infinity
+    lens = cast("ThinLensCamera", camera)
+    nearest, farthest = (float(lens.depth(psi).detach()) for psi in (highest, lowest))
+    first, last = lens.depth_range
+    alike = math.pi * lens.aperture_radius**2 / 530e-9 / SAME_FOCUS  # from here on all is as at infinity
     last = min(last, alike)
     if nearest <= last or farthest > FARTHEST:
         return None

@@ -69,6 +69,8 @@ def read_depth(
           disparity that is infinite or, with d added, negative.
         - Infinite depth is a valid sky, and so is a floating-point disparity that is 0 with d added. Name them in
           ``invalid`` where a data set means *unknown* by them.
+        - What looks like an unknown that was not named is warned of once a folder: a 65535 that stands alone, and in a
+          PFM file infinity that is strewn over numbers as large as disparities.
         - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
 
     Example:

@@ -12,7 +12,7 @@ from kornia_tidy.checks import check_depth, check_metres, check_number, check_pa
 from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
-FASTEST = 0.5  # f-number: no lens in air opens wider, as its edge would see the sensor at more than a right angle
+FASTEST = 0.5  # f-number of a numerical aperture of 1: no lens in air opens wider
 # Lengths in metres, from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
 FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
 
@@ -88,7 +88,9 @@ class ThinLensCamera(nn.Module):
         - ``defocus(depth)``: any shape to the same shape.
 
     Raises:
-        ValueError: if a length is not positive, or the focus distance is not beyond the focal length.
+        ValueError: if a length is not one in metres (focal length 0.01 mm to 10 m, pixels 0.1 um to 1 mm), the lens is
+            faster than f/0.5, or the focus distance is not beyond the focal length.
+        TypeError: if an argument is of another type.
 
     Convention:
         - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus.
@@ -316,6 +318,7 @@ class DefocusRange(nn.Module):
 
     Raises:
         ValueError: if ``lo`` is not below ``hi``.
+        TypeError: if ``lens`` is not a ThinLensCamera.
 
     Convention:
         - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus, so 1 is nearest.

@@ -49,6 +49,11 @@ class CodedLens(nn.Module):
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
             Default: the binary disc.
 
+    Raises:
+        TypeError: if a part is of another type.
+        ValueError: if the camera's defocus needs more than 4096 layers or PSFs eight times as wide as the largest
+            window, or a mask holds NaN.
+
     Example:
         >>> lens = CodedLens()
         >>> lens.psf_bank(defocus=[-10.0, 0.0]).psfs.shape[:2]

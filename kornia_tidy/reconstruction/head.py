@@ -28,6 +28,7 @@ class ReconstructionHead(nn.Module, ABC):
         TypeError: if the image is not a floating-point tensor.
 
     Convention:
+        - The first image is looked at: one in 0..255 or normalised is warned about, as captures are in [0, 1].
         - An image whose sides are no multiples of ``stride`` is continued at its borders, half of what is missing on
           each side, and the result is cropped. It is continued by reflection, which makes no edge where there is
           none; where a side is too short to be reflected that far, by repeating the outermost pixels.
