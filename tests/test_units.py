@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import warnings
 
 import cv2
@@ -36,7 +37,7 @@ from kornia_tidy.optics.switching import Switching
 from kornia_tidy.reconstruction import PhaseCam3DUNet
 from kornia_tidy.systems import SYSTEMS
 from kornia_tidy.training.trained import check_weights
-from tests.base import BaseTester, needs_data
+from tests.base import DATA, BaseTester, needs_data
 from tests.scenes import ENTRIES, load_scene
 
 INF = math.inf
@@ -400,11 +401,22 @@ class TestDepthFiles(BaseTester):
         read_depth(path, kind="disparity", focal_px=1000.0, baseline_m=0.1)
         read_depth(path, invalid=[INF])
         sky = np.full((40, 40), 30, np.float32)
-        sky[:15] = np.inf
+        sky[:15, :30] = sky[18, 4:9] = np.inf  # and below a branch
         path.write_bytes(encode_pfm(sky))
         assert read_depth(path).valid.all()
         path.write_bytes(encode_pfm(self.disparity() / 20))
         read_depth(path)
+
+    def test_feature_maps_without_a_number_raise_no_alarm(self, tmp_path):
+        (tmp_path / "a.pfm").write_bytes(encode_pfm(np.full((8, 8), np.inf, np.float32)))
+        assert read_depth(tmp_path / "a.pfm").valid.all()
+
+    @needs_data
+    @pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry["invalid"] == "inf"])
+    def test_feature_real_disparities_without_their_options_are_told(self, name, tmp_path):
+        path = shutil.copy(DATA / ENTRIES[name]["depth"], tmp_path)
+        with pytest.warns(UserWarning, match="kind='disparity'"):
+            read_depth(path)
 
     def test_feature_65535_taken_for_a_depth_is_told(self, tmp_path):
         cv2.imwrite(str(tmp_path / "a.png"), np.array([[700, 65535], [900, 4000]], np.uint16))

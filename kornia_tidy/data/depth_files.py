@@ -70,7 +70,7 @@ def read_depth(
         - Infinite depth is a valid sky, and so is a floating-point disparity that is 0 with d added. Name them in
           ``invalid`` where a data set means *unknown* by them.
         - What looks like an unknown that was not named is warned of once a folder: a 65535 that stands alone, and in a
-          PFM file infinity that is strewn over numbers as large as disparities.
+          PFM file infinity that lies below numbers as large as disparities.
         - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
 
     Example:
@@ -119,8 +119,10 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
             )
     if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):
         endless = np.isinf(stored)
-        sky = 0.25 * endless.sum() > endless[len(endless) // 2 :].sum()  # holes of stereo lie anywhere
-        if endless.any() and not sky and np.median(stored[~endless]) > NEAR_DISPARITY:
+        # A sky reaches up to the top of the picture, holes of stereo lie below something: 96 to 100 % in Middlebury's.
+        holes = endless & np.maximum.accumulate(~endless, axis=0)
+        known = stored[np.isfinite(stored)]
+        if 2 * holes.sum() > endless.sum() and np.median(known) > NEAR_DISPARITY:
             tell_once(
                 None,
                 ("inf", path.parent),
