@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 # Noise and interpolation go a little beyond [0, 1], and no encoding of light beyond white goes above 2.39 (scRGB).
 # An image normalised by ImageNet's statistics reaches -2.12 and 2.64, one in 8 bits 255.
-BRIGHTEST_CODE, NONSENSE_CODE, DARKEST = 2.5, 16.0, -0.5
+BRIGHTEST_CODE, NONSENSE_CODE, DARKEST_CODE = 2.5, 16.0, -0.5
+DARKEST_LIGHT = -1.0  # colours that no display has are below zero in linear light
 LARGEST_LIGHT = 1e30  # sums over a PSF and over a tile stay finite in float32
 SAME_FOCUS = 0.5  # radians at the pupil's edge, which take 2 % of the peak of a point (1 - psi^2 / 12): not to be seen
 FARTHEST = 1e5  # m; beyond, a pixel is sky, which no map in millimetres holds
@@ -83,12 +84,19 @@ or give linear light with color_space='linear'
         raise ValueError(beyond)
     if (worst := max(highest, -lowest)) > LARGEST_LIGHT:
         raise ValueError(f"image must be within {LARGEST_LIGHT:g} to be summed in float32, got {worst:g}")
-    return normalised(lowest, highest) or (beyond if encoded and highest > BRIGHTEST_CODE else None)
+    darkest = DARKEST_CODE if encoded else DARKEST_LIGHT
+    return normalised(lowest, highest, darkest) or (beyond if encoded and highest > BRIGHTEST_CODE else None)
 
 
-def normalised(lowest: float, highest: float) -> str | None:
-    """Return a sentence on an image whose extremes are those of a normalised one, else None."""
-    if lowest >= DARKEST or -lowest < 0.1 * highest:
+def normalised(lowest: float, highest: float, darkest: float) -> str | None:
+    """Return a sentence on an image whose extremes are those of a normalised one, else None.
+
+    Args:
+        lowest: least value.
+        highest: greatest value.
+        darkest: how far below zero values may be, and a tenth of the greatest in any case.
+    """
+    if lowest >= darkest or -lowest < 0.1 * highest:
         return None
     return (
         f"image holds values from {lowest:.3g} to {highest:.3g}, and light is not negative: if it was normalised by a "
@@ -101,9 +109,9 @@ def check_head_image(image: Tensor) -> str | None:
     if not image.numel():
         return None
     lowest, highest = (float(end) for end in torch.aminmax(image.detach()))
-    if highest > NONSENSE_CODE and lowest > DARKEST:
+    if highest > NONSENSE_CODE and lowest > DARKEST_CODE:
         return f"image holds values up to {highest:.6g}, where networks expect captures in [0, 1]: divide by 255"
-    return normalised(lowest, highest)
+    return normalised(lowest, highest, DARKEST_CODE)
 
 
 def misread_depth(camera: ThinLensCamera | DefocusRange, lowest: Tensor, highest: Tensor) -> str | None:

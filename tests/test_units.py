@@ -157,6 +157,7 @@ class TestImage(BaseTester):
     def test_feature_noise_and_overshoot_raise_no_alarm(self):
         image, depth = scene()
         camera()(1.4 * image - 0.2, depth)
+        camera(color_space="linear", sensor=None)(2.7 * image - 0.8, depth)
         camera(check_inputs=False)(255 * image, depth)
 
     @pytest.mark.parametrize(("whole", "scale"), [(torch.uint8, 255), (torch.int32, 65535)])
