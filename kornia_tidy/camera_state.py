@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from kornia_tidy.camera_settings import EXTRA_STATE, check_settings, read_settings, write_settings
+from kornia_tidy.checks import check_finite
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.threads import SharedLock
 
@@ -130,8 +131,11 @@ class CameraState(nn.Module):
         error_msgs: list[str],
     ) -> None:
         key = prefix + EXTRA_STATE
-        weights = chain(self.named_parameters(), self.named_buffers())
-        if key not in state_dict and any(prefix + name in state_dict for name, _ in weights):
+        own = (prefix + name for name, _ in chain(self.named_parameters(), self.named_buffers()))
+        weights = {name: state_dict[name] for name in own if isinstance(state_dict.get(name), Tensor)}
+        for name, value in weights.items():
+            check_finite(f"{name} in the state", value)
+        if key not in state_dict and weights:
             self.__dict__["_window"] = None  # measured when the weights are there
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs

@@ -20,9 +20,54 @@ def check_choice(name: str, value: Any, allowed: Collection[Any]) -> None:
 
 
 def check_positive(name: str, value: float, unit: str = "") -> None:
-    """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
+    """Raise ``ValueError`` unless ``value`` is a finite number above zero, ``TypeError`` if it is no number."""
+    check_number(name, value, unit)
     if not 0 < value < float("inf"):
         raise ValueError(f"{name} must be positive and finite{' ' + unit if unit else ''}, got {value}")
+
+
+def check_number(name: str, value: Any, unit: str = "") -> None:
+    """Raise ``TypeError`` unless ``value`` is a single number."""
+    if isinstance(value, str) or not hasattr(value, "__float__"):
+        raise TypeError(f"{name} must be a number{' in ' + unit if unit else ''}, got {described(value)}")
+
+
+def check_metres(name: str, value: float, shortest: float, longest: float, example: str) -> None:
+    """Raise ``ValueError`` unless a length lies where such lengths do; ``example`` says how one is written."""
+    check_positive(name, value, "metres")
+    if not shortest <= value <= longest:
+        raise ValueError(f"{name} must be metres between {shortest:g} and {longest:g} ({example}), got {value}")
+
+
+def check_part(name: str, value: Any, kind: type | tuple[type, ...], example: str, needs: str = "") -> None:
+    """Raise ``TypeError`` unless ``value`` is of a kind, and has an attribute where one is needed.
+
+    Example:
+        >>> check_part("masks", 5, torch.nn.Module, "phase masks such as PixelwiseMask(5)")
+        Traceback (most recent call last):
+        TypeError: masks must be phase masks such as PixelwiseMask(5), got the number 5
+    """
+    if not isinstance(value, kind) or (needs and not hasattr(type(value), needs)):
+        raise TypeError(f"{name} must be {example}, got {described(value)}")
+
+
+def check_generator(generator: Any) -> None:
+    """Raise ``TypeError`` unless ``generator`` is None or a torch.Generator."""
+    if generator is not None and not isinstance(generator, torch.Generator):
+        seed = generator if type(generator) is int else 0
+        raise TypeError(
+            f"generator must be a torch.Generator such as torch.Generator().manual_seed({seed}), got "
+            f"{described(generator)}"
+        )
+
+
+def described(value: Any) -> str:
+    """Return a value in words short enough for a message."""
+    if isinstance(value, bool) or value is None:
+        return repr(value)
+    if isinstance(value, (int, float)):
+        return f"the number {value}"
+    return repr(value) if isinstance(value, str) and len(value) < 40 else f"a {type(value).__name__}"
 
 
 def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
@@ -30,9 +75,22 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
     if not value.is_floating_point():
-        raise TypeError(f"{name} must be floating point with values in [0, 1] or metres, got {value.dtype}")
+        raise TypeError(
+            f"{name} must be floating point with values in [0, 1] or metres, got {value.dtype}{_as_float(name, value)}"
+        )
     if value.ndim != rank:
-        raise ValueError(f"{name} must have shape {layout}, got {tuple(value.shape)}")
+        missing = name == "depth" and value.ndim == rank - 1
+        remedy = f": add the axis of channels with depth.unsqueeze({-3})" if missing else ""
+        raise ValueError(f"{name} must have shape {layout}, got {tuple(value.shape)}{remedy}")
+
+
+def _as_float(name: str, value: Tensor) -> str:
+    """How to turn whole numbers into what is meant."""
+    if name.startswith("depth"):
+        return f": convert it with {name}.float() * 0.001 if it is in millimetres"
+    if name.startswith("image") and value.dtype not in (torch.bool, torch.complex64, torch.complex128):
+        return f": convert it with {name}.float() / {255 if value.dtype == torch.uint8 else 65535}"
+    return ""
 
 
 def check_finite(name: str, value: Tensor) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.checks import check_choice, check_part, check_positive
 
 LAYERS = ("nearest", "linear", "cubic", "bandlimited")
 
@@ -111,6 +111,19 @@ class Fidelity:
         """
         check_choice("fidelity", name, tuple(PRESETS))
         return PRESETS[name]
+
+    @classmethod
+    def of(cls, value: str | Fidelity) -> Fidelity:
+        """Return a preset by its name, or the settings themselves.
+
+        Raises:
+            ValueError: if there is no such preset.
+            TypeError: if it is neither.
+        """
+        if isinstance(value, str):
+            return cls.preset(value)
+        check_part("fidelity", value, Fidelity, f"a Fidelity or one of {', '.join(map(repr, PRESETS))}")
+        return value
 
     def replace(self, **changes: object) -> Fidelity:
         """Return a copy with some knobs changed, named as such."""

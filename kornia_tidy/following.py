@@ -30,13 +30,13 @@ def is_followed() -> bool:
 
 
 def is_value_unknown() -> bool:
-    """Whether values cannot be looked at: while compiling, and under ``torch.vmap``, which has many at once.
+    """Whether values cannot be looked at: while compiling or tracing, and under ``torch.vmap``, which has many at once.
 
     Example:
         >>> torch.vmap(lambda x: x * is_value_unknown())(torch.ones(2)), is_value_unknown()
         (tensor([1., 1.]), False)
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
         return True
     functorch = torch._C._functorch
     if functorch.peek_interpreter_stack() is None:

@@ -71,6 +71,7 @@ def moving_capture(
     batched = not isinstance(images, Tensor) or images.ndim != 4
     check_float_tensor("images", images, 5 if batched else 4, "(B, M, C, H, W) or (M, C, H, W)")
     check_float_tensor("depths", depths, images.ndim, "(B, M, 1, H, W) or (M, 1, H, W), as images are batched or not")
+    optics._check_values(images)
     if not batched:
         images, depths = images[None], depths[None]
     wide = optics.fidelity.double or images.dtype == torch.float64

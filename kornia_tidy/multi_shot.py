@@ -86,9 +86,7 @@ def burst(
         >>> burst(optics, torch.rand(3, 80, 80), torch.ones(1, 80, 80), dead_time=10e-3).shape
         torch.Size([2, 3, 80, 80])
     """
-    batched = image.ndim != 3
-    if not batched:
-        image, depth = image[None], depth[None]
+    image, depth, batched = optics._checked(image, depth)
     wide = optics.fidelity.double or image.dtype == torch.float64
     optics = optics.snapshot(torch.float64 if wide else torch.float32)  # every shot is of the same masks
     light = optics.decode(image)

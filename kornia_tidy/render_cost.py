@@ -70,7 +70,7 @@ def bank_operations(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> 
     Example:
         >>> geometry = BankGeometry(5, Pupil(torch.ones(23, 23), 0.1), (530e-9,), 2e-7)
         >>> f"{bank_operations(geometry, Fidelity(window=65), 21):.1e}"
-        '3.2e+08'
+        '3.9e+08'
     """
     return _weight(fidelity) * layers * sum(min(ways) for ways in _operations(geometry, fidelity))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from typing import Any, Self
 
 from torch import Tensor
@@ -51,16 +51,16 @@ class CaptureNotes:
         (True, False)
     """
 
-    def __init__(self, told: Iterable[str] = ()) -> None:
-        self._told: dict[str, object] = dict.fromkeys(told)
+    def __init__(self, told: Iterable[Hashable] = ()) -> None:
+        self._told: dict[Hashable, object] = dict.fromkeys(told)
         self._of_thread = threading.local()
 
-    def first_time(self, warning: str) -> bool:
+    def first_time(self, warning: Hashable) -> bool:
         """Return whether nobody asked for this warning before, in any thread."""
         mine = object()
         return self._told.setdefault(warning, mine) is mine  # one step of the interpreter
 
-    def is_told(self, warning: str) -> bool:
+    def is_told(self, warning: Hashable) -> bool:
         """Return whether a warning was given."""
         return warning in self._told
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from kornia_tidy.camera_settings import settings_of
-from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_positive
+from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_part, check_positive
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.following import is_followed, is_value_unknown, refuse_torchscript
@@ -28,6 +28,7 @@ from kornia_tidy.scene.convolution import BORDERS, check_border
 from kornia_tidy.sensor.noise import STRIP, SensorNoise
 from kornia_tidy.systems import published_system
 from kornia_tidy.threads import CaptureNotes
+from kornia_tidy.units import check_image, layout_remedy, misread_depth, tell_once
 
 if TYPE_CHECKING:
     from kornia_tidy.render_plan import RenderPlan
@@ -67,7 +68,8 @@ class TiDyOptics(CodedLens):
             one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
             has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
-        check_inputs: look at the values of images and depths before any work, eagerly.
+        check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
+            unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
             through in bands of 64 rows or more, which changes nothing but the last digits.
 
@@ -79,8 +81,9 @@ class TiDyOptics(CodedLens):
           is valid is cropped like the depth.
 
     Raises:
-        TypeError: if image or depth are not floating-point tensors.
-        ValueError: if shapes do not fit, a value is NaN, a depth is not positive, or options contradict each other.
+        TypeError: if image or depth are not floating-point tensors, or an argument is of another type.
+        ValueError: if shapes do not fit, a value or a mask is NaN, an sRGB value is above 16, a depth is not positive,
+            the defocus needs PSFs too large, or options contradict each other.
         KeyError: if a mapping has no image or no depth.
 
     Convention:
@@ -122,7 +125,7 @@ class TiDyOptics(CodedLens):
         memory_budget: int = 512 << 20,
     ) -> None:
         check_positive("memory_budget", memory_budget, "bytes")
-        fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        fidelity = Fidelity.of(fidelity)
         paper = fidelity.propagation == "paper"
         color_space = color_space or ("paper" if paper else "srgb")
         check_choice("color_space", color_space, COLOR_SPACES)
@@ -140,6 +143,8 @@ class TiDyOptics(CodedLens):
                 "compositing 'occlusion' needs colours without spectra of their own, got a spectrum with a basis: "
                 "leave reflectance=True out, or use 'gather' or 'scatter'"
             )
+        if sensor is not None:
+            check_part("sensor", sensor, nn.Module, "a sensor such as SensorNoise(0.01), or None for no noise")
         self.sensor = sensor
         self.compositing = compositing
         self.color_space = color_space
@@ -216,6 +221,7 @@ class TiDyOptics(CodedLens):
         """Take a picture of an image and its depth. See :meth:`forward`."""
         if torch.jit.is_tracing():
             refuse_torchscript()
+        check_generator(generator)
         image, depth, batched = self._checked(image, depth)
         with torch.autocast(image.device.type, enabled=False):
             now = self._now(image)
@@ -482,19 +488,38 @@ class TiDyOptics(CodedLens):
         batched = not isinstance(image, Tensor) or image.ndim != 3
         check_float_tensor("image", image, 4 if batched else 3, "(B, C, H, W) or (C, H, W)")
         check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
+        remedy = layout_remedy(tuple(image.shape), len(self.spectrum.weights))
         if not batched:
             image, depth = image[None], depth[None]
-        self._spectrum(image.shape[1])
+        self._spectrum(image.shape[1], remedy)
         if 0 in image.shape[-2:]:
             raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
         if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
             raise ValueError(
                 f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
-                f"{tuple(depth.shape)}"
+                f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
             )
-        if self.check_inputs and not is_value_unknown():
-            check_finite("image", image)
+        self._check_values(image)
         return image, depth, batched
+
+    def check_scene(self, image: Tensor, depth: Tensor) -> None:
+        """Look at an image and its depth as a capture does: refuse what makes no sense, warn of other units."""
+        image, depth, _ = self._checked(image, depth)
+        self._tell_of_depth(*torch.aminmax(self._defocus(depth, image).detach()))
+
+    def _tell_of_depth(self, lowest: Tensor, highest: Tensor) -> bool:
+        """Warn once of depths that seem to be in another unit; return whether they do."""
+        said = misread_depth(self.camera, lowest, highest) if self.check_inputs else None
+        if said is not None:
+            tell_once(self._notes, "depth", said, stacklevel=9)
+        return said is not None
+
+    def _check_values(self, image: Tensor) -> None:
+        """Refuse values without sense; warn once of those that seem to be in another unit."""
+        if self.check_inputs and not is_value_unknown():
+            said = check_image(image, encoded=self.color_space != "linear")
+            if said is not None:
+                tell_once(self._notes, "image", said, stacklevel=8)
 
     def _survey(self, parts: Iterable[Tensor]) -> Tensor:
         """Return the lowest and highest defocus of a map given in parts; count pixels beyond the range, say so once.
@@ -516,7 +541,8 @@ class TiDyOptics(CodedLens):
         if not extremes:
             return torch.zeros(2)
         lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
-        if self.check_inputs and (count := int(clamped)) and self._notes.first_time(_BEYOND):
+        told = self._tell_of_depth(lowest, highest)
+        if self.check_inputs and not told and (count := int(clamped)) and self._notes.first_time(_BEYOND):
             warnings.warn(
                 f"{count} of {pixels} pixels have a defocus between {float(lowest):+.2f} and {float(highest):+.2f} "
                 f"rad, beyond the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "

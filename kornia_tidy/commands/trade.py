@@ -117,6 +117,7 @@ def run(args: argparse.Namespace) -> None:
         PixelwiseMask(args.masks, generator=torch.Generator().manual_seed(args.seed)), make_camera(args, scene)
     ).to(device)
     image, depth = scene.image.to(device), scene.depth.to(device)
+    optics.check_scene(image, depth)  # once: captures that are measured keep quiet
     name = f"dead leaves, seed {args.seed}" if args.image is None else Path(args.image).name
     conditions = Conditions.here_and_now(name, optics, image, depth, args.reference)
     settings = _settings(args, optics, image, depth)

@@ -18,6 +18,10 @@ from kornia_tidy.data.metadata import with_text
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
+from kornia_tidy.units import tell_once
+
+UNKNOWN = 65535  # the largest number of 16 bits: how many data sets mark what no sensor saw
+NEAR_DISPARITY = 5.0  # pixels of disparity are more than this, metres of a room less
 
 
 class DepthMap(NamedTuple):
@@ -65,6 +69,8 @@ def read_depth(
           disparity that is infinite or, with d added, negative.
         - Infinite depth is a valid sky, and so is a floating-point disparity that is 0 with d added. Name them in
           ``invalid`` where a data set means *unknown* by them.
+        - What looks like an unknown that was not named is warned of once a folder: a 65535 that stands alone, and in a
+          PFM file infinity that lies below numbers as large as disparities.
         - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
 
     Example:
@@ -80,6 +86,7 @@ def read_depth(
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
     stored = stored[..., 0]
+    _tell_of_unknown(path, stored, kind, invalid)
     known = stored != 0 if stored.dtype.kind in "ui" else ~np.isnan(stored)
     for value in invalid:
         known &= stored != value
@@ -92,6 +99,38 @@ def read_depth(
     if not known.any():
         raise ValueError(f"cannot read {path}: it has no valid {kind} at any pixel")
     return DepthMap(torch.from_numpy(fill_holes(depth, known))[None], torch.from_numpy(known)[None])
+
+
+def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: str, invalid: Collection[float]) -> None:
+    """Warn once a folder of values that usually mean *unknown* and would be read as depths."""
+    if kind != "depth":
+        return
+    path = Path(path)
+    if stored.dtype == np.uint16 and UNKNOWN not in invalid and bool((full := stored == UNKNOWN).any()):
+        others = int(stored[~full].max(initial=0))
+        # Where depths go on up to the end, or the file says what its end means, it is one of them.
+        if others < 0.9 * UNKNOWN and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
+            tell_once(
+                None,
+                ("65535", path.parent),
+                f"{path} holds {UNKNOWN} where its other values end at {others}, and it is taken for a depth: if it "
+                f"means 'unknown', give invalid=[{UNKNOWN}] (--invalid {UNKNOWN})",
+                stacklevel=4,
+            )
+    if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):
+        endless = np.isinf(stored)
+        # A sky reaches up to the top of the picture, holes of stereo lie below something: 96 to 100 % in Middlebury's.
+        holes = endless & np.maximum.accumulate(~endless, axis=0)
+        known = stored[np.isfinite(stored)]
+        if 2 * holes.sum() > endless.sum() and np.median(known) > NEAR_DISPARITY:
+            tell_once(
+                None,
+                ("inf", path.parent),
+                f"{path} holds infinity, which is taken for a depth in metres: if it is a disparity, as Middlebury's, "
+                f"give kind='disparity' and invalid=[inf] with its calibration (--depth-kind disparity --invalid inf); "
+                f"if infinity means 'unknown', invalid=[inf]",
+                stacklevel=4,
+            )
 
 
 def check_depth_options(

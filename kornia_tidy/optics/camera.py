@@ -8,9 +8,13 @@ from typing import overload
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_depth, check_positive
+from kornia_tidy.checks import check_depth, check_metres, check_number, check_part, check_positive
 from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+
+FASTEST = 0.5  # f-number of a numerical aperture of 1: no lens in air opens wider
+# Lengths in metres, from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
+FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
 
 
 def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: float | Tensor) -> Tensor:
@@ -41,6 +45,16 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     scale = math.pi * aperture_radius**2 / REFERENCE_WAVELENGTH
     # Inverse depth: infinity is a plain zero.
     return (scale * (_at_least_float32(depth).reciprocal() - 1 / _at_least_float32(focus_distance))).to(depth.dtype)
+
+
+def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
+    """Return the nearest and farthest depth of a range, or raise."""
+    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
+        raise TypeError(f"depth_range must be two numbers, (near, far) in metres, got {value!r}")
+    near, far = value
+    if not 0 < near < far:
+        raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {(near, far)}")
+    return near, far
 
 
 def _number(value: float | Tensor) -> float:
@@ -74,7 +88,9 @@ class ThinLensCamera(nn.Module):
         - ``defocus(depth)``: any shape to the same shape.
 
     Raises:
-        ValueError: if a length is not positive, or the focus distance is not beyond the focal length.
+        ValueError: if a length is not one in metres (focal length 0.01 mm to 10 m, pixels 0.1 um to 1 mm), the lens is
+            faster than f/0.5, or the focus distance is not beyond the focal length.
+        TypeError: if an argument is of another type.
 
     Convention:
         - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus.
@@ -102,9 +118,17 @@ class ThinLensCamera(nn.Module):
         lens_material: Material | None = None,
     ) -> None:
         super().__init__()
-        check_positive("focal_length", focal_length, "metres")
-        check_positive("aperture_diameter", aperture_diameter, "metres")
-        check_positive("pixel_pitch", pixel_pitch, "metres")
+        check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+        check_metres("aperture_diameter", aperture_diameter, *DIAMETERS, "2.8 mm is 2.8e-3")
+        check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
+        check_number("focus_distance", focus_distance, "metres")
+        if focal_length < FASTEST * aperture_diameter * (1 - 1e-9):
+            raise ValueError(
+                f"aperture_diameter must be at most {focal_length / FASTEST:g} m, which is f/{FASTEST}, for a focal "
+                f"length of {focal_length:g} m, got {aperture_diameter:g} (2.8 mm is 2.8e-3)"
+            )
+        if lens_material is not None:
+            check_part("lens_material", lens_material, Material, "a material such as kornia_tidy.optics.PMMA")
         focus = _number(focus_distance)
         if not focus > focal_length:
             raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
@@ -118,9 +142,7 @@ class ThinLensCamera(nn.Module):
             self.focus_distance = nn.Parameter(focus_distance.detach().clone())
         if depth_range is None and math.isinf(focus):
             raise ValueError("a camera focused at infinity needs depth_range=(near, far) in metres, got None")
-        near, far = depth_range if depth_range is not None else (focus / 2, math.inf)
-        if not 0 < near < far:
-            raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {(near, far)}")
+        near, far = _depth_range(depth_range) if depth_range is not None else (focus / 2, math.inf)
         self.depth_range = (near, far)
         scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
         # Kept as numbers: the nodes of a PSF bank stay where they are while a learnable focus moves.
@@ -257,16 +279,20 @@ class ThinLensCamera(nn.Module):
             >>> camera.defocus(torch.tensor([0.5, 4.0])).round(decimals=3)
             tensor([ 20., -20.])
         """
-        near, far = depth_range
+        near, far = _depth_range(depth_range)
         lo, hi = defocus_range
-        if not 0 < near < far:
-            raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {depth_range}")
         if not (lo <= 0 <= hi and lo < hi):
             raise ValueError(f"defocus_range must be (lo, hi) with lo <= 0 <= hi and lo < hi, got {defocus_range}")
         scale = (hi - lo) / (1 / near - 1 / far)
         inverse_focus = 1 / far - lo / scale
         focus = math.inf if inverse_focus == 0 else 1 / inverse_focus
         radius = math.sqrt(scale * REFERENCE_WAVELENGTH / math.pi)
+        if focal_length < FASTEST * 2 * radius:
+            raise ValueError(
+                f"depths from {near:g} to {far:g} m need an aperture of {2 * radius:.3g} m for a defocus from {lo:g} "
+                f"to {hi:g} rad, and a focal length of {focal_length:g} m allows {focal_length / FASTEST:g} m: if they "
+                f"are millimetres, multiply them by 0.001 (--depth-scale 0.001); else ask for less defocus"
+            )
         return cls(focal_length, 2 * radius, focus, pixel_pitch, depth_range, lens_material)
 
     def extra_repr(self) -> str:
@@ -292,6 +318,7 @@ class DefocusRange(nn.Module):
 
     Raises:
         ValueError: if ``lo`` is not below ``hi``.
+        TypeError: if ``lens`` is not a ThinLensCamera.
 
     Convention:
         - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus, so 1 is nearest.
@@ -310,6 +337,7 @@ class DefocusRange(nn.Module):
             raise ValueError(f"a defocus range must be finite with lo < hi, got lo={lo}, hi={hi}")
         self.defocus_range = (float(lo), float(hi))
         self.lens = ThinLensCamera() if lens is None else lens
+        check_part("lens", self.lens, ThinLensCamera, "a ThinLensCamera")
 
     @property
     def aperture_radius(self) -> float:
@@ -340,7 +368,10 @@ class DefocusRange(nn.Module):
             lowest, highest = torch.aminmax(depth.detach())
             if not bool((lowest >= 0) & (highest <= 1)):  # False for NaN too
                 bad = depth[~((depth >= 0) & (depth <= 1))][0].item()
-                raise ValueError(f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}")
+                raise ValueError(
+                    f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}: metres need a "
+                    f"ThinLensCamera"
+                )
         lo, hi = self.defocus_range
         return (lo + (hi - lo) * _at_least_float32(depth)).to(depth.dtype)
 

@@ -10,19 +10,22 @@ from functools import partial
 from math import ceil, floor, pi
 from typing import Any, ClassVar, Literal, NoReturn, Self, cast, overload
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera_settings import digest_of, settings_of, take_over
 from kornia_tidy.camera_state import CameraState
+from kornia_tidy.checks import check_finite, check_part
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.following import is_followed, refuse_torchscript
+from kornia_tidy.following import is_followed, is_value_unknown, refuse_torchscript
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
 from kornia_tidy.optics.bank_memory import BankMemory
 from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
+from kornia_tidy.optics.lens_limits import PARTS, check_defocus_range
 from kornia_tidy.optics.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
@@ -31,7 +34,6 @@ from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.state_bank import StateBank
 
-_PARTS = ("masks", "camera", "modulator", "spectrum", "fidelity")
 _READS = 100  # of masks that another thread changes all the time; what is read last is taken
 
 
@@ -51,13 +53,18 @@ class CodedLens(CameraState):
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
             Default: the binary disc.
 
+    Raises:
+        TypeError: if a part is of another type.
+        ValueError: if the camera's defocus needs more than 4096 layers or PSFs eight times as wide as the largest
+            window, or a mask holds NaN.
+
     Example:
         >>> lens = CodedLens()
         >>> lens.psf_bank(defocus=[-10.0, 0.0]).psfs.shape[:2]
         torch.Size([2, 3])
     """
 
-    _SETTABLE: ClassVar = {**dict(zip(_PARTS, _PARTS, strict=True)), "aperture": "_aperture"}  # settings: attributes
+    _SETTABLE: ClassVar = {**dict(zip(PARTS, PARTS, strict=True)), "aperture": "_aperture"}  # settings: attributes
 
     _moment: int | None = None  # the one moment looked at, if not the whole exposure
     _state: int | None = None  # the one state looked through, if not all
@@ -76,11 +83,13 @@ class CodedLens(CameraState):
         aperture: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        self.fidelity = Fidelity.of(fidelity)
         self.masks = PixelwiseMask() if masks is None else masks
         self.camera = ThinLensCamera() if camera is None else camera
         self.modulator = DwellTimes() if modulator is None else modulator
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
+        if aperture is not None:
+            check_part("aperture", aperture, (Tensor, np.ndarray), "a tensor of amplitudes (N, N) such as 23x23")
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
         # Of each moment and state, and of their averages.
         self._memories: dict[tuple[int | None, int | None], BankMemory] = {}
@@ -169,7 +178,7 @@ class CodedLens(CameraState):
             fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
         """
         other = self._sharing_parts()
-        other.fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
+        other.fidelity = Fidelity.of(fidelity)
         return other
 
     def through_state(self, state: int) -> Self:
@@ -294,6 +303,7 @@ class CodedLens(CameraState):
 
     def _check_layers(self) -> None:
         settings = self.fidelity
+        check_defocus_range(self.camera.defocus_range, self._pixel_step(), settings, self._fixed_window)
         if settings.layers == "bandlimited" and settings.layer_spacing >= (limit := pi / self._band()):
             raise ValueError(
                 f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
@@ -351,9 +361,10 @@ class CodedLens(CameraState):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; a part that shapes the PSFs makes wavelengths, window and pupil to be found anew."""
-        if name not in _PARTS:
+        if name not in PARTS:
             super().__setattr__(name, value)
             return
+        check_part(name, value, *PARTS[name])
         with self._lock:
             if name in ("spectrum", "fidelity"):
                 both = {**self.__dict__, name: value}
@@ -441,6 +452,9 @@ class CodedLens(CameraState):
         tolerance: float,
         nodes: tuple[float, ...],
     ) -> PSFBank:
+        if not is_value_unknown():
+            check_finite("the phase of the masks", states)
+            check_finite("the weights of the modulator", weights)
         dispersion, shift = self._colours(spectrum)
         if self.fidelity.propagation == "paper":
             if self.pupil.fill_factor != 1:
@@ -507,13 +521,13 @@ class CodedLens(CameraState):
         """A sensor pixel seen from the pupil, in metres: see :func:`exact_psf_bank`."""
         return self.camera.pixel_pitch * self.camera.aperture_radius / self.camera.image_distance
 
-    def _spectrum(self, channels: int) -> Spectrum:
+    def _spectrum(self, channels: int, remedy: str = "") -> Spectrum:
         if channels == len(self.spectrum.weights):
             return self._seen
         if channels == 1:
             return Spectrum.monochrome()
         raise ValueError(
-            f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}"
+            f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )
 
 

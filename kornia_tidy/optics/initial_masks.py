@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_generator
 from kornia_tidy.optics.phase_masks import PixelwiseMask, ZernikeMask
 from kornia_tidy.optics.phase_masks.base import mask_axes
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -99,6 +99,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
         torch.Size([5, 23, 23])
     """
     check_choice("start", start, STARTS)
+    check_generator(generator)
     uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(5, 23, 23, generator=generator, dtype=torch.float64)
     if start == "noise":
         return uniform

@@ -9,6 +9,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.checks import check_part, described
+
 
 class Timeline(NamedTuple):
     r"""What a modulator shows during one exposure: moments that follow one another, and in each of them its states.
@@ -127,6 +129,7 @@ class DwellTimes(Modulator):
 
     def __init__(self, shares: Sequence[float] | None = None) -> None:
         super().__init__()
+        _check_numbers(shares)
         if shares is not None and not (sum(shares) > 0 and all(0 <= s < math.inf for s in shares)):
             raise ValueError(f"dwell shares must be finite, not negative and not all zero, got {tuple(shares)}")
         self.shares = None if shares is None else tuple(s / sum(shares) for s in shares)
@@ -166,6 +169,7 @@ class LearnableDwellTimes(Modulator):
 
     def __init__(self, shares: Sequence[float]) -> None:
         super().__init__()
+        _check_numbers(shares)
         if not shares or not all(0 < s < math.inf for s in shares):
             raise ValueError(f"dwell shares to learn must be positive and finite, got {tuple(shares)}")
         self.logits = nn.Parameter(torch.tensor([math.log(s) for s in shares]))
@@ -228,7 +232,7 @@ class SpatialLightModulator(Modulator):
             :class:`~kornia_tidy.optics.phase_panel.PixelCrosstalk`, and one that gives states and weights, such as
             :class:`DwellTimes` or :class:`~kornia_tidy.optics.switching.Switching`. What turns masks and stands after
             that one turns all that is shown. A :class:`DiffractionEfficiency` may stand anywhere, and alone means
-            equal dwell times.
+            equal dwell times, as no part at all does.
         fill_factor: share of the area of each pixel that modulates: a square in its middle. Light through the gaps
             between the squares passes with phase zero; see :func:`~kornia_tidy.optics.exact.exact_psf_bank`.
 
@@ -257,7 +261,9 @@ class SpatialLightModulator(Modulator):
         super().__init__()
         if not 0 < fill_factor <= 1:
             raise ValueError(f"fill_factor must be above 0 and at most 1, got {fill_factor}")
-        self.parts = nn.Sequential(*parts)
+        for part in parts:
+            check_part("each part of a modulator", part, nn.Module, "a module such as GreyLevels(8) or DwellTimes()")
+        self.parts = nn.Sequential(*(parts or (DwellTimes(),)))
         self.fill_factor = fill_factor
 
     def timeline(self, phase: Tensor) -> Timeline:
@@ -298,6 +304,11 @@ class SpatialLightModulator(Modulator):
     def extra_repr(self) -> str:
         """Describe the panel in a person's words."""
         return f"fill factor {self.fill_factor:g}"
+
+
+def _check_numbers(shares: object) -> None:
+    if shares is not None and not (isinstance(shares, Sequence) and all(isinstance(s, int | float) for s in shares)):
+        raise TypeError(f"dwell shares must be a number for each mask, such as (3, 1), got {described(shares)}")
 
 
 def _check_count(shares: int, masks: int) -> None:

@@ -11,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.files import read_bytes, write_bytes
 
 STRAY_LIGHT = ("renormalize", "veil", "discard")
@@ -117,7 +117,7 @@ class PSFBank:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if the file is not a PSF bank.
+            ValueError: if the file is not a PSF bank, or a value is NaN or infinite.
         """
         read_bytes(path)  # missing, a folder or empty: say so
         try:
@@ -129,6 +129,8 @@ class PSFBank:
             raise ValueError(f"{path} is not a readable PSF bank: {error}") from None
         if form != _FORMAT or not {"psfs", "defocus", "energy"} <= set(tensors) <= {*_FIELDS}:
             raise ValueError(f"{path} is not a PSF bank: its format is {form!r} with {sorted(tensors)}")
+        for name, value in tensors.items():
+            check_finite(f"{name} of {path}", value)
         return cls(**tensors)
 
     @classmethod
@@ -142,6 +144,7 @@ class PSFBank:
         Raises:
             ValueError: if a value is negative or not finite, a PSF holds no light, or the nodes do not ascend.
         """
+        check_finite("defocus of measured psfs", defocus)
         if not bool((torch.isfinite(psfs) & (psfs >= 0)).all()):
             raise ValueError(f"measured psfs must be finite and not negative, got a minimum of {float(psfs.min())}")
         if not bool((defocus.diff() > 0).all()):

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.checks import check_choice, check_number, check_positive
 from kornia_tidy.optics.modulator import DwellTimes, Modulator, Timeline, timeline_of
 from kornia_tidy.optics.propagation import gauss_legendre
 
 BETWEEN = ("random", "linear", "exponential")
+SLOWEST = 10.0  # s; what turns a plate by a motor takes less
 SETTLED = 0.99  # share of a step done at the end of the switching time, where the response is exponential
 
 
@@ -83,8 +84,12 @@ class Switching(Modulator):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if not 0 <= switching_time < math.inf:
-            raise ValueError(f"switching_time must be zero or positive and finite seconds, got {switching_time}")
+        check_number("switching_time", switching_time, "seconds")
+        if not 0 <= switching_time <= SLOWEST:
+            raise ValueError(
+                f"switching_time must be zero or positive seconds up to {SLOWEST:g} (4 ms is 4e-3), got "
+                f"{switching_time}"
+            )
         check_positive("exposure", exposure, "seconds")
         check_positive("samples", samples)
         if isinstance(between, str):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.following import is_value_unknown
+from kornia_tidy.units import check_head_image, layout_remedy
 
 
 class ReconstructionHead(nn.Module, ABC):
@@ -26,6 +29,7 @@ class ReconstructionHead(nn.Module, ABC):
         TypeError: if the image is not a floating-point tensor.
 
     Convention:
+        - The first image is looked at: one in 0..255 or normalised is warned about, as captures are in [0, 1].
         - An image whose sides are no multiples of ``stride`` is continued at its borders, half of what is missing on
           each side, and the result is cropped. It is continued by reflection, which makes no edge where there is
           none; where a side is too short to be reflected that far, by repeating the outermost pixels.
@@ -33,6 +37,7 @@ class ReconstructionHead(nn.Module, ABC):
     """
 
     stride: int
+    _looked = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -45,7 +50,12 @@ class ReconstructionHead(nn.Module, ABC):
         """Return the estimated maps, (B, out_channels, H, W)."""
         check_float_tensor("image", image, 4, "(B, C, H, W)")
         if image.shape[1] != self.in_channels:
-            raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}")
+            remedy = layout_remedy(tuple(image.shape), self.in_channels)
+            raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}{remedy}")
+        if not self._looked and not is_value_unknown():
+            self._looked = True  # at the first image only: a look waits for the device
+            if (said := check_head_image(image)) is not None:
+                warnings.warn(said, stacklevel=4)
         height, width = image.shape[-2:]
         (left, right, top, bottom), mode = border_padding((height, width), self.stride)
         if bottom or right:

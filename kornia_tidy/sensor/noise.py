@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_float_tensor, check_positive
+from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_number, check_positive
 from kornia_tidy.sensor.shot import shot_noise
 
 
@@ -198,6 +198,7 @@ class SensorNoise(nn.Module):
             ['read', 'shot']
         """
         check_choice("dtype", dtype, (torch.float32, torch.float64))
+        check_generator(generator)
         source = device if generator is None else generator.device
         samplers = {"read": torch.randn, "shot": torch.rand}
         *outer, height, width = shape
@@ -237,5 +238,6 @@ def _check_bits(bits: int) -> None:
 
 
 def _check_not_negative(name: str, value: float, unit: str) -> None:
+    check_number(name, value, unit)
     if not 0 <= value < float("inf"):
         raise ValueError(f"{name} must be zero or positive and finite, {unit}, got {value}")

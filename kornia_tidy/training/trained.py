@@ -152,7 +152,7 @@ def below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -> None:
-    """Raise ``ValueError`` unless weights fit a module, naming what does not.
+    """Raise ``ValueError`` unless weights fit a module and are finite, naming what does not.
 
     Example:
         >>> check_weights(nn.Linear(2, 1), {"weight": torch.ones(1, 3)}, "a.safetensors")
@@ -171,6 +171,11 @@ def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -
         f"{key} is {tuple(weights[key].shape)}, wanted {tuple(value.shape)}"
         for key, value in own.items()
         if key in weights and weights[key].shape != value.shape
+    ]
+    faults += [
+        f"{key} holds NaN or infinity"
+        for key, value in weights.items()
+        if value.is_floating_point() and not bool(value.isfinite().all())
     ]
     if faults:
         raise ValueError(f"{name} does not fit: {'; '.join(faults[:4])}{' ...' if len(faults) > 4 else ''}")

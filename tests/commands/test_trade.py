@@ -49,6 +49,16 @@ class TestTrade(BaseTester):
         assert {p.name for p in folder.iterdir()} == {"trade.json", "trade.csv", "trade.png"}
         assert all(str(path) in told for path in folder.iterdir())
 
+    @pytest.mark.filterwarnings("default")
+    def test_feature_other_units_are_told(self, tmp_path, capsys, measured):
+        write_image(tmp_path / "image.png", torch.rand(3, 48, 48))
+        write_depth(tmp_path / "depth.png", torch.full((1, 48, 48), 1.1), 0.001)
+        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.png")]
+        assert main(["trade", *QUICK[2:], *KNOBS, *files, "-o", str(tmp_path / "new")]) == 0
+        told = [line for line in capsys.readouterr().err.splitlines() if "millimetres" in line]
+        assert len(told) == 1
+        assert told[0].startswith("kornia-tidy: warning: the nearest pixel is 1100 m away")
+
     def test_feature_an_interrupted_run_goes_on(self, tmp_path, monkeypatch, capsys, measured):
         def interrupted(*args, **kwargs):
             rows = real_sweep(*args, **kwargs)

@@ -25,8 +25,8 @@ def save(path, values, dtype):
 
 class TestReadDepth(BaseTester):
     def test_feature_millimetres(self, tmp_path):
-        depth, valid = read_depth(save(tmp_path / "a.npy", [1, 1500, 65535], np.uint16), 0.001)
-        self.assert_close(depth, torch.tensor([[[0.001, 1.5, 65.535]]]), rtol=1e-6, atol=0)
+        depth, valid = read_depth(save(tmp_path / "a.npy", [1, 1500, 65534], np.uint16), 0.001)
+        self.assert_close(depth, torch.tensor([[[0.001, 1.5, 65.534]]]), rtol=1e-6, atol=0)
         assert valid.all()
         assert depth.dtype == torch.float32
         assert valid.dtype == torch.bool

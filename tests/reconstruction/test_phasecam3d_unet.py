@@ -45,5 +45,5 @@ class TestPhaseCam3DUNet(BaseTester):
 
     def test_feature_outputs_lie_between_zero_and_one(self, device, dtype):
         head = PhaseCam3DUNet(width=2, out_channels=2).to(device, dtype)
-        out = head(100 * torch.randn(2, 3, 32, 32, device=device, dtype=dtype))
+        out = head.predict(100 * torch.randn(2, 3, 32, 32, device=device, dtype=dtype))
         assert 0 < out.min() < 0.5 < out.max() < 1

@@ -8,13 +8,15 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.checks import check_choice, check_generator, check_metres, check_positive
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.optics.phase_masks.limits import CONSTRAINTS, limited_phase
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 MASK_SPAN = 2.3  # pupil radii across a mask's shorter side: the paper's 23 pixels of a tenth of a radius
 NOISE_RMS = 2.05  # radians at 530 nm: that of the paper's start, heights uniform on [0, 1.2e-6] m at index 1.5
+HEIGHTS = (1e-9, 1e-3)  # m; what an element or a panel may be high
+HEIGHT_STEPS = (1e-15, 1e-4)  # m; what a step of learning may move
 
 Size = int | tuple[int, int]
 """Pixels of a mask: along both sides, or (rows, columns)."""
@@ -72,7 +74,7 @@ class PhaseMasks(nn.Module):
         check_choice("constraint", constraint, CONSTRAINTS)
         self.material = constant_index(1.5) if material is None else material
         if max_height is not None:
-            check_positive("max_height", max_height, "metres")
+            check_metres("max_height", max_height, *HEIGHTS, "1 um is 1e-6")
             if constraint == "none":
                 raise ValueError(f"max_height needs a constraint, 'clamp', 'sigmoid' or 'wrapped', got {max_height}")
         self.constraint = constraint
@@ -201,6 +203,7 @@ def initial_values(
         if not bool(torch.isfinite(values).all()):
             raise ValueError("initial values must be finite, got NaN or infinity")
         return values.detach().to(torch.get_default_dtype(), copy=True)
+    check_generator(generator)
     check_positive("num_masks", num_masks)
     check_choice("initial", initial, ("noise", "flat"))
     if initial == "flat":
@@ -230,7 +233,7 @@ def adam_groups(masks: nn.Module, lr_metres: float, **options: float) -> dict[st
         >>> round(adam_groups(PixelwiseMask(), 1e-8)["lr"], 4)
         0.0593
     """
-    check_positive("lr_metres", lr_metres, "metres")
+    check_metres("lr_metres", lr_metres, *HEIGHT_STEPS, "10 nm is 10e-9")
     material = cast("PhaseMasks", masks).material
     return {
         "params": list(masks.parameters()),

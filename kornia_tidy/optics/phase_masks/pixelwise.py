@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.checks import check_choice, check_generator, check_positive
 from kornia_tidy.optics.materials import Material
-from kornia_tidy.optics.phase_masks.base import PhaseMasks, Size, mask_axes, metres_to_radians
+from kornia_tidy.optics.phase_masks.base import HEIGHTS, PhaseMasks, Size, mask_axes, metres_to_radians
 from kornia_tidy.optics.phase_masks.limits import unlimited_phase
 
 
@@ -60,8 +60,13 @@ class PixelwiseMask(PhaseMasks):
             mask_axes((heights.shape[1], heights.shape[2]))  # refuses what cannot be centred on the pupil
             if not bool(torch.isfinite(heights).all()):
                 raise ValueError("initial heights must be finite metres, got NaN or infinity")
+            if (highest := float(heights.detach().abs().max())) > HEIGHTS[1]:
+                raise ValueError(
+                    f"initial heights must be metres within {HEIGHTS[1]:g} (1 um is 1e-6), got {highest:g}"
+                )
             phase = (heights.detach().double() * to_radians).to(torch.get_default_dtype())
         else:
+            check_generator(generator)
             check_positive("num_masks", num_masks)
             check_choice("initial", initial, ("noise", "flat"))
             y, x = mask_axes(size)

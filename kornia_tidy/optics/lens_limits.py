@@ -1,0 +1,59 @@
+"""What a coded lens may be made of, and how much defocus its PSFs can hold."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor, nn
+
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+
+PARTS: dict[str, tuple[type, str, str]] = {
+    "masks": (nn.Module, "phase masks such as PixelwiseMask(5)", "dispersion"),
+    "camera": (nn.Module, "a camera such as ThinLensCamera() or DefocusRange()", "chromatic_defocus"),
+    "modulator": (nn.Module, "a modulator such as DwellTimes()", ""),
+    "spectrum": (Spectrum, "a Spectrum such as Spectrum.rgb()", ""),
+    "fidelity": (Fidelity, "a Fidelity such as Fidelity.preset('balanced')", ""),
+}
+"""Of each part its type, an example for people, and an attribute that its type must have."""
+
+WIDEST_BLUR = 8  # times the largest window: one that wide holds a fiftieth of the light, 1 / (pi / 4 * 64)
+MOST_LAYERS = 4096
+
+
+def check_defocus_range(
+    defocus_range: tuple[float, float], step: float | Tensor, fidelity: Fidelity, window: int | None
+) -> None:
+    """Refuse a range of defocus whose PSFs would take minutes and gigabytes, before any work.
+
+    Out of focus a point is a disc, by rays of diameter ``2 |psi| 530 nm / (pi s)`` pixels: the gradient of the phase
+    ``psi rho^2`` at the edge of the pupil.
+
+    Args:
+        defocus_range: in radians.
+        step: s, a sensor pixel seen from the pupil in metres.
+        fidelity: how many layers, and the largest window.
+        window: side of the PSFs in pixels if it is fixed.
+
+    Raises:
+        ValueError: if there are more than 4096 layers, or a disc is wider than 8 of the largest windows.
+
+    Example:
+        >>> check_defocus_range((-20.0, 20.0), 2.1e-7, Fidelity(), None)
+        >>> check_defocus_range((-19375.0, 19375.0), 2e-7, Fidelity(), None)
+        Traceback (most recent call last):
+        ValueError: a defocus from -1.938e+04 to 1.938e+04 rad needs 19375 layers of PSFs 32686 px wide, of which at \
+most 4096 and 520 px are allowed: give lengths in metres, choose a smaller aperture or depth_range, or raise \
+Fidelity.max_window or layer_spacing
+    """
+    lo, hi = defocus_range
+    size = float(step.detach()) if isinstance(step, Tensor) else step
+    blur, layers = 2 * max(-lo, hi) * REFERENCE_WAVELENGTH / (math.pi * size), (hi - lo) / fidelity.layer_spacing
+    widest = WIDEST_BLUR * max(window or 0, fidelity.max_window)
+    if blur > widest or layers > MOST_LAYERS:
+        raise ValueError(
+            f"a defocus from {lo:.4g} to {hi:.4g} rad needs {layers:.0f} layers of PSFs {blur:.0f} px wide, of which "
+            f"at most {MOST_LAYERS} and {widest} px are allowed: give lengths in metres, choose a smaller aperture or "
+            f"depth_range, or raise Fidelity.max_window or layer_spacing"
+        )
