@@ -72,6 +72,7 @@ def moving_capture(
     check_float_tensor("depths", depths, images.ndim, "(B, S, 1, H, W) or (S, 1, H, W), as images are batched or not")
     if not batched:
         images, depths = images[None], depths[None]
+    optics = optics._now(images)  # all states are of the masks of one moment
     wide = optics.fidelity.double or images.dtype == torch.float64
     dtype = torch.float64 if wide else torch.float32
     with torch.autocast(images.device.type, enabled=False):

@@ -88,6 +88,7 @@ def burst(
     batched = image.ndim != 3
     if not batched:
         image, depth = image[None], depth[None]
+    optics = optics._now(image)  # all shots see the masks of one moment
     light = optics.decode(image)
     shots = []
     for k, share in enumerate(burst_shares(_dwell_shares(optics), dead_time, exposure)):
