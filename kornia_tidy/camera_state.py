@@ -26,7 +26,7 @@ class CameraState(nn.Module):
     - without weights of this camera leaves it as it is.
 
     The entry is never counted among the missing keys, so that masks alone and files of earlier versions load with
-    ``strict=True``. In a larger module's state it stands under the camera's prefix; PyTorch's ``load_state_dict`` of that
+    ``strict=True``. In a larger module's state it stands under the camera's prefix, and ``load_state_dict`` of that
     module obeys the same rules. To take settings over there, load the camera's part of the state into the camera first.
     """
 
