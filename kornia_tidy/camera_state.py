@@ -26,7 +26,9 @@ class CameraState(nn.Module):
     - without that entry, such as masks alone, loads the weights and measures the window anew for them;
     - without weights of this camera leaves it as it is.
 
-    Weights have no such entry where they are part of a larger module's state that lacks it; that is no missing key.
+    The entry is never counted among the missing keys, so that masks alone and files of earlier versions load with
+    ``strict=True``. In a larger module's state it stands under the camera's prefix, and ``load_state_dict`` of that
+    module obeys the same rules. To take settings over there, load the camera's part of the state into the camera first.
     """
 
     fidelity: Fidelity

@@ -74,10 +74,10 @@ def moving_capture(
     optics._check_values(images)
     if not batched:
         images, depths = images[None], depths[None]
+    optics = optics._now(images)  # every moment is of the same masks
     wide = optics.fidelity.double or images.dtype == torch.float64
     dtype = torch.float64 if wide else torch.float32
     with torch.autocast(images.device.type, enabled=False):
-        optics = optics.snapshot(dtype)  # every moment is of the same masks
         durations = optics.timeline(dtype).durations
         for name, scenes in (("images", images), ("depths", depths)):
             if scenes.shape[1] != len(durations):

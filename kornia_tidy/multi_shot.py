@@ -87,8 +87,7 @@ def burst(
         torch.Size([2, 3, 80, 80])
     """
     image, depth, batched = optics._checked(image, depth)
-    wide = optics.fidelity.double or image.dtype == torch.float64
-    optics = optics.snapshot(torch.float64 if wide else torch.float32)  # every shot is of the same masks
+    optics = optics._now(image)  # all shots see the masks of one moment
     light = optics.decode(image)
     shots = []
     for k, share in enumerate(burst_shares(_dwell_shares(optics, light.dtype), dead_time, exposure)):

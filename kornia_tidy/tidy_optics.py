@@ -93,6 +93,9 @@ class TiDyOptics(CodedLens):
         - Noise comes from the global generator, from ``generator=``, or from ``params=`` drawn before by
           :meth:`draw`. ``eval()`` does not switch it off: a camera has noise at test time too.
         - The capture is detached inside a DataLoader's worker, and only there; see :meth:`as_transform`.
+        - Threads may share a camera: each capture sees masks, parts and window as they are at one moment. The order in
+          which threads draw from the global generator is open: give each capture its ``generator=``.
+        - ``state_dict()`` holds settings and PSF window too; see :class:`~kornia_tidy.camera_state.CameraState`.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023.
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.motion import moving_capture
 from kornia_tidy.multi_shot import burst
 from kornia_tidy.optics import coded_lens as module
 from kornia_tidy.optics.phase_masks import ZernikeMask
@@ -232,6 +233,25 @@ class TestThreads(BaseTester):
         with one_thread_each(), torch.no_grad():
             expected, shots = optics(*SAMPLES[0]), burst(optics, *SAMPLES[0])
             assert all(in_threads(work))
+
+    @pytest.mark.parametrize("several", ["burst", "moving scene"])
+    def test_feature_all_shots_of_a_burst_are_of_one_moment(self, several, monkeypatch):
+        """Masks that change after the first shot are seen by the next burst."""
+
+        def take() -> Tensor:
+            image, depth = SAMPLES[0]
+            if several == "burst":
+                return burst(optics, image, depth)
+            return moving_capture(optics, torch.stack([image] * 2, 1), torch.stack([depth] * 2, 1))
+
+        optics, real = camera(), TiDyOptics._expose
+        with torch.no_grad():
+            expected = take()
+            monkeypatch.setattr(
+                TiDyOptics, "_expose", lambda self, *given: (real(self, *given), optics.masks.phase.add_(1))[0]
+            )
+            assert torch.equal(take(), expected)
+            assert not torch.equal(take(), expected)
 
     def test_feature_a_part_of_all_kinds_is_read_at_one_moment(self):
         """Masks and dwell times made of parameters that an optimiser moves in place."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -25,16 +24,16 @@ from kornia_tidy.optics.camera import DefocusRange, ThinLensCamera
 from kornia_tidy.optics.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.optics.exact import exact_psf_bank
 from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
+from kornia_tidy.optics.fitted_window import fitted_window
 from kornia_tidy.optics.lens_limits import PARTS, check_defocus_range
 from kornia_tidy.optics.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks, PixelwiseMask, central_square
-from kornia_tidy.optics.psf_bank import PSFBank, enclosing_window
+from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
+from kornia_tidy.optics.settled_timeline import settled_timeline
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.state_bank import StateBank
-
-_READS = 100  # of masks that another thread changes all the time; what is read last is taken
 
 
 class CodedLens(CameraState):
@@ -270,7 +269,7 @@ class CodedLens(CameraState):
         if self._shown is not None or is_followed():
             return self
         with self._lock:
-            shown = _settled(self.masks, self.modulator, dtype)
+            shown = settled_timeline(self.masks, self.modulator, dtype)
             if self._window is None:
                 self.fit_window()
             _ = self.pupil  # found here, once for all threads
@@ -339,17 +338,7 @@ class CodedLens(CameraState):
             energy = self._bank.energy
             return self._bank.window, (float(energy.min()), float(energy.max())), True
         self._check_layers()
-        settings, fixed = self.fidelity, self._fixed_window
-        size = fixed or min(33, settings.max_window)
-        while True:
-            psfs = self._sampled_psfs(size)
-            window = fixed or enclosing_window(psfs, settings.enclosed_energy)
-            if window is not None or size == settings.max_window:
-                break
-            size = min(2 * size - 1, settings.max_window)
-        margin = (size - (window or size)) // 2
-        shares = psfs[..., margin : size - margin, margin : size - margin].sum((2, 3))
-        return window or size, (float(shares.min()), float(shares.max())), window is not None
+        return fitted_window(self._sampled_psfs, self.fidelity, self._fixed_window)
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:
@@ -529,15 +518,3 @@ class CodedLens(CameraState):
         raise ValueError(
             f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )
-
-
-def _settled(masks: PhaseMasks, modulator: nn.Module, dtype: torch.dtype) -> Timeline:
-    """Return a copy of what is shown, made while no other thread changed the masks."""
-    alone = threading.active_count() == 1
-    for _ in range(_READS):
-        before = [] if alone else [p.detach().clone() for part in (masks, modulator) for p in part.parameters()]
-        shown = timeline_of(modulator, masks.phase.to(dtype)).map(Tensor.clone)
-        after = [] if alone else [p for part in (masks, modulator) for p in part.parameters()]
-        if all(map(torch.equal, before, after)):
-            break
-    return shown
