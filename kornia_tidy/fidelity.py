@@ -46,8 +46,8 @@ class Fidelity:
     mean, at most by the share of stray light times the contrast. With ``"zero"`` only as much is spread as stays in the
     image (:func:`kornia_tidy.scene.stray_light.share_within`), which is nothing for a window of
     ``2 * max(height, width) - 1`` pixels: then nothing is left out. Of the other choices, ``"renormalize"`` gives white
-    right but for ``"zero"`` (3.3e-2 with the random mask), and ``"discard"`` darkens it by all that is lost (3.8e-2) but
-    for ``"zero"`` (2.1e-3). With ``"valid"`` nobody knows what lies beyond the image, and its mean stands for it.
+    right but for ``"zero"`` (3.3e-2 with the random mask), and ``"discard"`` darkens it by all that is lost (3.8e-2)
+    but for ``"zero"`` (2.1e-3). With ``"valid"`` nobody knows what lies beyond the image; its mean stands for it.
 
     How layers are chosen by tolerance: :meth:`kornia_tidy.TiDyOptics.plan` takes, of all kinds and spacings, the
     cheapest whose error on the scene is within what was asked. On 35 photographs with a random mask that was
@@ -72,8 +72,8 @@ class Fidelity:
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
         max_window: largest side of the PSF window in pixels.
         stray_light: what becomes of the light outside the window: ``"renormalize"`` gives it back to the window,
-            ``"veil"`` spreads it over the image, or what stays of it where the border is ``"zero"``; ``"discard"`` loses
-            it.
+            ``"veil"`` spreads it over the image, or what stays of it where the border is ``"zero"``, and ``"discard"``
+            loses it.
         double: compute in float64 whatever the type of the image.
         correlate: rotate PSFs by 180 degrees, as the PhaseCam3D family does.
         occlusion_states: what occlusion-aware compositing looks through, where averaging PSFs is not exact: ``"each"``
