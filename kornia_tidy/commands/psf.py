@@ -107,7 +107,10 @@ def run(args: argparse.Namespace) -> None:
         middle = len(channels) // 2
         sheet = PSFSheet(
             title=f"PSFs of {Path(args.camera).name}, window {optics.window} x {optics.window} px",
-            depths=[f"{depth}\nψ = {each:+.3g}" for depth, each in zip(depths, near_to_far, strict=True)],
+            depths=[
+                f"{depth}\nψ = {each:+.3g}" if each else f"{depth}\nψ = 0"
+                for depth, each in zip(depths, near_to_far, strict=True)
+            ],
             channels=channels,
             psfs=psfs,
             contrast=contrast[:, middle],
@@ -195,7 +198,8 @@ def _defocus(text: str | None, optics: TiDyOptics) -> Tensor:
 
 def _without_mask(optics: TiDyOptics) -> Tensor:
     """(1, C, P, P) PSFs of the same lens in focus behind a flat mask."""
-    masks = PixelwiseMask(1, optics.masks.phase.shape[-2:], initial="flat")
+    rows, columns = optics.masks.phase.shape[-2:]
+    masks = PixelwiseMask(1, (rows, columns), initial="flat")
     plain = TiDyOptics(
         masks, optics.camera, fidelity=optics.fidelity, spectrum=optics.spectrum, aperture=optics._aperture
     )
