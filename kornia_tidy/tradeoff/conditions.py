@@ -17,11 +17,24 @@ import kornia_tidy
 from kornia_tidy.tidy_optics import TiDyOptics
 
 MEASURED_CODE = (
-    "tidy_optics.py",
+    "**/*.c",
+    "**/*.h",
+    "camera_survey.py",
+    "candidates.py",
+    "capture_error.py",
+    "checks.py",
+    "compiled.py",
     "fidelity.py",
-    "optics/*.py",
-    "scene/*.py",
+    "occlusion_cost.py",
+    "optics/**/*.py",
+    "planning.py",
+    "render_cost.py",
+    "render_plan.py",
+    "scene/**/*.py",
+    "sensor/*.py",
+    "tidy_optics.py",
     "tradeoff/costs.py",
+    "tradeoff/ladder.py",
     "tradeoff/measure.py",
 )
 
@@ -115,10 +128,15 @@ def code_hash() -> str:
     """Return a hash of the source that a capture runs through: rows of other code are not to be mixed with its own."""
     root = Path(kornia_tidy.__file__).parent
     digest = hashlib.sha256()
-    for pattern in MEASURED_CODE:
-        for path in sorted(root.glob(pattern)):
-            digest.update(path.read_bytes())
+    for path in measured_files(root):
+        digest.update(f"{path.relative_to(root).as_posix()} {path.stat().st_size}\n".encode())
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def measured_files(root: Path) -> list[Path]:
+    """Return the source files that shape a row: of optics, rendering, sensor, planner and measurement, C among them."""
+    return [path for pattern in MEASURED_CODE for path in sorted(root.glob(pattern))]
 
 
 def git_commit() -> str | None:

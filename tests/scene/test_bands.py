@@ -54,6 +54,17 @@ class TestCaptureInBands(BaseTester):
         self.assert_close(coded, expected, rtol=0, atol=1e-11)
         assert optics.clamped_pixels == clamped
 
+    @pytest.mark.parametrize("border", BORDERS)
+    @torch.no_grad()
+    def test_feature_stray_light_is_spread_over_the_whole_image(self, border):
+        """Which a band does not know: it goes at once, whatever the budget."""
+        optics = make_optics(border=border, sensor=None)
+        optics = optics.with_fidelity(optics.fidelity.replace(stray_light="veil"))
+        image, depth = make_scene(200, 40, torch.float64)
+        expected = optics(image, depth)
+        optics.memory_budget = 1
+        assert torch.equal(optics(image, depth), expected)
+
     @torch.no_grad()
     def test_feature_replayed_noise(self):
         optics = make_optics()

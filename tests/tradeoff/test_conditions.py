@@ -1,13 +1,18 @@
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+import kornia_tidy
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.tradeoff import Conditions
-from kornia_tidy.tradeoff.conditions import code_hash, device_name, scene_hash
+from kornia_tidy.tradeoff.conditions import code_hash, device_name, measured_files, scene_hash
 from tests.base import BaseTester
 from tests.tradeoff.samples import CONDITIONS
 
@@ -76,11 +81,6 @@ class TestConditions(BaseTester):
         assert CONDITIONS.same(replace(CONDITIONS, **change)) is same
 
     def test_feature_the_code_is_that_of_a_capture(self, tmp_path, monkeypatch):
-        import shutil
-        from pathlib import Path
-
-        import kornia_tidy
-
         before = code_hash()
         copy = tmp_path / "kornia_tidy"
         shutil.copytree(Path(kornia_tidy.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -88,8 +88,40 @@ class TestConditions(BaseTester):
         assert code_hash() == before
         (copy / "figures.py").write_text("")
         assert code_hash() == before
-        (copy / "scene" / "layers.py").write_text("")
-        assert code_hash() != before
+        hashes = {before}
+        for name in (
+            "scene/layers.py",
+            "scene/direct.c",
+            "scene/occlusion_direct.c",
+            "optics/mutual_intensity.c",
+            "vectors.h",
+            "compiled.py",
+            "optics/phase_masks/base.py",
+            "sensor/noise.py",
+            "planning.py",
+            "capture_error.py",
+            "tradeoff/ladder.py",
+        ):
+            (copy / name).write_text("")
+            assert code_hash() not in hashes, name
+            hashes.add(code_hash())
+
+    def test_feature_all_that_a_measurement_imports_is_in_the_hash(self):
+        """But for what draws, writes or names, and for other ways to take pictures, which no row comes from."""
+        script = "import sys, kornia_tidy.tradeoff.measure, kornia_tidy.planning; print(*sys.modules)"
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, text=True)
+        root = Path(kornia_tidy.__file__).parent
+        elsewhere = {"dataset_transform", "files", "motion", "multi_shot", "__init__"}
+        elsewhere |= {"tradeoff/conditions", "tradeoff/figure", "tradeoff/files", "tradeoff/__init__"}
+        names = {
+            name.partition(".")[2].replace(".", "/") for name in done.stdout.split() if name.startswith("kornia_tidy.")
+        }
+        files = {root / f"{name}.py" for name in names if not name.startswith(("figures", "systems"))} - {
+            root / f"{name}.py" for name in elsewhere
+        }
+        files = {path for path in files if path.is_file()}
+        assert len(files) > 30
+        assert files <= set(measured_files(root))
 
     def test_smoke_device_name(self):
         assert device_name(torch.device("cpu")).endswith("CPUs")
