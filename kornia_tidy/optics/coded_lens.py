@@ -74,8 +74,8 @@ class CodedLens(nn.Module):
         self.modulator = DwellTimes() if modulator is None else modulator
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
-        # Of each moment and state, and of their averages.
-        self._memories: dict[tuple[int | None, int | None], BankMemory] = defaultdict(BankMemory)
+        # Of each moment and state, and of their averages, for each number of threads.
+        self._memories: dict[tuple[int | None, int | None, int], BankMemory] = defaultdict(BankMemory)
         if self.fidelity.propagation == "paper":
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
         self.register_load_state_dict_post_hook(_refit_window)
@@ -389,7 +389,8 @@ class CodedLens(nn.Module):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
-        memory = self._memories[self._moment, state if self._state is None else self._state]
+        # Sums of another number of threads are rounded in another order.
+        memory = self._memories[self._moment, state if self._state is None else self._state, torch.get_num_threads()]
         return memory.recall(setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
