@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import TextIO
 
 import kornia_tidy
-from kornia_tidy.commands import demo, evaluate, masks, raw, render, simulate, systems, trade, train
+from kornia_tidy.commands import demo, evaluate, info, masks, raw, render, simulate, systems, trade, train
 
 # Each has add_parser(subparsers), which sets run(args).
-COMMANDS = (simulate, demo, systems, masks, raw, train, evaluate, render, trade)
+COMMANDS = (simulate, demo, systems, masks, raw, train, evaluate, render, trade, info)
 
 DESCRIPTION = """\
 A programmable camera: a phase mask in its lens changes while the shutter is open, so that each depth of the scene

@@ -76,6 +76,7 @@ def moving_capture(
     wide = optics.fidelity.double or images.dtype == torch.float64
     dtype = torch.float64 if wide else torch.float32
     with torch.autocast(images.device.type, enabled=False):
+        optics = optics.snapshot(dtype)  # every moment is of the same masks
         durations = optics.timeline(dtype).durations
         for name, scenes in (("images", images), ("depths", depths)):
             if scenes.shape[1] != len(durations):

@@ -89,6 +89,8 @@ def burst(
     batched = image.ndim != 3
     if not batched:
         image, depth = image[None], depth[None]
+    wide = optics.fidelity.double or image.dtype == torch.float64
+    optics = optics.snapshot(torch.float64 if wide else torch.float32)  # every shot is of the same masks
     light = optics.decode(image)
     shots = []
     for k, share in enumerate(burst_shares(_dwell_shares(optics, light.dtype), dead_time, exposure)):

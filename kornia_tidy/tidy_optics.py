@@ -5,13 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
+from kornia_tidy.camera_settings import settings_of
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_positive
 from kornia_tidy.dataset_transform import DatasetTransform
 from kornia_tidy.fidelity import Fidelity
@@ -26,15 +27,18 @@ from kornia_tidy.scene.compositing import COMPOSITING, render
 from kornia_tidy.scene.convolution import BORDERS, check_border
 from kornia_tidy.sensor.noise import STRIP, SensorNoise
 from kornia_tidy.systems import published_system
+from kornia_tidy.threads import CaptureNotes
 
 if TYPE_CHECKING:
     from kornia_tidy.render_plan import RenderPlan
 
+_OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")
 COLOR_SPACES = ("srgb", "linear", "paper")
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
 # What a capture in float32 of three channels takes at its peak beyond image and capture: for tiles, and a pixel.
 _BYTES_OF_TILES, _BYTES_A_PIXEL = 24 << 20, 120
 _DEFAULT_SENSOR = SensorNoise(0.01)
+_BEYOND = "depths beyond the camera's range"
 
 
 class TiDyOptics(CodedLens):
@@ -100,6 +104,8 @@ class TiDyOptics(CodedLens):
         torch.Size([5, 23, 23])
     """
 
+    _SETTABLE: ClassVar = {**CodedLens._SETTABLE, **{name: name for name in _OWN_SETTINGS}}
+
     def __init__(
         self,
         masks: PhaseMasks | None = None,
@@ -140,8 +146,7 @@ class TiDyOptics(CodedLens):
         self.border = border
         self.check_inputs = check_inputs
         self.memory_budget = memory_budget
-        self._clamped: Tensor | None = None
-        self._warned = False
+        self._notes = CaptureNotes()
 
     @classmethod
     def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
@@ -195,8 +200,9 @@ class TiDyOptics(CodedLens):
         if isinstance(image, (tuple, list)):
             if len(image) < 2 or depth is not None:
                 raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
-            coded = self.capture(image[0], image[1], params, generator)
-            parts = (coded, self._cropped(image[1]), *image[2:])
+            now = self._now(image[0])
+            coded = now.capture(image[0], image[1], params, generator)
+            parts = (coded, now._cropped(image[1]), *image[2:])
             return type(image)(*parts) if hasattr(image, "_fields") else type(image)(parts)
         return self.capture(image, depth, params, generator)
 
@@ -211,16 +217,24 @@ class TiDyOptics(CodedLens):
         if torch.jit.is_tracing():
             refuse_torchscript()
         image, depth, batched = self._checked(image, depth)
-        check_border(self.border, *image.shape[-2:], self.window)
         with torch.autocast(image.device.type, enabled=False):
-            rows = self._rows_at_once(image, depth)
-            if rows is None:
-                coded = self._capture_at_once(image, depth, params, generator)
+            now = self._now(image)
+            check_border(now.border, *image.shape[-2:], now.window)
+            if len(image) == 0:
+                coded = now._no_capture(image, depth)
+            elif (rows := now._rows_at_once(image, depth)) is None:
+                coded = now._capture_at_once(image, depth, params, generator)
             else:
-                coded = self._capture_in_bands(image, depth, rows, params, generator)
+                coded = now._capture_in_bands(image, depth, rows, params, generator)
         if not torch.compiler.is_compiling() and get_worker_info() is not None:
             coded = coded.detach()  # collation in a worker cannot carry gradients
         return coded if batched else coded[0]
+
+    def _no_capture(self, image: Tensor, depth: Tensor) -> Tensor:
+        """Return the captures of a batch of no images, of which gradients are zero."""
+        self._survey([])
+        states, weights = self._states(self._compute_dtype(image))
+        return self._cropped(image) + (states.sum() + weights.sum() + depth.sum()).to(image)
 
     def _capture_at_once(
         self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor] | None, generator: torch.Generator | None
@@ -327,6 +341,9 @@ class TiDyOptics(CodedLens):
         Returns:
             A plan for the masks as they are now, whose ``fidelity`` is for :meth:`with_fidelity`.
 
+        Raises:
+            ValueError: if the batch holds no image, or as for a capture.
+
         Example:
             >>> from kornia_tidy import PixelwiseMask
             >>> optics = TiDyOptics(PixelwiseMask(1, initial="flat"))
@@ -339,6 +356,8 @@ class TiDyOptics(CodedLens):
         shape = (len(self.spectrum.weights), *depth.shape[-2:])
         blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
         blank, depth, _ = self._checked(blank, depth)
+        if len(blank) == 0 or len(depth) == 0:
+            raise ValueError(f"a plan needs at least one image and its depth, got {len(blank)} and {len(depth)}")
         light = None if image is None else self.decode(blank.to(self._compute_dtype(blank)))
         defocus = self._defocus(depth, depth)
         return Planner(self, blank.shape[1]).scene(defocus, light).plan(tolerance)
@@ -383,9 +402,27 @@ class TiDyOptics(CodedLens):
     def clamped_pixels(self) -> int:
         """Pixels of the last capture whose defocus lay outside the camera's range and was clamped to its end.
 
-        Of a burst, those of one shot; of a moving scene, those of all its moments.
+        Of a burst, those of one shot; of a moving scene, those of all its moments. Each thread sees those of the last
+        capture that it took itself, be it with this camera or with a view of it such as ``with_fidelity`` returns.
         """
         return 0 if self._clamped is None else int(self._clamped)
+
+    @property
+    def _clamped(self) -> Tensor | None:
+        return self._notes.clamped
+
+    @_clamped.setter
+    def _clamped(self, count: Tensor | None) -> None:
+        self._notes.clamped = count
+
+    @property
+    def _warned(self) -> bool:
+        return self._notes.is_told(_BEYOND)
+
+    @_warned.setter
+    def _warned(self, told: bool) -> None:
+        if told:
+            self._notes.first_time(_BEYOND)
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""
@@ -396,11 +433,24 @@ class TiDyOptics(CodedLens):
             f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
         )
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what travels with pickle and deepcopy: nothing of the last capture."""
-        return {**super().__getstate__(), "_clamped": None}
+    def settings(self) -> dict[str, Any]:
+        """Return what shapes a capture besides the weights, by the names of the parts."""
+        return {**super().settings(), **{name: settings_of(getattr(self, name)) for name in _OWN_SETTINGS}}
+
+    def _take_over(self, saved: Mapping[str, Any]) -> None:
+        for name, allowed in (("compositing", COMPOSITING), ("color_space", COLOR_SPACES), ("border", BORDERS)):
+            if name in saved:
+                check_choice(name, saved[name], tuple(allowed))
+        super()._take_over(saved)
 
     # ------------------------------------------------------------------ inside
+
+    def _now(self, image: Any) -> Self:
+        """Return the camera at this moment, for a capture of an image."""
+        if not isinstance(image, Tensor):
+            return self
+        with torch.autocast(image.device.type, enabled=False):
+            return self.snapshot(self._compute_dtype(image))
 
     def _rows_at_once(self, image: Tensor, depth: Tensor) -> int | None:
         """Rows whose capture fits the memory allowed; None where all do, or where the whole image is needed."""
@@ -435,7 +485,7 @@ class TiDyOptics(CodedLens):
         if not batched:
             image, depth = image[None], depth[None]
         self._spectrum(image.shape[1])
-        if image.numel() == 0:
+        if 0 in image.shape[-2:]:
             raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
         if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
             raise ValueError(
@@ -462,10 +512,11 @@ class TiDyOptics(CodedLens):
             pixels += own.numel()
             if not bool((lowest >= lo - 5e-4) & (highest <= hi + 5e-4)):
                 clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
-        lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
         self._clamped = clamped
-        if self.check_inputs and not self._warned and (count := int(clamped)):
-            self._warned = True
+        if not extremes:
+            return torch.zeros(2)
+        lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
+        if self.check_inputs and (count := int(clamped)) and self._notes.first_time(_BEYOND):
             warnings.warn(
                 f"{count} of {pixels} pixels have a defocus between {float(lowest):+.2f} and {float(highest):+.2f} "
                 f"rad, beyond the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
@@ -495,9 +546,10 @@ class TiDyOptics(CodedLens):
                 f"{list(sample)}"
             )
         image, depth = sample["image"], sample[keys[0]]
-        coded = self.capture(image, depth, params, generator)
-        cropped = {name: self._cropped(sample[name]) for name in (keys[0], "mask") if name in sample}
-        return {**sample, "image": coded, "all_in_focus": self._cropped(image), **cropped}
+        now = self._now(image)
+        coded = now.capture(image, depth, params, generator)
+        cropped = {name: now._cropped(sample[name]) for name in (keys[0], "mask") if name in sample}
+        return {**sample, "image": coded, "all_in_focus": now._cropped(image), **cropped}
 
 
 def _any_channels(function: Any, image: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ class TestMain(BaseTester):
         return install
 
     @pytest.mark.parametrize(
-        "argv", [[], ["simulate"], ["demo"], ["systems"], ["trade"], ["train"], ["evaluate"], ["raw"], ["render"]]
+        "argv",
+        [[], ["simulate"], ["demo"], ["systems"], ["trade"], ["train"], ["evaluate"], ["raw"], ["render"], ["info"]],
     )
     def test_smoke_help_teaches_and_exits_with_zero(self, argv, capsys):
         with pytest.raises(SystemExit) as exit_:

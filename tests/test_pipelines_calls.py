@@ -127,10 +127,10 @@ BAD_CALLS: list[tuple[str, tuple[Any, ...], type[Exception], str]] = [
     ("rank 2", (IMAGE[0, 0], DEPTH), ValueError, r"image must have shape \(B, C, H, W\) or .* got \(40, 48\)"),
     ("rank 5", (IMAGE[None], DEPTH), ValueError, r"image must have shape"),
     (
-        "empty batch",
-        (IMAGE[:0], DEPTH[:0]),
+        "no pixels",
+        (IMAGE[..., :0, :], DEPTH[..., :0, :]),
         ValueError,
-        r"image must hold at least one pixel, got shape \(0, 3, 40, 48\)",
+        r"image must hold at least one pixel, got shape \(1, 3, 0, 48\)",
     ),
     ("ranks differ", (IMAGE, DEPTH[0]), ValueError, r"depth must have shape .* got \(1, 40, 48\)"),
     (

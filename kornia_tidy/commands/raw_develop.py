@@ -40,6 +40,9 @@ examples:
   For measuring: linear light on the sensor's own grid, nothing interpolated:
     kornia-tidy raw develop shots/*.dng -o planes --demosaic half --linear --sensor-grid
 
+  Files that do not say in which light they were taken, and look green or orange:
+    kornia-tidy raw develop quicktake/*.qtk -o pictures --white-balance auto
+
   A bare dump of counts, with factors for red, green and blue:
     kornia-tidy raw develop dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520 \\
         --white-balance 1.9 1 1.5 -o pictures
@@ -78,12 +81,7 @@ def add_parser(subparsers: Any) -> None:
         metavar="METHOD",
         help=f"{', '.join(METHODS)} (default: LibRaw's AHD for Bayer, Markesteijn's for X-Trans, else bilinear)",
     )
-    look.add_argument(
-        "--white-balance",
-        nargs="+",
-        metavar="WB",
-        help="as-shot, daylight, none, or a factor for each colour (default: as shot, else daylight, else none)",
-    )
+    add_white_balance_option(look)
     look.add_argument(
         "--highlights",
         choices=HIGHLIGHTS,
@@ -170,6 +168,17 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
         if output.resolve() in taken:
             raise ValueError(f"cannot write {output}: it is an input")
     return outputs
+
+
+def add_white_balance_option(group: Any) -> None:
+    """Add what :func:`parse_white_balance` reads."""
+    group.add_argument(
+        "--white-balance",
+        nargs="+",
+        metavar="WB",
+        help="as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour "
+        "(default: as shot, else daylight, else none)",
+    )
 
 
 def parse_white_balance(words: Sequence[str] | None) -> str | Tensor | None:

@@ -28,7 +28,9 @@ def add_dump_options(parser: argparse.ArgumentParser) -> None:
         help="colours of the filter array's tile, by rows: RGGB, GMYC, 36 letters for X-Trans; NONE for monochrome",
     )
     group.add_argument("--black", type=float, nargs="+", metavar="N", help="count without light, one or one a place")
-    group.add_argument("--white", type=float, metavar="N", help="saturation count")
+    group.add_argument(
+        "--white", type=float, metavar="N", help="saturation count; also in place of what a raw file says of its own"
+    )
     group.add_argument("--dtype", choices=("uint8", "uint16"), help="of a count (default: uint16)")
     group.add_argument("--byte-order", choices=("little", "big"), help="of a count (default: little)")
 
@@ -42,9 +44,9 @@ def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
     """
     if args.size is None:
         for name in DUMP_OPTIONS:
-            if getattr(args, name) is not None:
+            if name != "white" and getattr(args, name) is not None:
                 raise ValueError(f"--{name.replace('_', '-')} is for bare dumps of counts: give --size too")
-        return RawCapture.open(path)
+        return RawCapture.open(path, white=args.white)
     for name in ("pattern", "black", "white"):
         if getattr(args, name) is None:
             raise ValueError(f"a bare dump of counts needs --{name}")

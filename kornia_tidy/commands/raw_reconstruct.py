@@ -20,7 +20,7 @@ from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
 from tqdm import tqdm
 
-from kornia_tidy.commands.raw_develop import SUFFIXES, output_paths
+from kornia_tidy.commands.raw_develop import SUFFIXES, add_white_balance_option, output_paths, parse_white_balance
 from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, open_raw
 from kornia_tidy.commands.report import tell
 from kornia_tidy.data.depth_files import write_depth
@@ -104,6 +104,7 @@ def add_parser(subparsers: Any) -> None:
         "--depth-unit", type=float, default=1e-3, metavar="M", help="metres a unit of FILE_depth.png (default: 0.001)"
     )
     parser.add_argument("--linear", action="store_true", help="FILES that are pictures hold linear light, not sRGB")
+    add_white_balance_option(parser)
     parser.add_argument("--resume", action="store_true", help="skip files whose results are there and still right")
     parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)")
     parser.add_argument(
@@ -118,6 +119,7 @@ def run(args: argparse.Namespace) -> None:
     from kornia_tidy.training.light_head import LightHead, reconstruct_light  # noqa: PLC0415
     from kornia_tidy.training.trained import load_trained  # noqa: PLC0415
 
+    parse_white_balance(args.white_balance)
     weights = head_file(args.head)
     system = load_trained(weights)
     head = LightHead(system).to(torch.device(args.device))
@@ -130,6 +132,7 @@ def run(args: argparse.Namespace) -> None:
         "weights": hashlib.sha256(read_bytes(weights)).hexdigest(),
         "depth_unit": args.depth_unit,
         "linear": args.linear,
+        "white_balance": args.white_balance,
         "dump": {name: getattr(args, name) for name in DUMP_OPTIONS},
     }
     folder.mkdir(parents=True, exist_ok=True)
@@ -192,7 +195,7 @@ def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[T
         picture = read_image(path)
         return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}
     raw: RawCapture = open_raw(path, args)
-    light = raw.to_rgb(encoded=False, upright=False)
+    light = raw.to_rgb(white_balance=parse_white_balance(args.white_balance), encoded=False, upright=False)
     bare = replace(raw, counts=torch.empty(0))  # which way it is turned, and not the counts
     return light, bare.upright, vars(raw.info)
 

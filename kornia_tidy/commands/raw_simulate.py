@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +66,9 @@ def add_parser(subparsers: Any) -> None:
         help=f"of the converter, whose white is 2^bits - 1 (default: {BITS})",
     )
     sensor.add_argument("--black", type=int, metavar="N", help="count without light (default: 2^bits / 16)")
+    sensor.add_argument(
+        "--white", type=float, metavar="N", help="saturation count, in place of what FILE says of its own"
+    )
     sensor.add_argument(
         "--color",
         choices=("camera", "channels"),
@@ -141,16 +145,23 @@ def _sensor(args: argparse.Namespace) -> RawCapture:
     """The camera of a file, or one in words."""
     import torch  # noqa: PLC0415
 
+    from kornia_tidy.sensor.raw_color import srgb_from_xyz  # noqa: PLC0415
     from kornia_tidy.sensor.raw_file import RawCapture  # noqa: PLC0415
 
     if args.like is not None:
         for name in ("pattern", "bits", "black"):
             if getattr(args, name) is not None:
                 raise ValueError(f"--like has a sensor of its own: leave out --{name}")
-        return RawCapture.open(args.like)
+        return RawCapture.open(args.like, white=args.white)
+    if args.white is not None:
+        raise ValueError("--white is of the file of --like: give that, or --bits")
     bits = args.bits or BITS
     black = 2**bits // 16 if args.black is None else args.black
-    return RawCapture.from_counts(torch.zeros(1, 2, 2), args.pattern or PATTERN, black, 2**bits - 1)
+    camera = RawCapture.from_counts(torch.zeros(1, 2, 2), args.pattern or PATTERN, black, 2**bits - 1)
+    if set(camera.colors) != set("RGB"):
+        return camera
+    # Its red, green and blue are those of the picture, so whoever develops the file shall see the picture's colours.
+    return replace(camera, xyz_to_camera=srgb_from_xyz().float(), white_balance=torch.ones(len(camera.colors)))
 
 
 def _noise(args: argparse.Namespace) -> SensorNoise:

@@ -12,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from kornia_tidy.camera_settings import EXTRA_STATE
 from kornia_tidy.checks import check_choice
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.lab.slm_frames import checked_heights
@@ -59,7 +60,8 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
         names = [key for key in _KEYS if key in state]
         if not names:
             raise ValueError(
-                f"cannot read {path}: it has no 'masks.phase', only {', '.join(sorted(state)) or 'nothing'}"
+                f"cannot read {path}: it has no 'masks.phase', only "
+                f"{', '.join(sorted(state.keys() - {EXTRA_STATE})) or 'nothing'}"
             )
         material = constant_index(1.5) if material is None else material
         heights = state[names[0]].double() / metres_to_radians(material)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
+import threading
 import warnings
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any, Literal, NoReturn, Self, cast, overload
+from typing import Any, ClassVar, Literal, NoReturn, Self, cast, overload
 
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera_settings import digest_of, settings_of, take_over
+from kornia_tidy.camera_state import CameraState
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.following import is_followed, refuse_torchscript
 from kornia_tidy.optics.aperture import check_aperture, circular_aperture
@@ -29,8 +31,11 @@ from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.state_bank import StateBank
 
+_PARTS = ("masks", "camera", "modulator", "spectrum", "fidelity")
+_READS = 100  # of masks that another thread changes all the time; what is read last is taken
 
-class CodedLens(nn.Module):
+
+class CodedLens(CameraState):
     """A lens whose phase mask changes during one exposure: all that decides how a point of light spreads.
 
     Its parts can be swapped: ``masks``, ``modulator``, ``camera``, ``spectrum``, ``fidelity``. It knows no scene but
@@ -52,9 +57,12 @@ class CodedLens(nn.Module):
         torch.Size([2, 3])
     """
 
+    _SETTABLE: ClassVar = {**dict(zip(_PARTS, _PARTS, strict=True)), "aperture": "_aperture"}  # settings: attributes
+
     _moment: int | None = None  # the one moment looked at, if not the whole exposure
     _state: int | None = None  # the one state looked through, if not all
     _bank: PSFBank | None = None  # measured, in the place of the masks' own
+    _shown: Timeline | None = None  # what a snapshot shows, which masks that change leave alone
 
     _seen: Spectrum  # what PSFs are computed at: the spectrum, at no more wavelengths than the fidelity allows
 
@@ -75,10 +83,9 @@ class CodedLens(nn.Module):
         self.spectrum = Spectrum.rgb() if spectrum is None else spectrum
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
         # Of each moment and state, and of their averages, for each number of threads.
-        self._memories: dict[tuple[int | None, int | None, int], BankMemory] = defaultdict(BankMemory)
+        self._memories: dict[tuple[int | None, int | None, int], BankMemory] = {}
         if self.fidelity.propagation == "paper":
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
-        self.register_load_state_dict_post_hook(_refit_window)
         self.fit_window()
 
     @overload
@@ -126,12 +133,13 @@ class CodedLens(nn.Module):
             if states or defocus is not None:
                 raise ValueError("PSFs that were measured are known at their own defocus and for the whole exposure")
             return self._measured_bank(spectrum, dtype)
-        nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+        now = self.snapshot(dtype)
+        nodes, stray_light = now.defocus_nodes if defocus is None else tuple(defocus), now.fidelity.stray_light
         if not states:
-            return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
-        weights = self.state_weights(dtype)
-        banks = [self._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
-        return StateBank.of([bank.with_stray_light(self.fidelity.stray_light) for bank in banks], weights)
+            return now._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(stray_light)
+        weights = now.state_weights(dtype)
+        banks = [now._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
+        return StateBank.of([bank.with_stray_light(stray_light) for bank in banks], weights)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
@@ -141,6 +149,8 @@ class CodedLens(nn.Module):
         """Return what the modulator shows of the masks during one exposure, and when."""
         if torch.jit.is_tracing():
             refuse_torchscript()
+        if self._shown is not None:
+            return self._shown.map(lambda part: part.to(dtype))
         return timeline_of(self.modulator, self.masks.phase.to(dtype))
 
     @property
@@ -233,27 +243,50 @@ class CodedLens(nn.Module):
         return PSFBank(*(x.to(device, dtype) for x in (bank.psfs, bank.defocus, bank.energy)), veil)
 
     def _sharing_parts(self) -> Self:
-        other = copy.copy(self)
-        for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
-            other.__dict__[kind] = dict(self.__dict__[kind])
+        with self._lock:
+            other = copy.copy(self)
+            for kind in ("_modules", "_parameters", "_buffers"):  # or swapping a part of one would swap that of both
+                other.__dict__[kind] = dict(self.__dict__[kind])
         return other
+
+    def snapshot(self, dtype: torch.dtype) -> Self:
+        """Return this lens as it is now, for one capture: what other threads change meanwhile is seen by the next one.
+
+        Masks that another thread changes in place, as an optimiser does, are copied until they stand still. The parts
+        themselves are shared; memories too. The compiler sees the lens itself.
+
+        Args:
+            dtype: float32 or float64, in which the masks are needed.
+        """
+        if self._shown is not None or is_followed():
+            return self
+        with self._lock:
+            shown = _settled(self.masks, self.modulator, dtype)
+            if self._window is None:
+                self.fit_window()
+            _ = self.pupil  # found here, once for all threads
+            now = object.__new__(type(self))
+            now.__dict__ = {**self.__dict__, "_modules": dict(self._modules), "_shown": shown}
+        return now
 
     # ------------------------------------------------------------------ the window of the PSFs
 
     @property
     def window(self) -> int:
         """Side of the PSFs in pixels: given by the fidelity, or measured by :meth:`fit_window`."""
-        if self._window is None and self._fixed_window and self._bank is None:
+        window = self._window
+        if window is None and self._fixed_window and self._bank is None:
             self._check_layers()
             return self._fixed_window
-        return self.fit_window() if self._window is None else self._window
+        return self.fit_window() if window is None else window
 
     @property
     def light_held(self) -> tuple[float, float]:
         """Least and largest share of the light in the window, as it was when the window was chosen."""
-        if self._window is None:
-            self.fit_window()
-        return self._held
+        with self._lock:
+            if self._window is None:
+                self.fit_window()
+            return self._held
 
     @property
     def _fixed_window(self) -> int | None:
@@ -270,16 +303,31 @@ class CodedLens(nn.Module):
     def fit_window(self) -> int:
         """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
 
-        It is done on construction, after ``load_state_dict`` and when a part is swapped; masks in training keep their
-        window until this is called again. A window or a preset that fixes the side is only measured.
+        It is done on construction, when a part is swapped, and after loading weights that do not tell their window;
+        masks in training keep their window until this is called again. A window or a preset that fixes the side is only
+        measured.
 
         Returns:
             The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
         """
+        with self._lock:
+            self._window, self._held, enough = self._fitted_window()
+            window, held = self._window, self._held
+        if not enough:
+            settings = self.fidelity
+            warnings.warn(
+                f"the largest PSF window allowed, {window} px, holds {held[0]:.0%} of the light where it should "
+                f"hold {settings.enclosed_energy:.0%}; the rest is handled by {settings.stray_light!r}: raise "
+                f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
+                stacklevel=2,
+            )
+        return window
+
+    def _fitted_window(self) -> tuple[int, tuple[float, float], bool]:
+        """Return the window, the least and largest share of the light in it, and whether that is enough."""
         if self._bank is not None:
             energy = self._bank.energy
-            self._window, self._held = self._bank.window, (float(energy.min()), float(energy.max()))
-            return self._window
+            return self._bank.window, (float(energy.min()), float(energy.max())), True
         self._check_layers()
         settings, fixed = self.fidelity, self._fixed_window
         size = fixed or min(33, settings.max_window)
@@ -289,18 +337,9 @@ class CodedLens(nn.Module):
             if window is not None or size == settings.max_window:
                 break
             size = min(2 * size - 1, settings.max_window)
-        self._window = window or size
-        margin = (size - self._window) // 2
+        margin = (size - (window or size)) // 2
         shares = psfs[..., margin : size - margin, margin : size - margin].sum((2, 3))
-        self._held = (float(shares.min()), float(shares.max()))
-        if window is None:
-            warnings.warn(
-                f"the largest PSF window allowed, {size} px, holds {self._held[0]:.0%} of the light where it should "
-                f"hold {settings.enclosed_energy:.0%}; the rest is handled by {settings.stray_light!r}: raise "
-                f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
-                stacklevel=2,
-            )
-        return self._window
+        return window or size, (float(shares.min()), float(shares.max())), window is not None
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:
@@ -312,14 +351,19 @@ class CodedLens(nn.Module):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; a part that shapes the PSFs makes wavelengths, window and pupil to be found anew."""
-        if name in ("spectrum", "fidelity"):
-            both = {**self.__dict__, name: value}
-            if "spectrum" in both and "fidelity" in both:
-                spectrum, most = both["spectrum"], both["fidelity"].wavelengths
-                self.__dict__["_seen"] = spectrum if most is None else fewer_wavelengths(spectrum, most)
-        super().__setattr__(name, value)
-        if name in ("masks", "camera", "modulator", "spectrum", "fidelity"):
+        if name not in _PARTS:
+            super().__setattr__(name, value)
+            return
+        with self._lock:
+            if name in ("spectrum", "fidelity"):
+                both = {**self.__dict__, name: value}
+                if "spectrum" in both and "fidelity" in both:
+                    spectrum, most = both["spectrum"], both["fidelity"].wavelengths
+                    self.__dict__["_seen"] = spectrum if most is None else fewer_wavelengths(spectrum, most)
+            super().__setattr__(name, value)
             self.__dict__.update(_window=None, _pupil=None)
+            if name in ("masks", "modulator"):
+                self.__dict__["_shown"] = None
 
     def __prepare_scriptable__(self) -> NoReturn:
         """Refuse ``torch.jit.script``, of this camera and of what it is a part of."""
@@ -327,7 +371,39 @@ class CodedLens(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: no PSFs."""
-        return {**super().__getstate__(), "_memories": defaultdict(BankMemory)}
+        return {**super().__getstate__(), "_memories": {}}
+
+    # ------------------------------------------------------------------ the state
+
+    def settings(self) -> dict[str, Any]:
+        """Return what shapes the PSFs besides the weights, by the names of the parts."""
+        fidelity = settings_of(self.fidelity)
+        fidelity.pop("window")  # the window has an entry of its own
+        bank = self._bank
+        return {
+            **{name: settings_of(getattr(self, name)) for name in ("masks", "camera", "modulator", "spectrum")},
+            "fidelity": fidelity,
+            "mask_pixels": list(self.masks.phase.shape[-2:]),
+            "aperture": settings_of(self._aperture),
+            "measured PSFs": None if bank is None else digest_of(bank.psfs, bank.defocus, bank.energy),
+            "state": self._state,
+            "moment": self._moment,
+        }
+
+    def _take_over(self, saved: Mapping[str, Any]) -> None:
+        fidelity = saved.get("fidelity")
+        if isinstance(fidelity, dict):
+            saved = {**saved, "fidelity": {**fidelity, "window": saved.get("fixed_window")}}
+        take_over(self, saved, self.settings(), self._SETTABLE)
+        self.__dict__.update(_window=None, _pupil=None)
+
+    def _check_window(self, window: int) -> None:
+        fixed = self._fixed_window if self._bank is None else self._bank.window
+        if fixed not in (None, window):
+            raise ValueError(
+                f"the state is that of another camera: its PSF window is {window} px, and this one's is fixed to "
+                f"{fixed} px; set Fidelity.window, or take its settings over by load_state_dict(state, take_over=True)"
+            )
 
     # ------------------------------------------------------------------ inside
 
@@ -388,10 +464,10 @@ class CodedLens(nn.Module):
         if is_followed() or isinstance(step, Tensor) or (learning and torch.is_grad_enabled()):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
-        setting = (spectrum, self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
+        setting = (self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
         # Sums of another number of threads are rounded in another order.
-        memory = self._memories[self._moment, state if self._state is None else self._state, torch.get_num_threads()]
-        return memory.recall(setting, states, weights, nodes, build)
+        key = self._moment, state if self._state is None else self._state, torch.get_num_threads()
+        return self._memories.setdefault(key, BankMemory()).recall(spectrum, setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
         """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
@@ -442,5 +518,13 @@ class CodedLens(nn.Module):
         )
 
 
-def _refit_window(lens: CodedLens, _: Any) -> None:
-    lens.fit_window()
+def _settled(masks: PhaseMasks, modulator: nn.Module, dtype: torch.dtype) -> Timeline:
+    """Return a copy of what is shown, made while no other thread changed the masks."""
+    alone = threading.active_count() == 1
+    for _ in range(_READS):
+        before = [] if alone else [p.detach().clone() for part in (masks, modulator) for p in part.parameters()]
+        shown = timeline_of(modulator, masks.phase.to(dtype)).map(Tensor.clone)
+        after = [] if alone else [p for part in (masks, modulator) for p in part.parameters()]
+        if all(map(torch.equal, before, after)):
+            break
+    return shown

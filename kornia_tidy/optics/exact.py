@@ -30,7 +30,7 @@ def exact_psf_bank(
     defocus: Sequence[float],
     pixel_step: float | Tensor,
     window: int,
-    tolerance: float = 2e-2,
+    tolerance: float = 1e-2,
     chromatic_defocus: Sequence[float] | None = None,
 ) -> PSFBank:
     r"""Return the PSFs of a mask sequence with every mask pixel and sensor pixel integrated.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import torch
@@ -43,6 +43,11 @@ class Timeline(NamedTuple):
     def weights(self) -> Tensor:
         """Share of the exposure's light that each state has, (S,)."""
         return self.durations if self.mixture is None else (self.durations[:, None] * self.mixture).sum(0)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Timeline:
+        """Return the timeline with a function applied to each of its tensors."""
+        mixture, middles = (None if part is None else function(part) for part in (self.mixture, self.middles))
+        return Timeline(function(self.states), function(self.durations), mixture, middles)
 
     def moment(self, index: int) -> tuple[Tensor, Tensor]:
         """Return the states of one moment, and their weights, which sum to one."""

@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 import kornia_tidy
+from kornia_tidy.camera_settings import EXTRA_STATE
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.rendering.layout import Layout
 from kornia_tidy.tidy_optics import TiDyOptics
@@ -90,6 +91,8 @@ def _part(module: nn.Module | None) -> dict[str, Any] | None:
 def _digest(optics: TiDyOptics) -> str:
     digest = hashlib.sha256()
     for name, value in {**optics.state_dict(), "aperture": optics.pupil.amplitude}.items():
+        if name.endswith(EXTRA_STATE):  # settings, which are written beside it in words
+            continue
         digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
 

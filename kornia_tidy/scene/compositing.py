@@ -20,6 +20,7 @@ from kornia_tidy.scene.convolution import check_border, from_spectrum, pad_borde
 from kornia_tidy.scene.layers import assign_layers, layer_weight, present_layers
 from kornia_tidy.scene.occlusion import occlude_dense
 from kornia_tidy.scene.occlusion_tiling import occlude_tiled
+from kornia_tidy.scene.stray_light import spread_evenly
 from kornia_tidy.scene.tiling import blur_then_mix, split_then_blur
 
 METHODS = ("tiled", "dense")
@@ -118,14 +119,16 @@ def gather(
 
     .. math:: I_c = \sum_d O_d \, (L_c * h_{dc} + v_{dc} \overline{L_c})
 
-    White stays white where the PSFs sum to one (with the veil); flux is not conserved where depth changes.
+    White stays white where the PSFs sum to one (with the veil), but for the border ``"zero"``; flux is not conserved
+    where depth changes.
 
     Args:
         image: L, (B, C, H, W) linear light.
         defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians; with ``nodes`` and ``layers`` it gives the weights O.
         nodes: (D,) ascending defocus of the layers in radians.
         psfs: h, (D, C, P, P) with P odd.
-        veil: v, (D, C) fraction of the image's mean light that is added, or None.
+        veil: v, (D, C) fraction of the image's mean light that is added, or None. With the border ``"zero"`` as much of
+            it as stays in the image, see :func:`kornia_tidy.scene.stray_light.share_within`.
         layers: ``"linear"`` or ``"nearest"``.
         border: what lies beyond the image, see :func:`render`.
         correlate: turn the PSFs by 180 degrees.
@@ -173,7 +176,8 @@ def scatter(
         defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians; with ``nodes`` and ``layers`` it gives the weights O.
         nodes: (D,) ascending defocus of the layers in radians.
         psfs: h, (D, C, P, P) with P odd.
-        veil: v, (D, C) fraction of each layer's mean light that is added, or None.
+        veil: v, (D, C) fraction of each layer's mean light that is added, or None. With the border ``"zero"`` as much
+            of it as stays in the image, see :func:`kornia_tidy.scene.stray_light.share_within`.
         layers: ``"linear"`` or ``"nearest"``.
         border: what lies beyond the image, see :func:`render`.
         correlate: turn the PSFs by 180 degrees.
@@ -218,7 +222,9 @@ def occlusion(
         nodes: (D,) ascending defocus of the layers in radians: the last is the nearest.
         psfs: h, (D, C, P, P) with P odd.
         veil: v, (D, C) fraction of each layer's light that is spread evenly before it is blurred and hidden, or None:
-            :math:`L_d = (1 - v_d) L + v_d \overline{L}`, so that one layer alone looks as gather makes it.
+            :math:`L_d = (1 - v_d) L + v_d \overline{L}`, so that one layer alone looks as gather makes it. With the
+            border ``"zero"`` as much of it as there is among the light seen, see
+            :func:`kornia_tidy.scene.stray_light.normalised_share`.
         layers: ``"linear"`` or ``"nearest"``.
         border: what lies beyond the image, see :func:`render`.
         correlate: turn the PSFs by 180 degrees.
@@ -282,13 +288,13 @@ def _gather_dense(
     lower, fraction = lower[inside], None if fraction is None else fraction[inside]
     size = padded_size(*image.shape[-2:], psf_size, border)
     light = to_spectrum(pad_border(image, psf_size // 2, border), size)
-    haze = None if veil is None else veil[:, None, :, None, None] * image.mean((-2, -1), keepdim=True)
+    stray = None if veil is None else spread_evenly(image, psf_size, border)
     # Of the sum a pixel has two terms: pick them, mix once. Autograd then keeps masks, not a blurred image a layer.
     below = above = torch.zeros((), dtype=image.dtype, device=image.device)
     for index in present_layers(lower, fraction, len(psfs)):
         blurred = from_spectrum(light * to_spectrum(psfs[index], size), size, psf_size)
-        if haze is not None:
-            blurred = blurred + haze[index]
+        if stray is not None and veil is not None:  # both or none
+            blurred = blurred + veil[index, :, None, None] * stray
         below = torch.where(lower == index, blurred, below)
         if fraction is not None:
             above = torch.where(lower == index - 1, blurred, above)
@@ -300,13 +306,14 @@ def _scatter_dense(
 ) -> Tensor:
     psf_size = psfs.shape[-1]
     size = padded_size(*image.shape[-2:], psf_size, border)
-    light = haze = torch.zeros((), dtype=image.dtype, device=image.device)
+    light = stray = torch.zeros((), dtype=image.dtype, device=image.device)
     for index in present_layers(lower, fraction, len(psfs)):
         own = layer_weight(lower, fraction, index) * image
         light = light + to_spectrum(pad_border(own, psf_size // 2, border), size) * to_spectrum(psfs[index], size)
         if veil is not None:
-            haze = haze + veil[index, :, None, None] * own.mean((-2, -1), keepdim=True)
-    return from_spectrum(light, size, psf_size) + haze
+            stray = stray + veil[index, :, None, None] * own
+    coded = from_spectrum(light, size, psf_size)
+    return coded if veil is None else coded + spread_evenly(stray, psf_size, border)
 
 
 def _gather_tiled(
@@ -317,7 +324,7 @@ def _gather_tiled(
     coded = blur_then_mix(image, psfs, lower, fraction, border)
     if veil is None:
         return coded
-    return coded + _own_veil(lower, fraction, veil) * image.mean((-2, -1), keepdim=True)
+    return coded + _own_veil(lower, fraction, veil) * spread_evenly(image, psfs.shape[-1], border)
 
 
 def _scatter_tiled(
@@ -326,7 +333,7 @@ def _scatter_tiled(
     coded = split_then_blur(image, psfs, lower, fraction, border)
     if veil is None:
         return coded
-    return coded + (_own_veil(lower, fraction, veil) * image).mean((-2, -1), keepdim=True)
+    return coded + spread_evenly(_own_veil(lower, fraction, veil) * image, psfs.shape[-1], border)
 
 
 def _output_pixels(radius: int, border: str) -> tuple[EllipsisType, slice, slice]:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from kornia_tidy.scene.convolution import from_spectrum, pad_border, to_spectrum
 from kornia_tidy.scene.layers import layer_weight, present_layers
+from kornia_tidy.scene.stray_light import normalised_share
 
 EPSILON = 1e-6  # added to the divisor: white stays white to this, over the share of the PSF that a layer is seen by
 
@@ -75,6 +76,7 @@ def occlude_dense(
     fraction = None if fraction is None else pad_border(fraction, radius, sides)[:, 0]
     inside = pad_border(torch.ones_like(image[:1, 0]), radius, "zero") if border == "zero" else None
     mean = None if veil is None else image.mean((-2, -1))
+    veil = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
     return occlude_planes(pad_border(image, radius, border), psfs, fraction, mean, veil, lower=lower, inside=inside)
 
 

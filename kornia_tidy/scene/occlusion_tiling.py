@@ -32,6 +32,7 @@ from kornia_tidy.scene.layers import layer_weight
 from kornia_tidy.scene.occlusion import EPSILON, lay_over, occlude_planes, weight_behind
 from kornia_tidy.scene.occlusion_direct import goes_directly, occlude_directly
 from kornia_tidy.scene.occlusion_tiles import Chunk, Corner, Grid, Plan, make_plan
+from kornia_tidy.scene.stray_light import normalised_share
 from kornia_tidy.scene.summed import differentiable_slopes
 
 
@@ -87,6 +88,7 @@ def occlude_tiled(
     inside = pad_border(torch.ones_like(image[:1, 0]), radius, "zero") if border == "zero" else None
     light = pad_border(image, radius, border)
     mean = None if veil is None else image.mean((-2, -1))
+    veil = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
     planes = light, psfs, fraction, mean, veil, lower, inside
     return _Occlude.apply(*planes, sloped, goes_directly(light, psfs, lower, fraction))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.sensor.auto_balance import auto_balance
 from kornia_tidy.sensor.demosaic import BAYER, demosaic_to_srgb, mixed
 from kornia_tidy.sensor.filter_array import tiled
 from kornia_tidy.sensor.raw_color import adapted_to_srgb, assumed_camera_to_srgb, camera_to_srgb
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from kornia_tidy.sensor.raw_file import RawCapture
 
 HIGHLIGHTS = ("clip", "keep")
-WHITE_BALANCES = ("as shot", "daylight", "none")
+WHITE_BALANCES = ("as shot", "daylight", "auto", "none")
 
 
 def develop(
@@ -41,8 +43,10 @@ def develop(
         raw: the capture.
         method: of :func:`~kornia_tidy.sensor.demosaic.demosaic`, for captures behind a filter array. Default: that of
             :func:`default_method`.
-        white_balance: ``"as shot"``, ``"daylight"`` or ``"none"``, or factors, one a channel of ``raw.colors`` or one
-            a colour. Default: as shot if the file says it, else daylight if it says that, else none.
+        white_balance: ``"as shot"``, ``"daylight"``, ``"auto"``, see
+            :func:`~kornia_tidy.sensor.auto_balance.auto_balance`, or ``"none"``, or factors, one a channel of
+            ``raw.colors`` or one a colour. Default: as shot if the file says it, else daylight if it says that, else
+            none.
         highlights: a channel that is multiplied by more saturates higher. ``"clip"`` takes all to the lowest of these
             levels, which becomes 1: what is saturated is white. ``"keep"`` leaves what is above 1, in false colours
             where a channel is saturated.
@@ -61,6 +65,9 @@ def develop(
     Raises:
         ValueError: if the capture lacks what is asked for, or an argument is none of the above.
 
+    Warns:
+        UserWarning: if daylight is taken because the file does not say its white balance, and nobody asked for it.
+
     Convention:
         Black is 0, noise below it negative; colours that sRGB cannot show lie outside [0, 1]. Neither is clamped.
 
@@ -75,6 +82,12 @@ def develop(
     mosaic = raw.mosaic()
     to_srgb = None
     if raw.colors:
+        if white_balance is None and raw.white_balance is None and raw.daylight_balance is not None:
+            warnings.warn(
+                "a file without a white balance as shot is balanced for daylight, which leaves a cast in other light: "
+                "choose white_balance='auto' (--white-balance auto), or 'daylight' if it was",
+                stacklevel=2,
+            )
         factors = balance_factors(raw, white_balance)
         _balance(mosaic, raw, factors / factors.min())
         to_srgb = srgb_matrix(raw, factors, adaptation) if matrix is None else _checked(matrix, raw)
@@ -109,8 +122,8 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
         white_balance: as for :func:`develop`.
 
     Raises:
-        ValueError: if the file does not say it, or given factors are not positive, or not as many
-            as channels or colours.
+        ValueError: if the file does not say it, nothing in the capture tells it (``"auto"``), or given factors are
+            not positive, or not as many as channels or colours.
     """
     none = torch.ones(len(raw.colors))
     if white_balance is None:
@@ -118,6 +131,8 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
         return none if stated is None else stated
     if isinstance(white_balance, str):
         check_choice("white_balance", white_balance, WHITE_BALANCES)
+        if white_balance == "auto":
+            return auto_balance(raw)
         factors = {"as shot": raw.white_balance, "daylight": raw.daylight_balance, "none": none}[white_balance]
         if factors is None:
             raise ValueError(f"the capture has no white balance {white_balance!r}: choose another or give factors")

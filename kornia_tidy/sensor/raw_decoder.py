@@ -15,6 +15,8 @@ import sys
 from typing import Any
 
 LARGEST_TILE = 6  # X-Trans
+LOADED = "loaded"  # printed as soon as NumPy and LibRaw are: a crash before is not the file's doing
+C330_LENGTHS = (2247168, 3370752)  # by which LibRaw tells the pictures of a Kodak C330, which have no header
 
 
 def main() -> None:
@@ -52,12 +54,18 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
     from raw_tags import (  # noqa: PLC0415  # ty: ignore[import-not-found]
         black_tile,
         camera_tags,
+        filter_array_fault,
         kodak_matrix,
         missing_bytes,
+        tiff_directories,
+        white_levels,
     )
 
+    sys.stderr.write(LOADED + "\n")  # not buffered
     if missing := missing_bytes(data):
         raise ValueError(f"it is cut short, {missing} bytes of its picture are missing")
+    if fault := filter_array_fault(data):
+        raise ValueError(fault)
     raw = rawpy.imread(io.BytesIO(data))  # left open: the counts are LibRaw's own memory
     counts = np.ascontiguousarray(raw.raw_image_visible)
     sizes, levels = raw.sizes, raw.black_level_per_channel
@@ -74,6 +82,9 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
             black = mean_over_tile(tile, len(pattern), len(pattern[0]))
     if counts.ndim == 3:
         counts = np.ascontiguousarray(counts[..., :channels])
+    white = raw.white_level
+    if counts.ndim == 3 and len(set(levels)) == 1 and white + levels[0] in white_levels(data):
+        white += levels[0]  # LibRaw takes one black level for all channels off white, but not off the counts
     camera_to_srgb = raw.color_matrix.tolist()
     if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw reads the tag too, and keeps it to itself
         camera_to_srgb = kodak_matrix(data) or camera_to_srgb
@@ -82,7 +93,7 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         "pattern": pattern,
         "colors": colors,
         "black": black,
-        "white": raw.white_level,
+        "white": white,
         "xyz_to_camera": raw.rgb_xyz_matrix.tolist(),
         "camera_to_srgb": camera_to_srgb,
         "white_balance": raw.camera_whitebalance,
@@ -91,7 +102,19 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         "pixel_aspect": sizes.pixel_aspect,
         "info": {**camera_tags(data), **libraw_info(raw)},
     }
+    if counts.ndim == 3 and len(data) in C330_LENGTHS and not any(tiff_directories(data)):
+        header |= finished_colors()
     return header, counts.data.cast("B")
+
+
+def finished_colors() -> dict[str, Any]:
+    """Return the colours, the balance and the name of a Kodak C330, whose YCbCr is balanced and of sRGB."""
+    return {
+        "camera_to_srgb": [[float(row == column) for column in range(4)] for row in range(3)],
+        "white_balance": [1.0] * 4,
+        "daylight_balance": [1.0] * 4,
+        "info": {"make": "Kodak", "model": "C330"},
+    }
 
 
 def filter_pattern(raw: Any) -> list[list[int]]:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from io import SEEK_END
@@ -20,6 +21,8 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.files import check_file
+from kornia_tidy.sensor.raw_decoder import C330_LENGTHS, LOADED
+from kornia_tidy.sensor.raw_plausible import is_c330
 
 Source = str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryIO
 
@@ -51,6 +54,7 @@ OUT_OF_MEMORY_WORDS = (
     "failed to map segment",
     "Cannot allocate memory",
     "Memory allocation still failed",
+    "returned a result with an exception set",  # NumPy, as it is loaded
 )
 
 
@@ -65,6 +69,9 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it cannot be decoded, for whatever reason, within these limits.
+
+    Warns:
+        UserWarning: if its length alone says what it is.
     """
     check_positive("timeout", timeout, "seconds")
     check_positive("memory_limit", memory_limit, "bytes")
@@ -72,7 +79,14 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
     with _opened(source) as file, TemporaryFile() as result:
         length = file.seek(0, SEEK_END)
         file.seek(0)
-        check_beginning(name, file.read(16))
+        beginning = file.read(16)
+        if length in C330_LENGTHS and not begins_as_raw(beginning) and is_c330(beginning + file.read()):
+            warnings.warn(
+                f"{name} has no header: by its length of {length} bytes it is taken for a picture of a Kodak C330",
+                stacklevel=3,
+            )
+        else:
+            check_beginning(name, beginning)
         file.seek(0)  # where the process begins to read
         try:
             complaint = _complaint(*_run(file, result, timeout, memory_limit), memory_limit)
@@ -116,7 +130,7 @@ def check_beginning(name: str, data: bytes) -> None:
     """Refuse what does not begin as raw files do, before LibRaw guesses what it is from its size."""
     if not data:
         raise ValueError(f"cannot read {name}: the file is empty")
-    if any(data.startswith(beginning, place) for place, all_ in BEGINNINGS.items() for beginning in all_):
+    if begins_as_raw(data):
         return
     if data.startswith((b"\xff\xd8\xff", b"\x89PNG")):
         raise ValueError(f"cannot read {name}: it is a JPEG or PNG picture, not a raw file")
@@ -124,6 +138,11 @@ def check_beginning(name: str, data: bytes) -> None:
         f"cannot read {name}: it does not begin as raw files do; if it is a bare dump of the counts, give its size, "
         "data type, filter pattern, black and white levels"
     )
+
+
+def begins_as_raw(data: bytes) -> bool:
+    """Return whether bytes are the beginning of a raw file with a header."""
+    return any(data.startswith(beginning, place) for place, all_ in BEGINNINGS.items() for beginning in all_)
 
 
 @contextmanager
@@ -168,8 +187,11 @@ def _complaint(status: int, printed: str, memory_limit: int) -> str | None:
     """Return what an exit status and printed words mean; None if all went well."""
     if status < 0:
         name = Signals(-status).name
-        slow = "decoding it took more processor time than it may use"
-        return slow if name == "SIGXCPU" else f"LibRaw crashed on it ({name})"
+        if name == "SIGXCPU":
+            return "decoding it took more processor time than it may use"
+        if LOADED not in printed.split():
+            return f"its decoder crashed before it was loaded ({name}): is {_memory(memory_limit)} too little?"
+        return f"LibRaw crashed on it ({name})"
     return _failure(printed, memory_limit) if status else None
 
 
@@ -206,10 +228,15 @@ def _sentence(header: dict[str, Any], memory_limit: int) -> str:
 
 def _failure(text: str, memory_limit: int) -> str:
     """Return what the words of a decoder mean that did not come to an answer."""
+    text = text.removeprefix(LOADED)
     if any(words in text for words in OUT_OF_MEMORY_WORDS):
         return _too_much(memory_limit)
     return f"its decoder failed ({' '.join(text.split())[-200:]})"
 
 
 def _too_much(memory_limit: int) -> str:
-    return f"decoding it needs more than the {memory_limit / 2**20:.0f} MiB of memory that it may use"
+    return f"decoding it needs more than {_memory(memory_limit)}"
+
+
+def _memory(limit: int) -> str:
+    return f"the {limit / 2**20:.0f} MiB of memory that it may use"

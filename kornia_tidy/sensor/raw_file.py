@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.sensor.develop import develop
 from kornia_tidy.sensor.filter_array import filter_tile, tile_planes, tiled
 from kornia_tidy.sensor.raw_decoding import Source, decode_raw, source_bytes, source_name
-from kornia_tidy.sensor.raw_plausible import check_plausible
+from kornia_tidy.sensor.raw_plausible import check_plausible, plausible_white
 
 if TYPE_CHECKING:
     from kornia_tidy.sensor.noise import SensorNoise
@@ -97,7 +97,9 @@ class RawCapture:
     info: RawInfo = field(default_factory=RawInfo)
 
     @classmethod
-    def open(cls, source: Source, *, timeout: float = 60.0, memory_limit: int = 2**31) -> RawCapture:
+    def open(
+        cls, source: Source, *, white: float | None = None, timeout: float = 60.0, memory_limit: int = 2**31
+    ) -> RawCapture:
         """Read a camera raw file, whatever is in it: a picture comes back, or one sentence.
 
         LibRaw decodes it in a process of its own, within these limits, so that a file that makes it crash, hang or
@@ -105,6 +107,7 @@ class RawCapture:
 
         Args:
             source: a path, the bytes of a file, or a binary file.
+            white: saturation count. Default: the file's or, where its counts show that it lies, their largest.
             timeout: seconds that decoding may take.
             memory_limit: bytes of memory that decoding may use.
 
@@ -114,19 +117,22 @@ class RawCapture:
                 without a picture, or too much for the limits.
 
         Warns:
-            UserWarning: if more than one count in a thousand lies above the file's white level.
+            UserWarning: if the file's white level lies, or more than one count in a thousand lies above white; and
+                if the length of a file without a header alone says that it is a Kodak C330's.
 
         Convention:
             The visible area only, without masked borders; a JPEG-like tone curve, if the file has one, is undone.
         """
+        if white is not None:
+            check_positive("white", white, "counts")
         header, counts, length = decode_raw(source, timeout, memory_limit)
         name = source_name(source)
         try:
-            raw = _from_header(header, counts)
+            raw = _from_header(header if white is None else {**header, "white": white}, counts)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"cannot read {name}: what it says of its sensor makes no sense ({error})") from None
         check_plausible(name, raw.counts, raw.black, raw.white, length)
-        return raw
+        return replace(raw, white=plausible_white(name, raw.counts, raw.white, given=white is not None))
 
     @classmethod
     def open_dump(
@@ -154,6 +160,9 @@ class RawCapture:
             FileNotFoundError: if there is no such file.
             ValueError: if the file's length is not that of these counts, or they are implausible.
 
+        Warns:
+            UserWarning: if more than one count in a thousand lies above white.
+
         Example:
             >>> data = bytes([1, 2, 1, 3, 1, 4, 2, 0])
             >>> RawCapture.open_dump(data, (2, 2), "RGGB", black=256, white=1023, byte_order="big").counts
@@ -175,6 +184,7 @@ class RawCapture:
         counts = torch.from_numpy(np.frombuffer(data, layout).astype(np.int32).reshape(1, height, width))
         raw = cls.from_counts(counts, pattern, black, white)
         check_plausible(name, raw.counts, raw.black, raw.white, len(data))
+        plausible_white(name, raw.counts, raw.white, given=True)
         return raw
 
     @classmethod

@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import warnings
 
+import numpy as np
 from torch import Tensor
 
 LEAST_BITS = 0.05  # a pixel; lossy compression of an empty picture takes twice as many
 MOST_ABOVE_WHITE = 1e-3  # of the counts: hot pixels may lie there
+# A white level is taken for wrong if more than this share of the counts is above this multiple of it. Noise, and
+# channels that saturate one after the other, stay within 10 % of white; hot pixels are few.
+LIES = ((1e-2, 1.1), (1e-3, 1.5))
+C330_ROWS, C330_ROW = 912, 2464  # bytes: Y Cb Y Cr ...
+C330_BLOCK, C330_GAP = 32, 16  # rows, in the longer files
+MOST_LUMA_STEP, MOST_CHROMA_STEP = 32, 16  # on average, from one sample to the next; text and noise have more
+GREY, MOST_COLOR = 128, 64  # of chroma, and how far from it a picture's may lie on average
+
+
+def is_c330(data: bytes) -> bool:
+    """Return whether bytes, whole rows, are like those of a Kodak C330: YCbCr, half as many Cb and Cr, no header."""
+    rows = np.frombuffer(data, np.uint8).reshape(-1, C330_ROW).astype(np.int16)
+    if len(rows) > C330_ROWS:
+        rows = rows[np.arange(len(rows)) % (C330_BLOCK + C330_GAP) < C330_BLOCK]
+    luma, blue, red = rows[:C330_ROWS, ::2], rows[:C330_ROWS, 1::4], rows[:C330_ROWS, 3::4]
+    return all(
+        np.abs(np.diff(plane)).mean() < most
+        for plane, most in ((luma, MOST_LUMA_STEP), (blue, MOST_CHROMA_STEP), (red, MOST_CHROMA_STEP))
+    ) and all(abs(plane.mean() - GREY) < MOST_COLOR for plane in (blue, red))
 
 
 def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, length: int) -> None:
-    """Refuse counts that no sensor wrote, and warn of a white level that the counts contradict.
+    """Refuse counts that no sensor wrote.
 
     Args:
         name: of the file, for the sentence.
@@ -23,9 +43,6 @@ def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, leng
     Raises:
         ValueError: if the file is too short for its picture, all counts are the same or below black, or white is not
             above black.
-
-    Warns:
-        UserWarning: if more than one count in a thousand lies above white.
     """
     height, width = counts.shape[-2:]
     if 8 * length < LEAST_BITS * height * width:
@@ -37,12 +54,42 @@ def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, leng
         raise ValueError(f"cannot read {name}: all its {width} x {height} counts are {low}, so it holds no picture")
     least, most = (float(end) for end in black.aminmax())
     if not most < white < float("inf"):
-        raise ValueError(f"cannot read {name}: its white level {white:g} is not above its black level {most:g}")
+        raise ValueError(
+            f"cannot read {name}: its white level {white:g} is not above its black level {most:g}: give "
+            "the right one (white=..., --white N)"
+        )
     if high < least:
         raise ValueError(f"cannot read {name}: all its counts are below its black level {least:g}")
-    if high > white and (share := float((counts > white).float().mean())) > MOST_ABOVE_WHITE:
+
+
+def plausible_white(name: str, counts: Tensor, white: float, given: bool) -> float:
+    """Return a white level, or the largest count where a file's level lies: the picture would be all white.
+
+    Args:
+        name: of the file, for the sentence.
+        counts: (C, H, W).
+        white: saturation count.
+        given: by the user, who knows better than the file.
+
+    Warns:
+        UserWarning: if a file's level lies, or more than one count in a thousand lies above white.
+    """
+    high = int(counts.max())
+
+    def share(level: float) -> float:
+        return float((counts > level).float().mean()) if high > level else 0.0
+
+    if not given and any(share(factor * white) > most for most, factor in LIES):
         warnings.warn(
-            f"{name}: {100 * share:.2g} % of the counts lie above the white level {white:g}, up to {high}: "
-            "it may be wrong",
-            stacklevel=2,
+            f"{name}: its white level {white:g} lies, as its counts reach {high}, which is taken for white: "
+            "if you know the right one, give it (white=..., --white N)",
+            stacklevel=3,
         )
+        return float(high)
+    if (above := share(white)) > MOST_ABOVE_WHITE:
+        warnings.warn(
+            f"{name}: {100 * above:.2g} % of the counts lie above the white level {white:g}, up to {high}: "
+            "it may be wrong; if so, give the right one (white=..., --white N)",
+            stacklevel=3,
+        )
+    return white

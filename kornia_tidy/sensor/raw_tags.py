@@ -1,33 +1,45 @@
-"""Names, exposure, black levels and colours from the tags of a raw file, whatever nonsense these hold.
+"""Names, exposure, levels, filter array and colours from the tags of a raw file, whatever nonsense these hold.
 
 LibRaw's Python package does not tell who built the camera, nor a black level that differs between places of a large
 tile, nor the colour matrix of Kodak's first cameras. The decoding process runs this file, so it imports nothing but the
 standard library.
 
-Source: TIFF 6.0, section 2; Exif 2.32, 4.6; DNG 1.7, BlackLevel; Canon's CRW by P. Harvey's notes on its format;
-Kodak's matrix by what dcraw takes it for.
+Source: TIFF 6.0, section 2; TIFF/EP, CFAPattern; Exif 2.32, 4.6; DNG 1.7, BlackLevel, WhiteLevel, CFAPlaneColor and
+CFALayout; Canon's CRW by P. Harvey's notes on its format; Kodak's matrix by what dcraw takes it for.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Any
 
 TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 7: "s", 10: "ii", 11: "f", 12: "d", 13: "I"}  # of TIFF's fields
 SUB_DIRECTORIES = (0x014A, 0x8769)  # SubIFDs, Exif
 MOST_DIRECTORIES, MOST_ENTRIES, MOST_BYTES = 32, 512, 1 << 16
+MOST_SHOWN = 8  # numbers in a sentence
 
 TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
 NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
 TIMES = (0x9003, 0x0132)
 SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL = 0x00FE, 0xC612, 0xC619, 0xC61A
-KODAK_MATRIX = 0x9218
+WHITE_LEVEL, KODAK_MATRIX = 0xC61D, 0x9218
+PHOTOMETRIC, FILTER_ARRAY = 0x0106, 32803  # and its value of a picture behind a filter array
+FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT = 0x828D, 0x828E, 0xC616, 0xC617
+LARGEST_FILTER_TILE = 8  # rows or columns; DNG names no limit, X-Trans has 6
+COLOR_CODES = range(7)  # red, green, blue, cyan, magenta, yellow, white
 STORED = ((0x0111, 0x0117), (0x0144, 0x0145))  # where strips and tiles begin, and their lengths
 QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
 CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
+
+# Tags that are read; a hostile file may hold 64 KiB behind each of the others.
+WANTED = frozenset(
+    [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, *STORED) for tag in tags]
+    + [SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, KODAK_MATRIX, PHOTOMETRIC]
+    + [FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT, *SUB_DIRECTORIES]
+)
 
 Directory = dict[int, tuple[Any, ...]]
 
@@ -61,6 +73,66 @@ def black_tile(data: bytes) -> list[list[float]] | None:
         if max(rows, columns) > 2 and len(levels) == rows * columns and all(map(math.isfinite, levels)):
             return [list(levels[row * columns : (row + 1) * columns]) for row in range(rows)]
     return None
+
+
+def white_levels(data: bytes) -> set[int]:
+    """Return what white levels a DNG names, those of its previews among them."""
+    return {level for directory in tiff_directories(data) for level in _whole_numbers(directory, WHITE_LEVEL)}
+
+
+def filter_array_fault(data: bytes) -> str | None:
+    """Return how the filter array tags of a DNG contradict each other, in words; None if they agree or it is no DNG.
+
+    LibRaw takes colours from beyond its tables where a pattern speaks of colours that are not there, and takes the
+    array for another one or for none where sizes do not fit. Every directory counts, as LibRaw takes the pattern from
+    whichever it meets.
+
+    Example:
+        >>> filter_array_fault(b"no DNG") is None
+        True
+    """
+    directories = list(tiff_directories(data))
+    if not directories or DNG_VERSION not in directories[0]:
+        return None
+    faults = [_fault(one) for one in directories if FILTER_PATTERN in one or _behind_filters(one)]
+    return next((fault for fault in faults if fault), None)
+
+
+def _behind_filters(directory: Directory) -> bool:
+    return FILTER_ARRAY in directory.get(PHOTOMETRIC, ())
+
+
+def _fault(directory: Directory) -> str | None:
+    """Return how the filter array tags of one directory contradict each other."""
+    pattern = _codes(directory, FILTER_PATTERN)
+    if not pattern:
+        return "its CFAPattern is missing or cannot be read"
+    size = _whole_numbers(directory, FILTER_REPEAT)
+    rows, columns = size if len(size) == 2 else (0, 0)
+    if not (0 < rows <= LARGEST_FILTER_TILE and 0 < columns <= LARGEST_FILTER_TILE):
+        return f"its CFARepeatPatternDim is {_listed(size)}, not two numbers from 1 to {LARGEST_FILTER_TILE}"
+    if len(pattern) != rows * columns:
+        return f"its CFAPattern has {len(pattern)} entries, its CFARepeatPatternDim says {rows} x {columns}"
+    colors = _codes(directory, FILTER_COLORS) if FILTER_COLORS in directory else (0, 1, 2)
+    if not 0 < len(colors) == len(set(colors) & set(COLOR_CODES)):
+        return f"its CFAPlaneColor is {_listed(colors)}, not different colours from 0 to {COLOR_CODES[-1]}"
+    if beyond := sorted(set(pattern) - set(colors)):
+        return f"its CFAPattern holds {_listed(beyond)}, which is not among its colours {_listed(colors)}"
+    layout = _whole_numbers(directory, FILTER_LAYOUT) if FILTER_LAYOUT in directory else (1,)
+    if layout != (1,):
+        return f"its CFALayout is {_listed(layout)}, and only 1, pixels in rows and columns, can be decoded"
+    return None
+
+
+def _codes(directory: Directory, tag: int) -> tuple[int, ...]:
+    """Return the values of a tag of bytes, also where they were written as undefined."""
+    values = directory.get(tag, ())
+    return tuple(values[0]) if values and isinstance(values[0], bytes) else _whole_numbers(directory, tag)
+
+
+def _listed(values: Sequence[int]) -> str:
+    shown = " ".join(map(str, values[:MOST_SHOWN])) or "empty"
+    return shown if len(values) <= MOST_SHOWN else f"{shown} ..."
 
 
 def kodak_matrix(data: bytes) -> list[list[float]] | None:
@@ -102,16 +174,15 @@ def tiff_directories(data: bytes) -> Iterator[Directory]:
     left = MOST_DIRECTORIES
     for base in _tiff_headers(data):
         order = "<" if data[base : base + 2] == b"II" else ">"
-        waiting, seen = [_unpack(data, f"{order}I", base + 4, base)], set()
+        waiting = list(_unpack(data, f"{order}I", base + 4, base))
+        seen = {0, *waiting}  # 0: none follows
         while waiting and left:
-            offset = waiting.pop(0)
-            if not offset or offset[0] in seen:
-                continue
-            seen.add(offset[0])
             left -= 1
-            directory, following = _directory(data, base, order, offset[0])
-            waiting += [(below,) for tag in SUB_DIRECTORIES for below in directory.get(tag, ()) if type(below) is int]
-            waiting.append(following)
+            directory, following = _directory(data, base, order, waiting.pop(0))
+            below = [offset for tag in SUB_DIRECTORIES for offset in _whole_numbers(directory, tag)[:MOST_DIRECTORIES]]
+            fresh = [offset for offset in dict.fromkeys([*below, *following]) if offset not in seen]
+            waiting += fresh
+            seen.update(fresh)
             yield directory
 
 
@@ -125,24 +196,31 @@ def _tiff_headers(data: bytes) -> list[int]:
 
 
 def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directory, tuple[Any, ...]]:
+    """Return a directory, and where the next one begins. What cannot be read, or is said twice, has no values."""
     start = base + offset
     count = min((_unpack(data, f"{order}H", start) or (0,))[0], MOST_ENTRIES)
     directory: Directory = {}
     for entry in range(start + 2, start + 2 + 12 * count, 12):
         tag, kind, number = _unpack(data, f"{order}HHI", entry) or (0, 0, 0)
-        if kind not in TYPES or tag in directory:
-            continue
-        code = TYPES[kind]
-        size = number * struct.calcsize(f"={code}")
-        if not 0 < size <= MOST_BYTES:
-            continue
-        place = _unpack(data, f"{order}I", entry + 8) if size > 4 else (entry + 8 - base,)
-        letters = f"{number}s" if code == "s" else code * number
-        values = _unpack(data, order + letters, base + place[0]) if place else ()
-        if len(code) == 2:
-            values = tuple(a / b if b else math.nan for a, b in zip(values[::2], values[1::2], strict=True))
-        directory[tag] = values
+        if tag in WANTED:
+            values = _entry_values(data, base, order, entry + 8, kind, number)
+            # Said twice and differently, LibRaw may believe the other.
+            directory[tag] = values if directory.get(tag, values) == values else ()
     return directory, _unpack(data, f"{order}I", start + 2 + 12 * count)
+
+
+def _entry_values(data: bytes, base: int, order: str, field: int, kind: int, number: int) -> tuple[Any, ...]:
+    """Return the values of an entry, which lie in its last field or where that points to."""
+    code = TYPES.get(kind, "")
+    size = number * struct.calcsize(f"={code}")
+    if not 0 < size <= MOST_BYTES:
+        return ()
+    place = _unpack(data, f"{order}I", field) if size > 4 else (field - base,)
+    letters = f"{number}s" if code == "s" else code * number
+    values = _unpack(data, order + letters, base + place[0]) if place else ()
+    if len(code) == 2:
+        values = tuple(a / b if b else math.nan for a, b in zip(values[::2], values[1::2], strict=True))
+    return values
 
 
 def _unpack(data: bytes, layout: str, offset: int, least: int = 0) -> tuple[Any, ...]:

@@ -20,7 +20,7 @@ LADDERS: dict[str, tuple[Value, ...]] = {
     PRESET: tuple(PRESETS),
     "layers": LAYERS,
     "layer_spacing": (2.5, 2.0, 1.0, 0.5),
-    "pixel_tolerance": (1.0, 1e-1, 2e-2, 1e-3, 1e-6),  # the first samples the middle of a pixel, no more
+    "pixel_tolerance": (1.0, 1e-1, 1e-2, 1e-3, 1e-6),  # the first samples the middle of a pixel, no more
     "window": (9, 17, 33, 65, 129, 257),
     "enclosed_energy": (0.5, 0.6, 0.7, 0.8, 0.9),
     "stray_light": STRAY_LIGHT,

@@ -7,6 +7,8 @@ import copy
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera_settings import EXTRA_STATE
+
 
 class MovingAverage(nn.Module):
     r"""A copy of a network whose weights follow those of the original slowly.
@@ -50,6 +52,8 @@ class MovingAverage(nn.Module):
         decay = min(self.decay, (1 + steps) / (10 + steps))
         learnt = {name for name, _ in network.named_parameters()}
         for (name, own), new in zip(self.network.state_dict().items(), network.state_dict().values(), strict=True):
+            if name.endswith(EXTRA_STATE):  # settings, of which there is no average
+                continue
             if name in learnt:
                 own.lerp_(new, 1 - decay)
             else:

@@ -9,6 +9,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera_settings import EXTRA_STATE
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
@@ -64,7 +65,7 @@ class TidyTraining(pl.LightningModule):
     noise comes from the global generator).
 
     Args:
-        optics: the camera. Its PSF window is fixed where it is, for the masks' sake.
+        optics: the camera. Masks in training keep its PSF window, which checkpoints tell.
         head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint.
         task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is learnt as :func:`~kornia_tidy.training.tasks.nearness`.
         loss: of a map, its truth and its validity; the same for all maps.
@@ -109,7 +110,7 @@ class TidyTraining(pl.LightningModule):
         check_choice("schedule", schedule, SCHEDULES)
         check_positive("lr", lr)
         check_positive("lr_metres", lr_metres, "metres")
-        self.optics = fix_window(optics)
+        self.optics = optics
         self.head = head
         self.average = MovingAverage(head, ema) if ema else None
         self.task, self.loss, self.settings = task, loss, settings
@@ -128,7 +129,8 @@ class TidyTraining(pl.LightningModule):
         optics = build_optics(settings)
         if design and settings.design and settings.masks:
             design_masks(optics, settings.design, progress=progress)
-            optics.fidelity = optics.fidelity.replace(window=settings.window)  # that of the masks as they are now
+            optics.fidelity = optics.fidelity.replace(window=settings.window)
+            fix_window(optics)  # that of the masks as they are now
         return cls(
             optics,
             build_head(settings),
@@ -222,6 +224,8 @@ class TidyTraining(pl.LightningModule):
         """
         here = {"task": self.task, **describe(self.optics, self.head)}
         stored = {"task": checkpoint.get("task"), **checkpoint.get("description", {})}
+        if f"optics.{EXTRA_STATE}" in checkpoint["state_dict"]:  # it tells the fidelity in full, and the window to take
+            here["fidelity"] = stored.get("fidelity", "")
         if other := differences(stored, here):
             raise ValueError(f"the checkpoint does not fit (checkpoint / here): {'; '.join(other)}")
         check_weights(self, checkpoint["state_dict"], "the checkpoint")

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera_settings import EXTRA_STATE
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.initial_masks import initial_heights
 from kornia_tidy.optics.phase_masks import FresnelLens, PixelwiseMask
@@ -63,7 +64,7 @@ def _masks(settings: TrainingSettings) -> PhaseMasks:
 
 
 def fix_window(optics: TiDyOptics) -> TiDyOptics:
-    """Fix a camera's PSF window where it is, in place: masks in training would else change it when they are loaded."""
+    """Fix a camera's PSF window where it is, in place: that of masks as they were before training is for all of it."""
     optics.fidelity = optics.fidelity.replace(window=optics.window)
     return optics
 
@@ -130,7 +131,8 @@ def load_weights(
         name: how messages call the checkpoint.
 
     Raises:
-        ValueError: if a weight is missing, unknown or of another shape; nothing is loaded then.
+        ValueError: if a weight is missing, unknown or of another shape, or the camera is another one; nothing is loaded
+            then.
     """
     state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
     name = name or str(checkpoint)
@@ -158,7 +160,11 @@ def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -
         ...
         ValueError: a.safetensors does not fit: missing bias; weight is (1, 3), wanted (1, 2)
     """
-    own = module.state_dict()
+    # A camera checks its settings itself.
+    weights, own = (
+        {key: value for key, value in state.items() if not key.endswith(EXTRA_STATE)}
+        for state in (weights, module.state_dict())
+    )
     missing, unknown = [key for key in own if key not in weights], [key for key in weights if key not in own]
     faults = [f"{word} {_some(keys)}" for word, keys in (("missing", missing), ("unknown", unknown)) if keys]
     faults += [
@@ -172,7 +178,8 @@ def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -
 
 def describe(optics: TiDyOptics, head: nn.Module) -> dict[str, str]:
     """Return in words what no weight tells: which lens, sensor and network these are."""
-    parts = {name: repr(getattr(optics, name)) for name in ("camera", "sensor", "fidelity")}
+    parts = {name: repr(getattr(optics, name)) for name in ("camera", "sensor")}
+    parts |= {"fidelity": repr(optics.fidelity.replace(window=optics.window))}
     parts |= {name: str(getattr(optics, name)) for name in ("compositing", "color_space", "border")}
     parts |= {name: type(getattr(optics, name)).__name__ for name in ("masks", "modulator")}
     return {**parts, "head": type(head).__name__}

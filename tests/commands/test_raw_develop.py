@@ -12,7 +12,8 @@ from kornia_tidy.commands import raw_develop
 from kornia_tidy.data.image_files import read_image
 from kornia_tidy.sensor.raw_file import RawCapture
 from tests.base import BaseTester
-from tests.sensor.dng import dng
+from tests.sensor.c330 import ramp
+from tests.sensor.dng import dng, patched
 
 
 @pytest.fixture
@@ -73,6 +74,34 @@ class TestRawDevelop(BaseTester):
         assert main(["raw", "develop", str(tmp_path / "dump.raw"), "-o", str(tmp_path), *levels.split()]) == 0
         assert read_image(tmp_path / "dump.png").shape == (3, 24, 30)
 
+    @pytest.mark.filterwarnings("default::UserWarning")
+    def test_feature_automatic_balance_of_what_says_none(self, tmp_path, capsys):
+        """Without AsShotNeutral LibRaw has daylight from the matrix; a grey scene under a green light turns grey."""
+        grey = np.random.default_rng(0).integers(20, 80, (12, 16)).repeat(2, 0).repeat(2, 1)
+        counts = 64 + grey * np.tile([[6, 9], [9, 3]], (12, 16))
+        (tmp_path / "green.dng").write_bytes(patched(dng(counts), 50728, tag=50700))
+        out = ["-o", str(tmp_path), "--demosaic", "half", "--linear"]
+        assert main(["raw", "develop", str(tmp_path / "green.dng"), *out]) == 0
+        told = capsys.readouterr().err
+        assert told.startswith("kornia-tidy: warning: a file without a white balance as shot is balanced for daylight")
+        assert told.count("\n") == 1
+        casts = read_image(tmp_path / "green.png").mean((1, 2))
+        assert main(["raw", "develop", str(tmp_path / "green.dng"), *out, "--white-balance", "auto"]) == 0
+        assert capsys.readouterr().err == ""
+        mean = read_image(tmp_path / "green.png").mean((1, 2))
+        assert casts.argmax() == 1
+        self.assert_close(mean, mean.mean().expand(3), rtol=5e-3, atol=0)
+
+    @pytest.mark.filterwarnings("default::UserWarning")
+    def test_feature_kodak_c330(self, tmp_path, capsys):
+        (tmp_path / "a.raw").write_bytes(ramp())
+        assert main(["raw", "develop", str(tmp_path / "a.raw"), "-o", str(tmp_path)]) == 0
+        told = capsys.readouterr()
+        assert "1216 x 912 px, no filter array, white balance R 1 G 1 B 1, the file's matrix" in told.out
+        assert told.err.count("\n") == 1
+        assert "is taken for a picture of a Kodak C330" in told.err
+        assert read_image(tmp_path / "a.png").shape == (3, 912, 1216)
+
     def test_feature_resume_keeps_what_is_there(self, files, tmp_path, capsys):
         good = [files[0], files[2]]
         command = ["raw", "develop", *good, "-o", str(tmp_path), "--resume"]
@@ -106,7 +135,7 @@ class TestRawDevelop(BaseTester):
     @pytest.mark.parametrize(
         ("extra", "message"),
         [
-            (["--white-balance", "cloudy"], "--white-balance is as-shot, daylight, none, or factors, got cloudy"),
+            (["--white-balance", "cloudy"], "--white-balance is as-shot, daylight, auto, none, or factors, got cloudy"),
             (["--white-balance", "1", "2"], "white_balance must be 3 positive factors, of R, G, B, got [1.0, 2.0]"),
             (["--demosaic", "libraw_markesteijn"], "LibRaw's demosaicing of a Bayer array must be one of"),
             (["elsewhere/a.cr2"], "a.dng and elsewhere/a.cr2 would both become"),

@@ -66,6 +66,23 @@ class TestRawInfo(BaseTester):
             "error": "cannot read short.dng: it is cut short, 9 bytes of its picture are missing",
         }
 
+    @pytest.mark.filterwarnings("default::UserWarning")
+    def test_feature_a_white_level_that_lies_is_told_once(self, folder, capsys):
+        counts = np.random.default_rng(0).integers(64, 54999, (36, 48))
+        counts[0, 0] = 54998
+        (folder / "lie.dng").write_bytes(dng(counts, white=255))
+        assert run("info lie.dng lie.dng") == 0
+        told = capsys.readouterr()
+        assert told.out.count("black 64, white 54998; counts") == 2
+        assert told.err == (
+            "kornia-tidy: warning: lie.dng: its white level 255 lies, as its counts reach 54998, which is taken for "
+            "white: if you know the right one, give it (white=..., --white N)\n"
+        )
+        assert run("info lie.dng --white 60000") == 0
+        told = capsys.readouterr()
+        assert "white 60000" in told.out
+        assert told.err == ""
+
     def test_feature_a_dump_once_it_is_described(self, folder, capsys):
         assert run("info dump.raw") == 2
         assert "if it is a bare dump of the counts, give its size" in capsys.readouterr().err
@@ -79,7 +96,8 @@ class TestRawInfo(BaseTester):
     @pytest.mark.parametrize(
         ("options", "reason"),
         [
-            ("--white 1023", "--white is for bare dumps of counts: give --size too"),
+            ("--black 10", "--black is for bare dumps of counts: give --size too"),
+            ("--white 1023", "if it is a bare dump of the counts, give its size"),
             ("--size 48x36 --pattern RGGB --black 0", "a bare dump of counts needs --white"),
             (
                 "--size 48x35 --pattern RGGB --black 0 --white 9",

@@ -53,7 +53,8 @@ def raw_file(size=(60, 80), seed=0):
     """A DNG of a camera whose colours are those of sRGB."""
     light = torch.rand(3, *size, generator=torch.Generator().manual_seed(seed))
     camera = RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095)
-    return encode_dng(simulate_raw(light, replace(camera, camera_to_srgb=torch.eye(3))))
+    camera = replace(camera, camera_to_srgb=torch.eye(3), white_balance=torch.ones(4))
+    return encode_dng(simulate_raw(light, camera))
 
 
 @pytest.fixture
@@ -203,7 +204,14 @@ class TestRawReconstruct(BaseTester):
         counts.tofile(tmp_path / "a.raw")
         options = ["--size", "80x64", "--pattern", "GRBG", "--black", "64", "--white", "1024"]
         args = raw_reconstruct.argparse.Namespace(
-            size=(64, 80), pattern="GRBG", black=[64.0], white=1024.0, dtype=None, byte_order=None, linear=False
+            size=(64, 80),
+            pattern="GRBG",
+            black=[64.0],
+            white=1024.0,
+            dtype=None,
+            byte_order=None,
+            linear=False,
+            white_balance=None,
         )
         light, _, _ = raw_reconstruct.read_light(str(tmp_path / "a.raw"), args)
         assert light.shape == (3, 64, 80)
@@ -216,7 +224,7 @@ class TestRawReconstruct(BaseTester):
         image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
         files = [str(DATA / "raw" / "colinleroy+a2tools" / "QKTK_IMAGE01.QTK")]
-        assert reconstruct(files, weights, tmp_path / "out") == 0
+        assert reconstruct(files, weights, tmp_path / "out", "--white-balance", "auto") == 0
         for suffix in (".png", ".jpg"):
             with image.open(tmp_path / "out" / f"QKTK_IMAGE01{suffix}") as picture:
                 assert picture.getexif()[0x010F] == "Apple"

@@ -50,6 +50,16 @@ class TestRawSimulate(BaseTester):
         assert torch.equal(back.counts, raw.counts)
         assert (back.pattern, back.white, float(back.black[0, 0])) == (raw.pattern, 16383, 1024)
 
+    def test_feature_a_sensor_in_words_has_the_pictures_colours(self, scene):
+        """The file says that its red, green and blue are sRGB's: developed by itself it shows the picture."""
+        assert main([*SCENE, "-o", "out.dng", "--full-well", "1e7", "--read-noise", "0", "--bits", "16"]) == 0
+        raw = RawCapture.open("out.dng")
+        # The fractions of the file are of a millionth, twice; the inverse of the matrix makes at most seven of it.
+        self.assert_close(raw.camera_to_srgb, torch.eye(3), atol=1e-4, rtol=0)
+        self.assert_close(raw.white_balance, torch.ones(4), atol=1e-5, rtol=0)
+        light = raw.planes()[[0, 1, 3]]
+        self.assert_close(raw.to_rgb("half", encoded=False)[[0, 2]], light[[0, 2]].clamp(max=1), atol=1e-3, rtol=0)
+
     def test_feature_like_a_file_with_a_calibration(self, scene):
         assert main([*SCENE, "-o", "first.dng", "--pattern", "BGGR", "--bits", "10", "--black", "50"]) == 0
         line = TransferLine(10.0, 0.1, 5.0, 0.1, 0.0, 1.0, 1000)
@@ -70,7 +80,8 @@ class TestRawSimulate(BaseTester):
             (["-o", "out.dng", "--like", "a.dng", "--bits", "12"], "leave out --bits"),
             (["-o", "out.dng", "--noise", "n.json", "--read-noise", "2"], "leave out --full-well and --read-noise"),
             (["-o", "out.dng", "--pattern", "RGB"], "a filter array's tile has 4 or 36 letters, got 'RGB'"),
-            (["-o", "out.dng", "--color", "camera"], "carries no matrix"),
+            (["-o", "out.dng", "--pattern", "GMYC"], "needs a camera of red, green and blue"),
+            (["-o", "out.dng", "--white", "1000"], "--white is of the file of --like: give that, or --bits"),
         ],
     )
     def test_exception_is_one_sentence_and_nothing_is_written(self, scene, capsys, arguments, message):

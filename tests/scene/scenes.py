@@ -74,11 +74,22 @@ def brute_blur(plane: np.ndarray, psf: np.ndarray, border: str) -> np.ndarray:
     return out
 
 
+def brute_share_within(height: int, width: int, radius: int) -> np.ndarray:
+    """The share of each pixel's stray light that stays in the frame, pixel by pixel: the rings' inverse square law."""
+    out = np.zeros((height, width))
+    for y, x, i, j in np.ndindex(height, width, height, width):
+        k = max(abs(y - i), abs(x - j))
+        if k > radius:
+            out[y, x] += (radius + 0.5) / ((k - 0.5) * (k + 0.5) * 8 * k)
+    return out
+
+
 def brute_render(image, psi, bank: Bank, *, compositing: str, layers: str, border: str) -> Tensor:
     """The forward model from its formula for a batch of tiny images, in NumPy's float64."""
     nodes, psfs = bank.defocus.double().cpu().numpy(), bank.psfs.double().cpu().numpy()
     veil = np.zeros(psfs.shape[:2]) if bank.veil is None else bank.veil.double().cpu().numpy()
     crop = psfs.shape[-1] // 2 if border == "valid" else 0
+    stays = brute_share_within(*image.shape[-2:], psfs.shape[-1] // 2) if border == "zero" else 1
     out = []
     for b in range(len(image)):
         weights = brute_weights(psi[b % len(psi), 0].double().cpu().numpy(), nodes, layers)
@@ -86,14 +97,14 @@ def brute_render(image, psi, bank: Bank, *, compositing: str, layers: str, borde
         for c, plane in enumerate(image[b].double().cpu().numpy()):
             if compositing == "gather":
                 terms = [
-                    o * (brute_blur(plane, h, border) + v * plane.mean())
+                    o * (brute_blur(plane, h, border) + v * plane.mean() * stays)
                     for o, h, v in zip(inner, psfs[:, c], veil[:, c], strict=True)
                 ]
             elif compositing == "occlusion":
                 terms = [brute_occlusion(plane, weights, psfs[:, c], veil[:, c], border)]
             else:
                 terms = [
-                    brute_blur(o * plane, h, border) + v * (o * plane).mean()
+                    brute_blur(o * plane, h, border) + v * (o * plane).mean() * stays
                     for o, h, v in zip(weights, psfs[:, c], veil[:, c], strict=True)
                 ]
             out.append(sum(terms))
@@ -103,6 +114,10 @@ def brute_render(image, psi, bank: Bank, *, compositing: str, layers: str, borde
 def brute_occlusion(plane, weights, psfs, veil, border: str) -> np.ndarray:
     """Ikoma's layers over one another, the far ones first: each lets through what it does not hide."""
     image = np.zeros_like(brute_blur(plane, psfs[0], border))
+    if border == "zero":  # of the light seen, as much is stray as the rest leaves
+        held = np.array([brute_blur(np.ones_like(plane), psf, border).mean() for psf in psfs])
+        stray = veil * brute_share_within(*plane.shape, psfs.shape[-1] // 2).mean()
+        veil = stray / (held + stray)
     for d in range(len(psfs)):
         seen = brute_blur(weights[: d + 1].sum(0), psfs[d], border) + 1e-6
         light = (1 - veil[d]) * plane + veil[d] * plane.mean()

@@ -86,3 +86,13 @@ def _directory(tags, offset, order):
             entries += struct.pack(order + "I", place + len(data))
             data += packed + b"\0" * (len(packed) % 2)
     return struct.pack(order + "H", len(tags)) + entries + struct.pack(order + "I", 0) + data
+
+
+def patched(data, which, **changes):
+    """Return a file of ours with a tag of its first directory changed: tag, kind, number or, of 4 bytes, value."""
+    data = bytearray(data)
+    start, count = 10, struct.unpack_from("<H", data, 8)[0]
+    place = next(p for p in range(start, start + 12 * count, 12) if struct.unpack_from("<H", data, p)[0] == which)
+    old = dict(zip(("tag", "kind", "number", "value"), struct.unpack_from("<HHI4s", data, place), strict=True))
+    struct.pack_into("<HHI4s", data, place, *(old | changes).values())
+    return bytes(data)

@@ -74,7 +74,8 @@ class TestDevelop(BaseTester):
         scale = float((raw.white - raw.black[0]) / raw.white) if raw.pattern is None and raw.colors else 1.0
 
         def difference(raw):
-            image = develop(raw, "half", encoded=False, square_pixels=False, upright=False)
+            balance = None if raw.white_balance is not None or raw.daylight_balance is None else "daylight"
+            image = develop(raw, "half", balance, encoded=False, square_pixels=False, upright=False)
             assert image.shape == theirs.shape
             return ((image * scale).clamp(0, 1) - theirs).abs()
 
@@ -88,7 +89,7 @@ class TestDevelop(BaseTester):
         path = DATA / UNLIKE[0]
         raw = RawCapture.open(path)
         theirs = libraw(path, half_size=True)
-        ours = develop(raw, "half", encoded=False, square_pixels=False, upright=False).clamp(0, 1)
+        ours = develop(raw, "half", "daylight", encoded=False, square_pixels=False, upright=False).clamp(0, 1)
         steps = np.full(round(ours.shape[-1] * raw.pixel_aspect), 1 / raw.pixel_aspect)
         ours = ours[..., np.cumsum([0, *steps[1:]]).astype(int)]
         assert ours.shape == theirs.shape
@@ -181,6 +182,21 @@ class TestDevelop(BaseTester):
         assert balance_factors(capture(white_balance=shot), "none").tolist() == [1.0] * 4
         assert balance_factors(capture(), torch.tensor([3.0, 1.0, 2.0])).tolist() == [3.0, 1.0, 2.0, 1.0]
 
+    def test_feature_daylight_that_nobody_asked_for_is_told(self):
+        sun = torch.tensor([1.8, 1, 1.7, 1])
+        with pytest.warns(
+            UserWarning, match=r"for daylight, which leaves a cast in other light: .*='auto' \(--white-b"
+        ):
+            told = develop(capture(daylight_balance=sun), "half")
+        assert torch.equal(told, develop(capture(daylight_balance=sun), "half", "daylight"))
+        develop(capture(daylight_balance=sun, white_balance=sun), "half")
+        develop(capture(), "half")
+
+    def test_feature_automatic_balance(self):
+        """Light 0.1, 0.2, 0.05 becomes grey, as bright as green."""
+        picture = develop(capture(levels=(200, 300, 300, 150)), "half", "auto", matrix=torch.eye(3), encoded=False)
+        self.assert_close(picture, torch.full((3, 2, 2), 0.2))
+
     def test_feature_matrix_is_the_files_then_the_models_then_assumed(self):
         file, model = torch.eye(3) * 0.5, torch.tensor(G2)
         ones = torch.ones(4)
@@ -234,7 +250,10 @@ class TestDevelop(BaseTester):
         ("options", "message"),
         [
             ({"highlights": "blend"}, "highlights must be one of 'clip', 'keep', got 'blend'"),
-            ({"white_balance": "cloudy"}, "white_balance must be one of 'as shot', 'daylight', 'none', got 'cloudy'"),
+            (
+                {"white_balance": "cloudy"},
+                "white_balance must be one of 'as shot', 'daylight', 'auto', 'none', got 'cloudy'",
+            ),
             ({"white_balance": "as shot"}, "the capture has no white balance 'as shot'"),
             ({"white_balance": torch.ones(2)}, "white_balance must be 3 positive factors, of R, G, B, got"),
             ({"white_balance": -torch.ones(3)}, "white_balance must be 3 positive factors"),

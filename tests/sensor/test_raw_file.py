@@ -239,9 +239,48 @@ class TestOpen(BaseTester):
         assert (raw.pattern, raw.colors, raw.counts.shape) == (None, "", (1, 36, 48))
         self.assert_close(raw.planes(), raw.mosaic())
 
-    def test_feature_a_white_level_that_lies_is_told(self):
+    def test_feature_one_black_level_of_three_channels(self):
+        """LibRaw then takes it off the white level, and not off the counts: 959 instead of 1023."""
+        counts = random_counts(36, 48, 3)
+        one, three = (RawCapture.open(dng(counts, None, black=(64,) * number)) for number in (1, 3))
+        assert one.black.tolist() == three.black.tolist() == [64, 64, 64]
+        assert one.white == three.white == 1023
+        assert torch.equal(one.mosaic(), three.mosaic())
+
+    @pytest.mark.parametrize(("white", "most"), [(255, 54998), (500, 999)])
+    def test_feature_a_white_level_that_lies_gives_way_to_the_counts(self, white, most):
+        counts = np.random.default_rng(0).integers(64, most + 1, (36, 48))
+        counts[0, 0] = most
+        told = f"its white level {white} lies, as its counts reach {most}, which is taken for white: .*--white N"
+        with pytest.warns(UserWarning, match=told) as caught:
+            raw = RawCapture.open(dng(counts, white=white))
+        assert len(caught) == 1
+        assert raw.white == most
+        assert raw.mosaic().max() == 1
+
+    def test_feature_white_that_is_given_counts(self):
+        raw = RawCapture.open(dng(random_counts(), white=500), white=999)
+        assert raw.white == 999
+        assert RawCapture.open(dng(random_counts(), white=64), white=1023).white == 1023
         with pytest.warns(UserWarning, match="of the counts lie above the white level 500, up to 999: it may be wrong"):
-            RawCapture.open(dng(random_counts(), white=500))
+            assert RawCapture.open(dng(random_counts()), white=500).white == 500
+
+    def test_feature_channels_that_saturate_later_are_told_and_left(self):
+        """A tenth above white, as where blue saturates after green: nothing changes, or highlights would turn pink."""
+        counts = random_counts()
+        counts[:4] = 1000
+        with pytest.warns(UserWarning, match=r"11 % of the counts lie above the white level 950, up to 1000"):
+            assert RawCapture.open(dng(counts.clip(max=950) + (counts == 1000) * 50, white=950)).white == 950
+
+    def test_feature_hot_pixels_are_no_white_level(self):
+        counts = random_counts(100, 100)
+        counts[:3, :3] = 60000
+        assert RawCapture.open(dng(counts)).white == 1023
+
+    @pytest.mark.parametrize(("white", "reason"), [(0, "white must be positive"), (64, "not above its black level 64")])
+    def test_exception_white_that_makes_no_sense(self, white, reason):
+        with pytest.raises(ValueError, match=reason):
+            RawCapture.open(dng(random_counts()), white=white)
 
     @pytest.mark.parametrize(
         ("data", "reason"),

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kornia_tidy.sensor import raw_decoding
+from kornia_tidy.sensor import raw_decoder, raw_decoding
 from kornia_tidy.sensor.raw_file import RawCapture
 from tests.base import DATA, BaseTester, needs_data
 
@@ -73,7 +73,7 @@ def forked_decoding():
             status = json.loads(server.stdout.readline())
             if status is None:
                 raise subprocess.TimeoutExpired("decoder", timeout)
-            return status, ""
+            return status, raw_decoder.LOADED  # its server loaded all before it forked
 
         raw_decoding._run = run
         try:

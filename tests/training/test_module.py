@@ -206,6 +206,36 @@ class TestCheckpoint(BaseTester):
         with pytest.raises(ValueError, match="were given as objects"):
             load_trained(tmp_path / "b.safetensors")
 
+    @pytest.mark.parametrize("averaged", [False, True])
+    def test_feature_lightning_restores_the_camera_of_a_checkpoint(self, averaged, tmp_path):
+        """Its masks had moved since its window was chosen, and the camera it is loaded into has another window."""
+
+        def own(masks):
+            return {"optics": TiDyOptics(masks, fidelity="draft", border="zero"), "head": nn.Conv2d(3, 3, 1)}
+
+        module = TidyTraining(**own(PixelwiseMask(1, generator=torch.Generator().manual_seed(0))), ema=0.0)
+        window = module.optics.window
+        with torch.no_grad():
+            module.optics.masks.phase.mul_(0.2)
+        average = [pl.callbacks.EMAWeightAveraging(decay=0.5)] if averaged else []
+        run = pl.Trainer(
+            default_root_dir=tmp_path, max_steps=2, accelerator="cpu", logger=False, enable_checkpointing=False,
+            enable_progress_bar=False, enable_model_summary=False, callbacks=average,
+        )  # fmt: skip
+        run.fit(module, SceneLoader(DeadLeaves(2, 48, 48), 1))
+        run.save_checkpoint(tmp_path / "a.ckpt")
+        flat = own(PixelwiseMask(1, initial="flat"))
+        assert flat["optics"].window != window
+        again = TidyTraining.load_from_checkpoint(tmp_path / "a.ckpt", weights_only=True, **flat, ema=0.0)
+        assert again.optics.window == window
+        sample, noise = batch(), torch.Generator()
+        expected = module.optics(sample["image"], sample["depth"], generator=noise.manual_seed(1))
+        coded = again.optics(sample["image"], sample["depth"], generator=noise.manual_seed(1))
+        assert torch.equal(coded, expected)
+        other = {"optics": TiDyOptics(PixelwiseMask(1), fidelity="draft"), "head": flat["head"]}
+        with pytest.raises(ValueError, match=r"border \(zero / reflect\)"):
+            TidyTraining.load_from_checkpoint(tmp_path / "a.ckpt", weights_only=True, **other, ema=0.0)
+
     def test_exception_names_of_missing_and_unknown_weights(self):
         with pytest.raises(ValueError, match="x does not fit: missing weight, bias; unknown other"):
             check_weights(nn.Linear(1, 1), {"other": torch.ones(1)}, "x")

@@ -1,0 +1,117 @@
+"""`kornia-tidy info`: versions, processor, compiler and compiled code of this machine, for bug reports."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import re
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import kornia_tidy
+from kornia_tidy.commands.report import tell
+from kornia_tidy.compiled import REALS, Compiler, build, cache_folder, find_compiler
+from kornia_tidy.optics import mutual_intensity
+from kornia_tidy.scene import direct, occlusion_direct
+
+DESCRIPTION = """\
+Tell what kornia_tidy runs on: versions of the packages it uses, processor and threads,
+the C compiler, and the compiled code with the folder that it is kept in. What is not
+compiled yet is compiled, which takes some seconds. Please put this into bug reports.
+"""
+
+PACKAGES = (
+    *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
+    *("lightning", "matplotlib", "h5py"),
+)
+SOURCES = (direct.SOURCE, occlusion_direct.SOURCE, mutual_intensity.SOURCE)
+
+
+def add_parser(subparsers: Any) -> None:
+    """Describe the command to argparse."""
+    parser = subparsers.add_parser(
+        "info",
+        help="versions, processor, compiler and compiled code, for bug reports",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+
+
+def run(_: argparse.Namespace) -> None:
+    """Tell all of it."""
+    for topic, text in lines():
+        tell(topic, _without_home(text))
+
+
+def lines() -> Iterator[tuple[str, str]]:
+    """Yield topics and what there is to say of them."""
+    yield "package", f"kornia_tidy {kornia_tidy.__version__}, Python {platform.python_version()}"
+    yield "uses", ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
+    yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}"
+    yield "processor", f"{_processor_name()}, {os.cpu_count()} cores"
+    yield (
+        "torch",
+        f"{torch.get_num_threads()} threads, vectors of {torch.backends.cpu.get_cpu_capability()}, "
+        f"MKL {'yes' if torch.backends.mkl.is_available() else 'no'}, accelerator {_accelerator()}",
+    )
+    yield "compiler", _compiler()
+    for source, dtype in product(SOURCES, REALS):
+        name = f"{source.name}, {str(dtype).removeprefix('torch.')}"
+        built = build(source, dtype)
+        if built.path is None:
+            yield "kernel", f"{name}: not there: {built.remark}"
+        else:
+            threads = "" if built.threads else f", in one thread: {built.remark}"
+            yield "kernel", f"{name}: {built.path.name}, {built.path.stat().st_size >> 10} KiB{threads}"
+    yield "cache", _cache()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _processor_name() -> str:
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    return found[1] if found else platform.processor() or "unknown"
+
+
+def _accelerator() -> str:
+    if torch.cuda.is_available():
+        return ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    return "mps" if torch.backends.mps.is_available() else "none"
+
+
+def _compiler() -> str:
+    try:
+        compiler: Compiler = find_compiler()
+    except RuntimeError as error:
+        return str(error)
+    return f"{' '.join((*compiler.program, *compiler.options))}: {compiler.version}"
+
+
+def _cache() -> str:
+    try:
+        folder = cache_folder()
+    except OSError as error:
+        return f"none: {error}"
+    files = [path for path in folder.iterdir() if path.is_file()]
+    return f"{folder}, {len(files)} files, {sum(path.stat().st_size for path in files) >> 10} KiB"
+
+
+def _without_home(text: str) -> str:
+    """Leave the user's name out of what may be shown to everybody."""
+    home = os.path.expanduser("~")
+    return text.replace(home, "~") if len(home) > 1 else text

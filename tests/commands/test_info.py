@@ -1,0 +1,58 @@
+"""`kornia-tidy info`."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+
+from kornia_tidy import cli, compiled
+from kornia_tidy.commands import info
+from tests.base import BaseTester
+from tests.test_compiled import forget
+
+
+class TestInfo(BaseTester):
+    @pytest.fixture(autouse=True)
+    def _anew(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(compiled.tempfile, "tempdir", str(tmp_path))
+        forget()
+        yield
+        forget()
+
+    @staticmethod
+    def told(capsys) -> dict[str, list[str]]:
+        assert cli.main(["info"]) == 0
+        captured = capsys.readouterr()
+        assert captured.err == ""
+        topics: dict[str, list[str]] = {}
+        for line in captured.out.splitlines():
+            topic, text = line.split(maxsplit=1)
+            topics.setdefault(topic, []).append(text)
+        return topics
+
+    def test_smoke(self, capsys):
+        topics = self.told(capsys)
+        assert f"torch {torch.__version__.split('+', maxsplit=1)[0]}" in topics["uses"][0]
+        assert f"{os.cpu_count()} cores" in topics["processor"][0]
+        assert len(topics["kernel"]) == 6
+
+    @pytest.mark.skipif(compiled.build(info.SOURCES[0], torch.float32).library is None, reason="no C compiler")
+    def test_feature_kernels_and_their_cache(self, capsys):
+        topics = self.told(capsys)
+        assert all(" KiB" in text for text in topics["kernel"])
+        assert topics["kernel"][0].startswith("direct.c, float32: direct-")
+
+    def test_feature_without_a_compiler_it_says_why(self, capsys, monkeypatch):
+        monkeypatch.setenv("CC", "false")
+        topics = self.told(capsys)
+        why = "the C compiler false failed (status 1): no word"
+        assert topics["compiler"] == [why]
+        assert all(text.endswith(f"not there: {why}") for text in topics["kernel"])
+
+    def test_feature_the_home_folder_is_not_named(self, capsys, tmp_path, monkeypatch):
+        monkeypatch.setenv("HOME", str(tmp_path))
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setattr(info, "SOURCES", ())
+        assert self.told(capsys)["cache"][0].startswith("~/.cache/kornia_tidy, ")
