@@ -28,6 +28,14 @@ def picture(path: Path) -> torch.Tensor:
     return torch.from_numpy(read)
 
 
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize("example", NAMES, indirect=True)
 class TestEveryExample(BaseTester):
     def test_smoke_help_teaches(self, example, capsys):
@@ -75,7 +83,8 @@ class TestSimulatePhoto(BaseTester):
 @pytest.mark.parametrize("example", ["dataloader_transform"], indirect=True)
 class TestDataLoaderTransform(BaseTester):
     @pytest.mark.parametrize("workers", ["0", "2"])
-    def test_feature_workers_give_the_same_bits(self, example, workers, capsys):
+    def test_feature_workers_give_the_same_bits(self, example, workers, capsys, two_threads):
+        """A worker has one thread, however many this process has."""
         batches = example.main(["--items", "3", "--size", "64", "--batch", "2", "--workers", workers])
         assert [tuple(batch.shape) for batch in batches] == [(2, 3, 64, 64), (1, 3, 64, 64)]
         out = capsys.readouterr().out

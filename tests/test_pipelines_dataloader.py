@@ -135,6 +135,26 @@ class TestDatasetTransform(BaseTester):
         data = Identical({"a": camera(sensor=sensor).as_transform(seed=4)})
         assert torch.equal(data[0]["a"]["image"], data[0]["a"]["image"])
 
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_threads_of_the_loading_process_change_no_bit(self, compositing):
+        """Nor what it rendered before, with all of them: PSFs that it remembers are of sums in another order."""
+        optics = TiDyOptics(compositing=compositing, check_inputs=False)
+        transform, before = optics.as_transform(seed=1), torch.get_num_threads()
+        samples = [
+            {"image": torch.rand(3, n, n), "depth": 0.4 + torch.rand(1, n, n), "index": n} for n in (48, 96, 200)
+        ]
+        taken = []
+        try:
+            for threads in (1, 2, 3, 4):
+                torch.set_num_threads(threads)
+                optics({**samples[0]})
+                taken.append([transform(sample)["image"] for sample in samples])
+                assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+        for other in taken[1:]:
+            assert all(map(torch.equal, taken[0], other))
+
     def test_smoke_repr_names_the_seed(self):
         assert "seed=4, key='index'" in repr(TiDyOptics(fidelity=camera().fidelity).as_transform(seed=4))
 

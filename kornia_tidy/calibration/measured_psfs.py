@@ -17,8 +17,11 @@ from kornia_tidy.calibration.point_images import PointImage
 from kornia_tidy.calibration.registration import Registered, register
 from kornia_tidy.calibration.shrinkage import shrink
 from kornia_tidy.checks import check_depth
+from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.phase_masks import MASK_SPAN
 from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.optics.pupil import Pupil
 
 MOST_MISFIT = 25.0  # residuals of five times the noise: more is no PSF of these captures
 
@@ -99,21 +102,25 @@ class MeasuredPSFs:
             raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
 
 
-def diffraction_cutoff(camera: ThinLensCamera, wavelength: float) -> float:
-    r"""Return the highest frequency that a lens passes, in cycles per pixel: :math:`2 R p / (\lambda s')`.
+def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil | None = None) -> float:
+    r"""Return the highest frequency that a lens passes in any direction: :math:`d R p / (\lambda s')` cycles per pixel.
 
     Args:
         camera: the lens, with its aperture's radius R, image distance s' and pixel pitch p.
         wavelength: the shortest in the channel, in metres.
+        pupil: its aperture, of which d is the largest distance between two open points in pupil radii. Default: that of
+            a lens with 23x23 mask pixels, whose corners reach beyond the disc: d = 2.14, along an axis 2.1, where the
+            disc has 2.
 
     Source: Goodman, Introduction to Fourier Optics, section 7.2.
 
     Example:
         >>> round(diffraction_cutoff(ThinLensCamera(), 530e-9), 3)
-        0.784
+        0.839
     """
-    distance = float(camera.image_distance)
-    return 2 * camera.aperture_radius * camera.pixel_pitch / (wavelength * distance)
+    pupil = Pupil(circular_aperture(23), MASK_SPAN / 23) if pupil is None else pupil
+    frequency = camera.aperture_radius * camera.pixel_pitch / (wavelength * float(camera.image_distance))
+    return pupil.diameter * frequency
 
 
 def measure_psfs(

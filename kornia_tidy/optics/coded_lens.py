@@ -90,8 +90,8 @@ class CodedLens(CameraState):
         if aperture is not None:
             check_part("aperture", aperture, (Tensor, np.ndarray), "a tensor of amplitudes (N, N) such as 23x23")
         self._aperture = None if aperture is None else check_aperture(aperture, aperture.shape[-1])
-        # Of each moment and state, and of their averages.
-        self._memories: dict[tuple[int | None, int | None], BankMemory] = {}
+        # Of each moment and state, and of their averages, for each number of threads.
+        self._memories: dict[tuple[int | None, int | None, int], BankMemory] = {}
         if self.fidelity.propagation == "paper":
             warn_if_aliased(self.camera.defocus_range, self.spectrum)
         self.fit_window()
@@ -468,7 +468,8 @@ class CodedLens(CameraState):
             return build(nodes)
         paper = self.fidelity.propagation == "paper"
         setting = (self._colours(spectrum), step, self.window, tolerance, paper, self.pupil)
-        key = self._moment, state if self._state is None else self._state
+        # Sums of another number of threads are rounded in another order.
+        key = self._moment, state if self._state is None else self._state, torch.get_num_threads()
         return self._memories.setdefault(key, BankMemory()).recall(spectrum, setting, states, weights, nodes, build)
 
     def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:

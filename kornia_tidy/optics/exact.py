@@ -16,7 +16,8 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
-_CACHE: OrderedDict[tuple[float, float, Geometry, Gaps, torch.device, torch.dtype], Tensor] = OrderedDict()
+Key = tuple[float, float, Geometry, Gaps, torch.device, torch.dtype, int]  # the last is the number of threads
+_CACHE: OrderedDict[Key, Tensor] = OrderedDict()
 _CACHE_BYTES = 256 * 2**20
 
 
@@ -102,7 +103,7 @@ def _kernels(
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
     if is_followed():
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
-    keys = [(psi, step, geometry, gaps, device, dtype) for psi in defocus]
+    keys = [(psi, step, geometry, gaps, device, dtype, torch.get_num_threads()) for psi in defocus]
     missing = [key for key in keys if key not in _CACHE]
     if missing:
         with torch.inference_mode(False), torch.no_grad():

@@ -36,6 +36,18 @@ class Pupil:
     max_rho2: float = field(init=False)
     """Largest squared distance of an open cell from the axis; it bounds how fast a PSF changes with defocus."""
 
+    @property
+    def diameter(self) -> float:
+        """Largest distance between two points of open cells in pupil radii, in any direction.
+
+        The autocorrelation of the amplitude, and with it every PSF's transform, is zero beyond it.
+        """
+        rows = (self.amplitude > 0).any(1).nonzero()[:, 0]
+        columns = (self.amplitude > 0)[rows].double()
+        first, last = columns.argmax(1), columns.shape[1] - 1 - columns.flip(1).argmax(1)
+        corners = torch.cat([torch.stack([rows + y, x], 1) for y in (0, 1) for x in (first, last + 1)]).double()
+        return float(torch.cdist(corners, corners, compute_mode="donot_use_mm_for_euclid_dist").max()) * self.cell_pitch
+
     def __post_init__(self) -> None:
         size = self.amplitude.shape[-1]
         cells = torch.nonzero(self.amplitude) - (size - 1) / 2

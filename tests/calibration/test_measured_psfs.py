@@ -172,9 +172,9 @@ class TestMeasurePSFs(BaseTester):
         error = (psfs - truth / truth.sum((1, 2), keepdim=True)).abs().sum((2, 3))
         assert float(error.max()) < 0.06
 
-    @pytest.mark.parametrize(("tile", "enough", "channel"), [(None, 4, 2), (((0, 1), (1, 2)), 12, 2)])
+    @pytest.mark.parametrize(("tile", "enough", "channel"), [(None, 4, 2), (((0, 1), (1, 2)), 13, 2)])
     def test_feature_too_few_places_are_told_before_any_work(self, tile, enough, channel, monkeypatch):
-        """Disks of the cutoffs hold at most 4 points of the pixels' grid of frequencies, of a plane's grid 12."""
+        """Disks of the cutoffs hold at most 4 points of the pixels' grid of frequencies, of a plane's grid 13."""
         planes_ = 3 if tile is None else 4
         light = torch.ones(planes_, 31, 31, dtype=torch.float64)
         images = [PointImage((40.0, 40.0), light, light, tile)] * enough

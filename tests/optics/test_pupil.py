@@ -99,3 +99,21 @@ class TestFillFactor(BaseTester):
     def test_exception_the_paper_has_no_gaps(self):
         with pytest.raises(ValueError, match=r"fidelity 'paper' .* got a fill_factor of 0\.9"):
             TiDyOptics(modulator=SpatialLightModulator(DwellTimes(), fill_factor=0.9), fidelity="paper")
+
+
+class TestDiameter(BaseTester):
+    @pytest.mark.parametrize("size", [23, 24, 46])
+    def test_feature_the_autocorrelation_ends_there(self, size):
+        """Of the disc and of cells open at random: of the amplitude in a 5th of a cell, lags but the last are there."""
+        for amplitude in (circular_aperture(size), (torch.rand(size, size) > 0.98).double()):
+            amplitude[0, 3] = 0.5
+            fine, fifths = amplitude.repeat_interleave(5, 0).repeat_interleave(5, 1), 5
+            spectrum = torch.fft.rfft2((fine > 0).double(), s=(2 * 5 * size, 2 * 5 * size))
+            lags = torch.fft.irfft2(spectrum.abs().square(), s=(2 * 5 * size, 2 * 5 * size)) > 0.5
+            y, x = (lag - 10 * size * (lag >= 5 * size) for lag in lags.nonzero().double().unbind(1))
+            # Between samples in the middles of fifths; their edges are a fifth further apart along both axes.
+            farthest = float(torch.hypot(y.abs() + 1.0, x.abs() + 1.0).max()) / fifths
+            assert Pupil(amplitude, 0.1).diameter == pytest.approx(0.1 * farthest, rel=1e-12)
+
+    def test_feature_one_cell_has_its_diagonal(self):
+        assert Pupil(torch.ones(1, 1), 0.5).diameter == pytest.approx(0.5 * math.sqrt(2))
