@@ -15,10 +15,9 @@ from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.scene.layers import layer_weights
 from kornia_tidy.scene.occlusion import EPSILON, lay_over, weight_behind
 from kornia_tidy.scene.occlusion_tiles import choose_grid, make_plan
-from tests.base import BaseTester
+from tests.base import BaseTester, oracle
 from tests.scene.render_tester import RenderTester
 from tests.scene.scenes import Bank, brute_render, make_bank, make_scene
-from tests.scene.test_compositing import oracle
 from tests.scene.test_tiling import KINDS, LargestTensor, depth_map
 
 ATOL = {torch.float32: 2e-5, torch.float64: 1e-12}

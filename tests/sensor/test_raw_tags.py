@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.sensor.raw_tags import black_tile, camera_tags, kodak_matrix, missing_bytes, tiff_directories
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.sensor.dng import LONG, SHORT, SRATIONAL, dng
 
 COUNTS = np.random.default_rng(0).integers(64, 1000, (36, 48))
@@ -29,7 +29,6 @@ class TestCameraTags(BaseTester):
             "timestamp": "2024-02-29T12:34:56",
         }
 
-    @needs_data
     @pytest.mark.parametrize(
         ("name", "expected"),
         [
@@ -42,7 +41,7 @@ class TestCameraTags(BaseTester):
     )
     def test_feature_of_cameras(self, name, expected):
         """As ExifTool lists the same files in its own tests."""
-        found = camera_tags((DATA / "raw/exiftool+exiftool" / name).read_bytes())
+        found = camera_tags(shared(f"data/raw/exiftool+exiftool/{name}").read_bytes())
         told = tuple(found.get(key) for key in ("model", "lens", "iso", "exposure", "aperture"))
         assert told == tuple(pytest.approx(x) if isinstance(x, float) else x for x in expected)
 
