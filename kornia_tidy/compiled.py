@@ -12,6 +12,7 @@ import hashlib
 import logging
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -34,7 +35,8 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
     """Return a C source as a library in which ``REAL`` is the given type, or None where it cannot be had.
 
     The library is kept under ``$XDG_CACHE_HOME/kornia_tidy`` (``~/.cache/kornia_tidy``), named after all that it
-    depends on: source, compiler, flags and processor. ``$CC`` chooses the compiler. Why there is none goes to the log
+    depends on: source, compiler, flags and processor. ``$CC`` chooses the compiler; what
+    follows its name goes to it after our own flags. Why there is none goes to the log
     of this module.
 
     Args:
@@ -45,7 +47,9 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
         >>> compiled(Path("/does/not/exist.c"), torch.float32) is None
         True
     """
-    compiler = os.environ.get("CC") or next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    compiler, *options = shlex.split(os.environ.get("CC", "")) or [
+        next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    ]
     if compiler is None:
         _log.info("no C compiler was found: %s is not used", source.name)
         return None
@@ -53,7 +57,7 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
         folder = _private_folder()
         # Threads are OpenMP's, which PyTorch has brought along; a compiler without it gives one thread.
         for extra in (("-fopenmp",), ()):
-            flags = (*FLAGS, NATIVE.get(platform.machine(), "-mcpu=native"), *extra, f"-DREAL={REALS[dtype]}")
+            flags = (*FLAGS, NATIVE.get(platform.machine(), "-mcpu=native"), *extra, f"-DREAL={REALS[dtype]}", *options)
             library = folder / f"{source.stem}-{_digest(source, compiler, flags)}.so"
             if library.is_file() or _compile(source, library, [compiler, *flags]):
                 return ctypes.CDLL(str(library))

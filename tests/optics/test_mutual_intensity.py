@@ -11,27 +11,7 @@ from kornia_tidy.optics.mutual_intensity import LARGEST_WINDOW, SOURCE, mutual_e
 from kornia_tidy.optics.propagation import energy_operations, pixel_energies
 from kornia_tidy.optics.wave_energy import wave_energies
 from tests.base import BaseTester
-from tests.optics.energies import EnergiesTester, random_case
-from tests.rounding import gamma, magnitude
-
-
-def round_off(field, weights, kernels):
-    r"""Bound the error of energies :math:`E = \sum w |\sum_n K_n v_n|^2` with :math:`v = U K`, in float64.
-
-    Each v is a sum of 2N real products, so off by :math:`e = \gamma_{2N} |U| |K|`, which moves E by no more than
-    :math:`\sum w (2 \sum_n |K_n| |v_n| \sum_n |K_n| e_n)`. After that each of the products of which E is the sum, of
-    two v and two K in :math:`\sum w (\sum_n |K_n| |v_n|)^2` together, is rounded no more often than it is added: N^2
-    times over pairs of cells, 2 K q over waves, 2 q over points; and 16 times as weights, real and imaginary parts are
-    put together. Moduli are |Re| + |Im|.
-    """
-    states, cells = field.shape[:2]
-    order, dtype = kernels.shape[2], field.real.dtype
-    k, u, w = magnitude(kernels).double(), magnitude(field).double(), weights.detach().double()
-    off = gamma(2 * cells, dtype) * torch.einsum("knm,drsm->dkrsn", u, k)
-    wave = torch.einsum("knm,drsm->dkrsn", field.to(torch.complex128), kernels.to(torch.complex128))
-    seen, lost = (torch.einsum("dpqn,dkrsn->dkpqrs", k, x) for x in (magnitude(wave) + off, off))
-    roundings = cells**2 + 2 * states * order + 2 * order + 16
-    return torch.einsum("k,dkpqrs->drp", w, 2 * seen * lost + gamma(roundings, dtype) * seen.square())
+from tests.optics.energies import EnergiesTester, random_case, round_off
 
 
 @pytest.fixture(params=[1, 2**20], ids=["single depths", "all at once"])
