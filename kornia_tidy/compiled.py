@@ -47,12 +47,11 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
         >>> compiled(Path("/does/not/exist.c"), torch.float32) is None
         True
     """
-    compiler, *options = shlex.split(os.environ.get("CC", "")) or [
-        next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
-    ]
-    if compiler is None:
+    words = shlex.split(os.environ.get("CC", "")) or list(filter(None, map(shutil.which, ("cc", "gcc", "clang"))))[:1]
+    if not words:
         _log.info("no C compiler was found: %s is not used", source.name)
         return None
+    compiler, *options = words
     try:
         folder = _private_folder()
         # Threads are OpenMP's, which PyTorch has brought along; a compiler without it gives one thread.

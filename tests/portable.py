@@ -63,7 +63,7 @@ from kornia_tidy.scene.direct import SOURCE
 warnings.simplefilter("ignore")
 generator = torch.Generator().manual_seed(0)
 one, two = torch.rand(2, 96, 96, generator=generator, dtype=torch.float64)
-products = torch.cat([one @ two, torch.linalg.inv(one), torch.fft.rfft2(two).real])
+products = torch.cat([one @ two, torch.linalg.inv(one), torch.fft.fft2(two).real])
 print(json.dumps({
     "aten": torch.backends.cpu.get_cpu_capability(),
     "mkl": hashlib.sha256(products.numpy().tobytes()).hexdigest() if torch.backends.mkl.is_available() else "",
@@ -115,7 +115,7 @@ def _not_aten(level: str) -> Callable[[Machine, dict[str, object]], str | None]:
 def _same_mkl(machine: Machine, used: dict[str, object]) -> str | None:
     if not used["mkl"]:
         return "this PyTorch is without oneMKL"
-    same = used["mkl"] == machine.usual["mkl"]
+    same = used["mkl"] == machine.usual.get("mkl")
     return f"oneMKL computes to the last bit as without it on this processor ({machine.processor})" if same else None
 
 
