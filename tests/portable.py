@@ -138,12 +138,12 @@ def _c(name: str, compiler: str, *options: str, needs: frozenset[str] = frozense
 
 FACTORS = (
     Factor("aten default", {"ATEN_CPU_CAPABILITY": "default"}, NUMBERS, ("tests/scene",), refuse=_not_aten("DEFAULT")),
-    Factor("aten avx2", {"ATEN_CPU_CAPABILITY": "avx2"}, NUMBERS, ("tests/optics",), AVX2, refuse=_not_aten("AVX2")),
+    Factor("aten avx2", {"ATEN_CPU_CAPABILITY": "avx2"}, NUMBERS, (), AVX2, refuse=_not_aten("AVX2")),
     Factor("aten avx512", {"ATEN_CPU_CAPABILITY": "avx512"}, NUMBERS, (), AVX512, refuse=_not_aten("AVX512")),
-    Factor("onemkl avx2", {"MKL_ENABLE_INSTRUCTIONS": "AVX2"}, TRANSFORMS, KERNELS, AVX2, refuse=_same_mkl),
+    Factor("onemkl avx2", {"MKL_ENABLE_INSTRUCTIONS": "AVX2"}, TRANSFORMS, (), AVX2, refuse=_same_mkl),
     Factor("onemkl compatible", {"MKL_CBWR": "COMPATIBLE"}, TRANSFORMS, KERNELS, refuse=_same_mkl),
     _c("c x86-64-v2", "gcc", "-march=x86-64-v2", needs=V2, quick=True),
-    _c("c x86-64-v3", "gcc", "-march=x86-64-v3", needs=V2 | AVX2, quick=True),
+    _c("c x86-64-v3", "gcc", "-march=x86-64-v3", needs=V2 | AVX2),
     _c("c native gcc", "gcc"),
     _c("c native clang", "clang", quick=True),
     Factor(
