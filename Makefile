@@ -6,13 +6,16 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench targets clean
+.PHONY: help demo test test-portable sanitize lint bench targets clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo     coded captures and what networks make of them: outputs/demo.png, reconstruction.png"
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
 	@echo "make test     the tests, a process for each core; ARGS='-k camera' runs some of them, ARGS='-n0' in one process"
+	@echo "make test-portable  the tests as on other machines: vector widths, compilers, none, threads; up to 20 minutes;"
+	@echo "              ARGS='--list' shows them, ARGS='--only aten' runs some, ARGS=--quick a share of each"
+	@echo "make sanitize the C sources under address and undefined-behaviour sanitizers: minutes, ARGS='--shapes 100' less"
 	@echo "make lint     style, spelling and types"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
@@ -26,6 +29,12 @@ demo: $(READY)
 
 test: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 --dist=loadfile $(ARGS)
+
+test-portable: $(READY)
+	@$(BIN)/python -m tests.portable $(ARGS)
+
+sanitize: $(READY)
+	@$(BIN)/python -m tests.sanitize $(ARGS)
 
 lint: $(READY)
 	@$(BIN)/ruff check

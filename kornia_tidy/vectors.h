@@ -3,6 +3,9 @@
 #include <stdint.h>
 #include <string.h>
 
+// Vectors are passed to functions that are inlined alone, so that it does not matter how a processor would pass them.
+#pragma GCC diagnostic ignored "-Wpsabi"
+
 #define INLINE static inline __attribute__((always_inline))
 
 enum { LANES = 64 / sizeof(REAL) };

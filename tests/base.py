@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -12,7 +15,35 @@ from torch import Tensor
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 DATA = SHARED / "data"
 
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real scenes of ../shared/data are not on this machine")
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not on this machine")
+
+
+def shared(part: str, counts: dict[str, int] | None = None) -> Path:
+    """Return a file or folder of ../shared; skips the test, by name, where it is not on this machine.
+
+    Args:
+        part: path from ../shared, such as ``data/scenes.json``.
+        counts: for a folder, how many files of each pattern must be in it.
+    """
+    path = SHARED / part
+    if not path.exists():
+        pytest.skip(f"../shared/{part} is not on this machine")
+    for pattern, count in (counts or {}).items():
+        if (found := len(list(path.glob(pattern)))) < count:
+            pytest.skip(f"../shared/{part} has {found} of {count} files {pattern} on this machine")
+    return path
+
+
+@cache
+def oracle() -> ModuleType:
+    """Return the independent model, ../shared/oracle/oracle.py; skips the test where it is not on this machine."""
+    spec = importlib.util.spec_from_file_location("oracle", shared("oracle/oracle.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
 
 TOLERANCES = {
     torch.bfloat16: (7.8e-3, 7.8e-3),

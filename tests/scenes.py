@@ -11,7 +11,7 @@ import cv2
 import pytest
 
 from kornia_tidy.data.rgbd import Scene, read_rgbd
-from tests.base import DATA
+from tests.base import DATA, shared
 
 ENTRIES: dict[str, dict[str, Any]] = (
     {entry["name"]: entry for entry in json.loads((DATA / "scenes.json").read_text())}
@@ -25,11 +25,12 @@ NOMINAL_CALIBRATION = {"focal_px": 1000.0, "baseline_m": 0.1}
 
 
 def load_scene(name: str) -> Scene:
-    """Read a scene by its name in scenes.json; skips the test if the data are not on this machine."""
-    if not ENTRIES:
-        pytest.skip("the real scenes of ../shared/data are not on this machine")
+    """Read a scene by its name in scenes.json; skips the test where its files are not on this machine."""
+    shared("data/scenes.json")
+    if name not in ENTRIES:
+        pytest.skip(f"../shared/data/scenes.json does not list {name}")
     entry = ENTRIES[name]
-    image, depth = DATA / entry["image"], DATA / entry["depth"]
+    image, depth = shared(f"data/{entry['image']}"), shared(f"data/{entry['depth']}")
     options: dict[str, Any] = {"kind": entry["kind"], "scale": entry["scale"], "invalid": _unknown(entry["invalid"])}
     if entry["kind"] == "disparity":
         options |= {

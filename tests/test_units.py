@@ -37,7 +37,7 @@ from kornia_tidy.optics.switching import Switching
 from kornia_tidy.reconstruction import PhaseCam3DUNet
 from kornia_tidy.systems import SYSTEMS
 from kornia_tidy.training.trained import check_weights
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.scenes import ENTRIES, load_scene
 
 INF = math.inf
@@ -412,10 +412,9 @@ class TestDepthFiles(BaseTester):
         (tmp_path / "a.pfm").write_bytes(encode_pfm(np.full((8, 8), np.inf, np.float32)))
         assert read_depth(tmp_path / "a.pfm").valid.all()
 
-    @needs_data
     @pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry["invalid"] == "inf"])
     def test_feature_real_disparities_without_their_options_are_told(self, name, tmp_path):
-        path = shutil.copy(DATA / ENTRIES[name]["depth"], tmp_path)
+        path = shutil.copy(shared(f"data/{ENTRIES[name]['depth']}"), tmp_path)
         with pytest.warns(UserWarning, match="kind='disparity'"):
             read_depth(path)
 
@@ -437,7 +436,6 @@ class TestDepthFiles(BaseTester):
 class TestNoFalseAlarm(BaseTester):
     """Warnings are errors here, as in all tests."""
 
-    @needs_data
     @pytest.mark.parametrize("name", ENTRIES)
     def test_feature_real_scenes(self, name):
         found = load_scene(name)

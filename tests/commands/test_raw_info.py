@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kornia_tidy.cli import main
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.sensor.dng import dng
 
 
@@ -112,10 +112,9 @@ class TestRawInfo(BaseTester):
         assert told.err.count("\n") == 1
         assert told.out == ""
 
-    @needs_data
     def test_exception_of_real_files_is_one_sentence_each(self, capsys):
-        paths = [str(p) for p in sorted((DATA / "raw/serptools+testdata").glob("*"))]
-        paths += [str(p) for p in sorted((DATA / "raw/mushfiqulalam+isp").glob("*"))]
+        folders = [shared(f"data/raw/{name}", {"*": 1}) for name in ("serptools+testdata", "mushfiqulalam+isp")]
+        paths = [str(path) for folder in folders for path in sorted(folder.glob("*"))]
         assert main(["raw", "info", *paths]) == 2
         told = capsys.readouterr()
         assert told.out == ""

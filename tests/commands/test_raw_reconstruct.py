@@ -28,7 +28,7 @@ from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.state_file import write_state
 from kornia_tidy.training.trained import load_trained
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 FILES = 8  # in the batch that gets a signal
 ENDS = [".png", ".jpg", "_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png", ".json"]
@@ -219,11 +219,10 @@ class TestRawReconstruct(BaseTester):
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
         assert reconstruct([str(tmp_path / "a.raw")], weights, tmp_path / "out", *options) == 0
 
-    @needs_data
     def test_feature_a_raw_file_keeps_camera_and_exposure(self, tmp_path):
         image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
-        files = [str(DATA / "raw" / "colinleroy+a2tools" / "QKTK_IMAGE01.QTK")]
+        files = [str(shared("data/raw/colinleroy+a2tools/QKTK_IMAGE01.QTK"))]
         assert reconstruct(files, weights, tmp_path / "out", "--white-balance", "auto") == 0
         for suffix in (".png", ".jpg"):
             with image.open(tmp_path / "out" / f"QKTK_IMAGE01{suffix}") as picture:

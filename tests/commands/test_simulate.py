@@ -14,7 +14,7 @@ from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.rgbd import read_rgbd
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 
 def seeded(seed):
@@ -84,12 +84,11 @@ class TestSimulate(BaseTester):
             )(image, depth, generator=seeded(8))
         self.assert_close(read_image("out.png"), coded, rtol=0, atol=0.5 / 65535 + 1e-6)
 
-    @needs_data
     @pytest.mark.parametrize("name", ["middlebury-teddy", "nyu-fastdepth"])
     def test_feature_five_lines_of_python_give_the_same_on_a_real_scene(self, name, tmp_path):
-        entries = json.loads((DATA / "scenes.json").read_text())
+        entries = json.loads(shared("data/scenes.json").read_text())
         entry = next(e for e in entries if e["name"] == name)
-        image_path, depth_path = str(DATA / entry["image"]), str(DATA / entry["depth"])
+        image_path, depth_path = (str(shared(f"data/{entry[kind]}")) for kind in ("image", "depth"))
         invalid = [float(v) for v in str(entry["invalid"]).split(",") if v and v != "None"]
         calibration = {k: entry[k] for k in ("focal_px", "baseline_m", "doffs_px") if k in entry}
         options = [f"--depth-kind={entry['kind']}", f"--depth-scale={entry['scale']}"]

@@ -12,7 +12,7 @@ from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.systems import SYSTEMS
 from kornia_tidy.training.tasks import metres
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 
 class TestSystems(BaseTester):
@@ -75,11 +75,10 @@ class TestSystems(BaseTester):
         assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
-    @needs_data
     @pytest.mark.slow
     @pytest.mark.filterwarnings("error")
     def test_feature_all_nine_see_a_real_scene_within_a_minute(self, tmp_path, capsys):
-        folder = DATA / "rgbd/middlebury2014/Motorcycle"
+        folder = shared("data/rgbd/middlebury2014/Motorcycle", {"im0.png": 1, "disp0GT.pfm": 1})
         files = ["--image", str(folder / "im0.png"), "--depth", str(folder / "disp0GT.pfm"), "--invalid", "inf"]
         stereo = ["--depth-kind", "disparity", "--focal-px", "999.421", "--baseline-m", "0.193", "--doffs-px", "32.8"]
         threads = torch.get_num_threads()

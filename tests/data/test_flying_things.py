@@ -10,7 +10,7 @@ import torch
 
 from kornia_tidy import DefocusRange
 from kornia_tidy.data import FlyingThings3D, UnreadableItemError, paper_patches
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.data.published import flying_things_disparity, write_flying_things, write_pfm
 
 
@@ -153,16 +153,14 @@ class TestFlyingThings3D(BaseTester):
         with pytest.raises(ValueError, match=message):
             FlyingThings3D(root, **changed)
 
-    @needs_data
     def test_feature_real_frames_are_those_of_the_files(self, tmp_path):
         """Against NumPy's reading of the raw bytes, turned upside down."""
-        source = DATA / "rgbd/sceneflow"
         files = {"frames_cleanpass": ".png", "disparity": ".pfm"}
         for (folder, suffix), origin in zip(files.items(), ("RGB_cleanpass", "disparity"), strict=True):
             (tmp_path / folder / "TRAIN/A/0032/left").mkdir(parents=True)
             link = tmp_path / folder / f"TRAIN/A/0032/left/0006{suffix}"
-            link.symlink_to(source / origin / f"left/A-0032-0006{suffix}")
-        raw = (source / "disparity/left/A-0032-0006.pfm").read_bytes()[-4 * 540 * 960 :]
+            link.symlink_to(shared(f"data/rgbd/sceneflow/{origin}/left/A-0032-0006{suffix}"))
+        raw = shared("data/rgbd/sceneflow/disparity/left/A-0032-0006.pfm").read_bytes()[-4 * 540 * 960 :]
         disparity = torch.from_numpy(np.frombuffer(raw, "<f4").reshape(540, 960)[::-1].copy())[None]
         metric = FlyingThings3D(tmp_path, subsets="A")[0]
         self.assert_close(metric["depth"], 1050 / disparity, rtol=1e-6)

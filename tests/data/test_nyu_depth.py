@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from kornia_tidy.data import NYUDepthV2, UnreadableItemError
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.data.published import HEADER_7_3, write_nyu
 
 
@@ -165,11 +165,10 @@ class TestNYUDepthV2(BaseTester):
         with pytest.raises(UnreadableItemError, match=r"item 1 .*0002: .*no valid depth at any pixel"):
             NYUDepthV2(copy, "all", raw=True)[1]
 
-    @needs_data
     def test_feature_real_pictures_stand_upright(self, tmp_path):
         """In each of the four, what is seen at the bottom is nearer than what is at the top."""
         for name in ("nyu_depth_v2_labeled", "splits"):
-            (tmp_path / f"{name}.mat").symlink_to(DATA / "nyu_layout" / f"{name}_TINY.mat")
+            (tmp_path / f"{name}.mat").symlink_to(shared(f"data/nyu_layout/{name}_TINY.mat"))
         assert [len(NYUDepthV2(tmp_path, split)) for split in ("train", "test", "all")] == [2, 2, 4]
         for sample in NYUDepthV2(tmp_path, "all"):
             assert sample["depth"][0, -100:].median() < sample["depth"][0, :100].median()

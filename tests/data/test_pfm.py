@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kornia_tidy.data.pfm import decode_pfm, encode_pfm
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 TOP_DOWN = np.array([[1.5, -2.0, 0.25], [4.0, 5.0, np.inf]], np.float32)  # as a person would look at it
 BOTTOM_UP = (4.0, 5.0, float("inf"), 1.5, -2.0, 0.25)  # as the file has it
@@ -68,16 +68,14 @@ class TestDecodePfm(BaseTester):
         with pytest.raises(ValueError, match=message):
             decode_pfm(data)
 
-    @needs_data
     def test_feature_reads_flyingthings3d_with_blanks_in_its_header(self):
         """The first four bytes of the values, a3 cd 1f 42, are the bottom left corner."""
-        values = decode_pfm((DATA / "rgbd/flyingthings3d_subset/disparity/0000/left/0012.pfm").read_bytes())
+        values = decode_pfm(shared("data/rgbd/flyingthings3d_subset/disparity/0000/left/0012.pfm").read_bytes())
         assert values.shape == (540, 960)
         assert values[-1, 0] == struct.unpack("<f", b"\xa3\xcd\x1f\x42")[0]
 
-    @needs_data
     def test_feature_middlebury_values_are_not_multiplied_by_the_scale(self):
         """The bottom left corner of ArtL is 00 00 5c 42 = 55 px."""
-        values = decode_pfm((DATA / "rgbd/middlebury2014/ArtL/disp0GT.pfm").read_bytes())
+        values = decode_pfm(shared("data/rgbd/middlebury2014/ArtL/disp0GT.pfm").read_bytes())
         assert values.shape == (277, 347)
         assert values[-1, 0] == 55

@@ -9,7 +9,7 @@ import torch
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.data.rgbd import read_rgbd
-from tests.base import BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.scenes import ENTRIES, NOMINAL_CALIBRATION, load_scene
 
 
@@ -29,11 +29,10 @@ class TestReadRgbd(BaseTester):
         with pytest.raises(ValueError, match=r"image\.png has 5 x 8, .*depth\.pfm has 8 x 5"):
             read_rgbd(tmp_path / "image.png", tmp_path / "depth.pfm")
 
-    @needs_data
     def test_feature_all_collected_scenes_are_here(self):
+        shared("data/scenes.json")
         assert len(ENTRIES) == 35
 
-    @needs_data
     @pytest.mark.parametrize("name", ENTRIES)
     def test_feature_real_scene_is_as_measured(self, name):
         """Size, valid share, and 0.5 %, 50 % and 99.5 % quantiles within 1 %, of scenes.json."""
@@ -50,13 +49,11 @@ class TestReadRgbd(BaseTester):
             known = NOMINAL_CALIBRATION["focal_px"] * NOMINAL_CALIBRATION["baseline_m"] / known
         np.testing.assert_allclose(np.quantile(known, [0.005, 0.5, 0.995]), entry["range"], rtol=0.01)
 
-    @needs_data
     def test_convention_depth_is_not_upside_down(self):
         """Motorcycle: the floor and bike below are nearer than the wall above, in a file whose rows run upwards."""
         depth = load_scene("middlebury-motorcycle").depth
         assert depth[0, -50:].median() < 0.8 * depth[0, :50].median()
 
-    @needs_data
     def test_feature_depth_edges_lie_on_image_edges(self):
         """A flipped or shifted map would meet the image's edges no more often than chance."""
         scene = load_scene("flyingthings3d-a0032")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_tidy.data import RGBDFolder, UnreadableItemError, described_folder
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.data.published import write_pfm
 
 
@@ -102,7 +102,6 @@ class TestRGBDFolder(BaseTester):
         with pytest.raises(UnreadableItemError, match=r"item 0 of RGBDFolder, x: .* must have the same size"):
             RGBDFolder(tmp_path, "*.png", "*_depth.png")[0]
 
-    @needs_data
     @pytest.mark.parametrize(
         ("folder", "image", "depth", "count", "median"),
         [
@@ -112,7 +111,8 @@ class TestRGBDFolder(BaseTester):
         ],
     )
     def test_feature_real_folders(self, folder, image, depth, count, median):
-        data = RGBDFolder(DATA / "rgbd" / folder, image, depth, scale=0.001, invalid=[65535])
+        root = shared(f"data/rgbd/{folder}", {image: count, depth: count})
+        data = RGBDFolder(root, image, depth, scale=0.001, invalid=[65535])
         assert len(data) == count
         for sample in data:
             assert sample["image"].shape == (3, 480, 640)

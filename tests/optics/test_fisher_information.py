@@ -30,7 +30,7 @@ from kornia_tidy.optics.fisher_information import (
 )
 from kornia_tidy.optics.initial_masks import fisher_mask
 from kornia_tidy.optics.materials import PMMA
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 APERTURE = circular_aperture(23)
 FINE = Fidelity("fine", pixel_tolerance=1e-4, window=25, stray_light="discard", double=True)
@@ -134,10 +134,9 @@ class TestSampledResponse(BaseTester):
         equal = sampled_response(pair, APERTURE, [4.0])
         self.assert_close(equal.psfs, (first.psfs + second.psfs) / 2)
 
-    @needs_data
     @pytest.mark.parametrize(("limit", "published"), [(10, 0.0785), (20, 0.0958)])
     def test_feature_the_published_mask_has_its_published_bound(self, limit, published):
-        heights = torch.from_numpy(np.loadtxt(DATA / "masks/PhaseCam3D/FisherMask_HeightMap.txt"))
+        heights = torch.from_numpy(np.loadtxt(shared("data/masks/PhaseCam3D/FisherMask_HeightMap.txt")))
         response = sampled_response(heights[None] * (math.pi / 530e-9), APERTURE, np.linspace(-limit, limit, 21))
         assert float(defocus_bound(fisher_information(response)).mean()) == pytest.approx(published, abs=5e-5)
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, cauchy_through, constant_index
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 FILES = {
     FUSED_SILICA: "main_SiO2_nk_Malitson.yml",
@@ -90,19 +90,17 @@ class TestMaterial(BaseTester):
         assert fraunhofer_d == pytest.approx(1.45846, abs=5.1e-6)
         assert (fraunhofer_d - 1) / (fraunhofer_f - fraunhofer_c) == pytest.approx(67.8, abs=0.05)
 
-    @needs_data
     @by_name
     def test_feature_matches_the_database_over_the_whole_range(self, material):
-        text = (DATA / "materials" / FILES[material]).read_text(encoding="utf-8")
+        text = shared(f"data/materials/{FILES[material]}").read_text(encoding="utf-8")
         shortest, longest = material.valid
         for step in range(101):
             wavelength = shortest + step / 100 * (longest - shortest)
             assert material.index(wavelength) == pytest.approx(database_index(text, wavelength * 1e6), abs=1e-12)
 
-    @needs_data
     def test_feature_the_film_of_joseph_2020_is_another_noa61(self):
         """The docstring's warning: 1.498 at 530 nm was measured on a thin film, far from the maker's 1.564."""
-        text = (DATA / "materials" / "other_optical_adhesives_NOA-61_nk_Joseph.yml").read_text(encoding="utf-8")
+        text = shared("data/materials/other_optical_adhesives_NOA-61_nk_Joseph.yml").read_text(encoding="utf-8")
         rows = [[float(number) for number in row] for row in re.findall(r"^\s+(\d\.\d+) (\d\.\d+)$", text, re.M)]
         nearest = min(rows, key=lambda row: abs(row[0] - 0.53))
         assert nearest[1] == pytest.approx(1.498, abs=5e-4)

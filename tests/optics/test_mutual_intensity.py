@@ -11,7 +11,7 @@ from kornia_tidy.optics.mutual_intensity import LARGEST_WINDOW, SOURCE, mutual_e
 from kornia_tidy.optics.propagation import energy_operations, pixel_energies
 from kornia_tidy.optics.wave_energy import wave_energies
 from tests.base import BaseTester
-from tests.optics.energies import EnergiesTester, random_case
+from tests.optics.energies import EnergiesTester, random_case, round_off
 
 
 @pytest.fixture(params=[1, 2**20], ids=["single depths", "all at once"])
@@ -31,13 +31,16 @@ class TestInC(BaseTester):
     @pytest.mark.parametrize(("states", "cells", "order"), [(1, 5, 1), (5, 23, 3), (3, 16, 2), (2, 33, 4)])
     @pytest.mark.parametrize("window", [1, 7, 22, LARGEST_WINDOW])
     def test_feature_equals_the_matrix_products(self, states, cells, order, window, dtype):
+        """Both are within the round-off of their formula. That is wide in float32, but both types are one source."""
         complex_type = dtype.to_complex()
         field = torch.randn(states, cells, cells, dtype=complex_type)
         kernels = torch.randn(3, window, order, cells, dtype=complex_type)
         weights = torch.rand(states, dtype=dtype)
+        allowed = 2 * round_off(field, weights, kernels)
         expected = mutual_energies(field, weights.requires_grad_(), kernels).detach()
         got = mutual_energies(field, weights.detach(), kernels)
-        self.assert_close(got / expected.max(), expected / expected.max(), rtol=0, atol=8 * torch.finfo(dtype).eps)
+        assert bool(((got.double() - expected.double()).abs() <= allowed).all())
+        assert bool((allowed < (0.1 if dtype == torch.float32 else 1e-9) * expected.max()).all())
 
     def test_feature_any_memory_order_and_number_of_threads(self):
         field, weights = torch.randn(2, 8, 8, dtype=torch.complex64), torch.rand(2)

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +8,7 @@ from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.paper import AliasingWarning, padded_size, paper_psf_bank, paper_psfs, warn_if_aliased
 from kornia_tidy.optics.spectrum import Spectrum
-from tests.base import DATA, SHARED, BaseTester, needs_data
+from tests.base import BaseTester, oracle, shared
 
 NODES = tuple(np.linspace(-20, 20, 21).tolist())
 WAVELENGTHS = (610e-9, 530e-9, 470e-9)
@@ -46,18 +44,14 @@ class TestPaperPSFs(BaseTester):
                 expected = torch.from_numpy(rewritten(heights.numpy(), NODES[d], wavelength, pad))
                 assert float((bank.psfs[d, c] - expected).abs().max()) < 1e-12
 
-    @needs_data
-    def test_feature_equals_the_oracle(self, monkeypatch):
-        monkeypatch.setattr(sys, "path", [str(SHARED / "oracle"), *sys.path])
-        import oracle
-
+    def test_feature_equals_the_oracle(self):
+        model = oracle()
         heights = torch.rand(2, 23, 23, dtype=torch.float64) * 1.2e-6
-        expected = torch.from_numpy(oracle.paper_psfs(heights.numpy(), NODES))
+        expected = torch.from_numpy(model.paper_psfs(heights.numpy(), NODES))
         assert float((bank_of(heights).psfs - expected).abs().max()) < 1e-12
 
-    @needs_data
     def test_feature_equals_the_published_file(self):
-        folder = DATA / "masks" / "PhaseCam3D" / "trained_framework"
+        folder = shared("data/masks/PhaseCam3D/trained_framework", {"HeightMap.txt": 1, "PSFs.npy": 1})
         heights = torch.from_numpy(np.loadtxt(folder / "HeightMap.txt"))[None]
         published = torch.from_numpy(np.load(folder / "PSFs.npy")).permute(0, 3, 1, 2)
         bank = bank_of(heights, tuple(np.linspace(-10, 10, 21).tolist()))

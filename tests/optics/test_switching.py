@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.optics.switching import Switching, random_phases, sampled_response, settling_time
-from tests.base import SHARED, BaseTester, needs_data
+from tests.base import BaseTester, oracle
 
 SMALL = Fidelity(window=9, layer_spacing=20.0, stray_light="discard")
 MEASURED = (0.0, 0.5, 1.1, 1.0)
@@ -79,14 +78,11 @@ class TestSwitching(BaseTester):
         assert float(weights.min()) >= 0
         assert abs(math.fsum(weights.tolist()) - 1) <= masks * torch.finfo(dtype).eps
 
-    @needs_data
     @pytest.mark.parametrize("time", [1e-3, 16e-3])
-    def test_feature_weights_are_those_of_the_oracle(self, time, monkeypatch):
-        monkeypatch.setattr(sys, "path", [str(SHARED / "oracle"), *sys.path])
-        import oracle
-
+    def test_feature_weights_are_those_of_the_oracle(self, time):
+        model = oracle()
         for cyclic in (False, True):
-            dwell, between = oracle.switching_weights(5, 0.1, time, swaps=5 if cyclic else None)
+            dwell, between = model.switching_weights(5, 0.1, time, swaps=5 if cyclic else None)
             _, weights = Switching(time, cyclic=cyclic)(torch.zeros(5, 3, 3, dtype=torch.float64))
             self.assert_close(weights, torch.from_numpy(np.concatenate([dwell, between])), rtol=1e-12, atol=0)
 

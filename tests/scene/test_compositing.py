@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 import re
 from dataclasses import replace
 
@@ -14,22 +13,10 @@ from scipy.signal import convolve2d
 
 from kornia_tidy.scene.compositing import METHODS, gather, render, scatter
 from kornia_tidy.scene.convolution import BORDERS
-from tests.base import SHARED, BaseTester
+from tests.base import BaseTester, oracle
 from tests.scene.scenes import Bank, brute_render, brute_weights, make_bank, make_scene
 
 COMPOSITINGS = ("gather", "scatter")
-ORACLE = SHARED / "oracle" / "oracle.py"
-
-
-def oracle():
-    if not ORACLE.is_file():
-        pytest.skip("the independent model ../shared/oracle/oracle.py is not on this machine")
-    spec = importlib.util.spec_from_file_location("oracle", ORACLE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def one_layer(psf, **options) -> Bank:

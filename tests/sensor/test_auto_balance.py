@@ -13,7 +13,7 @@ from kornia_tidy.sensor.auto_balance import auto_balance
 from kornia_tidy.sensor.develop import develop
 from kornia_tidy.sensor.filter_array import filter_tile, tiled
 from kornia_tidy.sensor.raw_file import RawCapture
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.sensor.dng import XTRANS
 
 QUICKTAKES = ("IMAGE01.QTK", "IMAGE02.QTK", "Image__1.qtk", "Image__2.qtk", "Image__6.qtk", "Mistigri.qtk")
@@ -69,14 +69,13 @@ class TestAutoBalance(BaseTester):
         with pytest.raises(ValueError, match=reason):
             auto_balance(replace(raw, counts=torch.full_like(raw.counts, level)))
 
-    @needs_data
     @pytest.mark.parametrize("name", QUICKTAKES)
     def test_feature_quicktakes_are_nearer_to_neutral_than_in_daylight(self, name):
         """Mean colour of the picture, linear: how far its channels are from their mean; of rooms, a tenth at most.
 
         The last one is of a white cat in a hedge, which is green.
         """
-        raw = RawCapture.open(DATA / f"raw/colinleroy+a2tools/QKTK_{name}")
+        raw = RawCapture.open(shared(f"data/raw/colinleroy+a2tools/QKTK_{name}"))
 
         def cast(balance):
             mean = develop(raw, "half", balance, encoded=False).clamp(0, 1).mean((1, 2))

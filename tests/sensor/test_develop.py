@@ -13,7 +13,7 @@ from kornia.color import rgb_to_linear_rgb
 from kornia_tidy.sensor.develop import balance_factors, default_method, develop, srgb_matrix
 from kornia_tidy.sensor.raw_color import assumed_camera_to_srgb, camera_to_srgb
 from kornia_tidy.sensor.raw_file import RawCapture
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.sensor.dng import XTRANS, dng
 from tests.sensor.test_raw_color import G1, G2
 from tests.sensor.test_raw_file import README
@@ -59,7 +59,6 @@ def capture(letters="RGGB", levels=(300, 500, 500, 800), size=4, **more):
 
 
 class TestDevelop(BaseTester):
-    @needs_data
     @pytest.mark.parametrize("name", HALVES)
     def test_feature_levels_balance_and_matrix_are_those_of_libraw(self, name):
         """On 2x2 planes, LibRaw's at half size, linear: within 1e-4 everywhere, 3e-5 on average for each channel.
@@ -68,9 +67,9 @@ class TestDevelop(BaseTester):
         Where black is the same in three channels and absent in a fourth (linear DNG) LibRaw leaves it in the white
         level.
         """
-        raw = RawCapture.open(DATA / name)
+        raw = RawCapture.open(shared(f"data/{name}"))
         options = {"use_camera_wb": True} if raw.white_balance is not None else {}
-        theirs = libraw(DATA / name, half_size=True, **(options if raw.colors else {"user_wb": [1.0] * 4}))
+        theirs = libraw(shared(f"data/{name}"), half_size=True, **(options if raw.colors else {"user_wb": [1.0] * 4}))
         scale = float((raw.white - raw.black[0]) / raw.white) if raw.pattern is None and raw.colors else 1.0
 
         def difference(raw):
@@ -83,10 +82,9 @@ class TestDevelop(BaseTester):
         assert difference(never_below_black(raw)).mean((1, 2)).max() < 3e-5
         assert difference(never_below_black(raw)).max() < (2e-4 if scale < 1 else 1e-4)
 
-    @needs_data
     def test_feature_wide_pixels_are_those_of_libraw(self):
         """Where pixels are wider than high LibRaw repeats columns, step by step."""
-        path = DATA / UNLIKE[0]
+        path = shared(f"data/{UNLIKE[0]}")
         raw = RawCapture.open(path)
         theirs = libraw(path, half_size=True)
         ours = develop(raw, "half", "daylight", encoded=False, square_pixels=False, upright=False).clamp(0, 1)
@@ -95,13 +93,12 @@ class TestDevelop(BaseTester):
         assert ours.shape == theirs.shape
         assert (ours - theirs).abs().max() < 1e-4
 
-    @needs_data
     def test_feature_xtrans_where_two_by_two_pixels_hold_all_colours(self):
         """LibRaw's half size keeps one sample of each colour in such a square; 1e-4 everywhere.
 
         Of a colour that is there twice it keeps either, as its threads come by.
         """
-        path = DATA / UNLIKE[1]
+        path = shared(f"data/{UNLIKE[1]}")
         raw = RawCapture.open(path)
         theirs = libraw(path, half_size=True, use_camera_wb=True)
         factors = balance_factors(raw)
@@ -120,7 +117,6 @@ class TestDevelop(BaseTester):
         assert whole.float().mean() > 0.2
         assert torch.minimum(*errors)[whole].max() < 1e-4
 
-    @needs_data
     @pytest.mark.parametrize(
         ("name", "method"), [(name, method) for name, methods in PICTURES.items() for method in methods]
     )
@@ -129,8 +125,10 @@ class TestDevelop(BaseTester):
 
         Left alone: DHT looks at ratios of counts, and so at noise below black, which LibRaw itself never shows it.
         """
-        raw = never_below_black(RawCapture.open(DATA / name))
-        theirs = libraw(DATA / name, use_camera_wb=True, demosaic_algorithm=rawpy.DemosaicAlgorithm[method.upper()])
+        raw = never_below_black(RawCapture.open(shared(f"data/{name}")))
+        theirs = libraw(
+            shared(f"data/{name}"), use_camera_wb=True, demosaic_algorithm=rawpy.DemosaicAlgorithm[method.upper()]
+        )
         ours = develop(raw, f"libraw_{method}", encoded=False, upright=False).clamp(0, 1)
         assert (ours - theirs).abs().mean() < 2e-4
         if method == "linear":

@@ -26,7 +26,7 @@ from kornia_tidy.sensor.photon_transfer import (
 from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
 from kornia_tidy.sensor.raw_simulation import simulate_raw
 from kornia_tidy.sensor.transfer_curve import CurvePoint
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.sensor.flats import flat, flats
 
 LINE = TransferLine(2.0, 0.01, 6.0, 0.1, 0.0, 0.999, 10000)
@@ -268,7 +268,6 @@ class TestFiles(BaseTester):
             read_json(tmp_path / "noise.json")
 
 
-@needs_data
 class TestRealFiles(BaseTester):
     @pytest.mark.parametrize(
         "name",
@@ -278,7 +277,7 @@ class TestRealFiles(BaseTester):
         ],
     )
     def test_feature_a_straight_line_where_the_data_allow_it(self, name):
-        line = photon_transfer([RawCapture.open(DATA / "raw" / name)]).line
+        line = photon_transfer([RawCapture.open(shared(f"data/raw/{name}"))]).line
         assert line.r_squared >= 0.99
         assert line.gain_error < 0.02 * line.gain
 
@@ -286,7 +285,7 @@ class TestRealFiles(BaseTester):
         """The G2's border, which no light reaches, has a standard deviation of 0.79 counts with rounding."""
         import rawpy
 
-        path = DATA / "raw/thorsted+digicam_corpus/G2_CRW_0305.CRW"
+        path = shared("data/raw/thorsted+digicam_corpus/G2_CRW_0305.CRW")
         with rawpy.imread(str(path)) as file:
             border = file.raw_image[40:-40, -46:-4].astype(float)
         result = photon_transfer([RawCapture.open(path)])
@@ -303,4 +302,4 @@ class TestRealFiles(BaseTester):
     )
     def test_feature_processed_pictures_are_refused(self, name):
         with pytest.raises(ValueError, match="allow a photon-transfer fit"):
-            photon_transfer([RawCapture.open(DATA / "raw" / name)])
+            photon_transfer([RawCapture.open(shared(f"data/raw/{name}"))])

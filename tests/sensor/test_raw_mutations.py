@@ -22,7 +22,7 @@ import pytest
 
 from kornia_tidy.sensor import raw_decoder, raw_decoding
 from kornia_tidy.sensor.raw_file import RawCapture
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 FILES = 1000
 CHUNK = 100
@@ -34,12 +34,13 @@ SMALL = 1_000_000  # bytes; larger files are taken once in eight
 def mutated(seed):
     """Return the name of a file of the data and its bytes, damaged in one of five ways."""
     generator = np.random.default_rng(seed)
-    paths = [p for folder in ("raw", "raw_synthetic") for p in sorted((DATA / folder).rglob("*")) if p.is_file()]
+    folders = [shared(f"data/{name}", {"*": 1}) for name in ("raw", "raw_synthetic")]
+    paths = [p for folder in folders for p in sorted(folder.rglob("*")) if p.is_file()]
     # Headerless dumps and files of other kinds are refused by their first bytes, whatever comes later.
     paths = [p for p in paths if p.stat().st_size > 1000 and p.parent.name[:6] not in {"mushfi", "cruxop", "drewno"}]
     large = [p for p in paths if p.stat().st_size > SMALL]
     small = [p for p in paths if p.stat().st_size <= SMALL]
-    chosen = large if generator.random() < 1 / 8 else small
+    chosen = (large if generator.random() < 1 / 8 else small) or paths
     path = chosen[generator.integers(len(chosen))]
     data = np.frombuffer(path.read_bytes(), np.uint8).copy()
     kind = ("cut", "bytes", "header", "block", "zeros")[seed % 5]
@@ -106,7 +107,6 @@ def outcome(data):
     return raw
 
 
-@needs_data
 class TestMutations(BaseTester):
     @pytest.mark.slow
     @pytest.mark.skipif(sys.platform != "linux", reason="files are passed on through /proc")

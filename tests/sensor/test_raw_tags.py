@@ -21,7 +21,7 @@ from kornia_tidy.sensor.raw_tags import (
     tiff_directories,
     white_levels,
 )
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.sensor.dng import BYTE, LONG, SHORT, SRATIONAL, XTRANS, dng, patched
 from tests.sensor.test_raw_file import README
 
@@ -43,7 +43,6 @@ class TestCameraTags(BaseTester):
             "timestamp": "2024-02-29T12:34:56",
         }
 
-    @needs_data
     @pytest.mark.parametrize(
         ("name", "expected"),
         [
@@ -56,7 +55,7 @@ class TestCameraTags(BaseTester):
     )
     def test_feature_of_cameras(self, name, expected):
         """As ExifTool lists the same files in its own tests."""
-        found = camera_tags((DATA / "raw/exiftool+exiftool" / name).read_bytes())
+        found = camera_tags(shared(f"data/raw/exiftool+exiftool/{name}").read_bytes())
         told = tuple(found.get(key) for key in ("model", "lens", "iso", "exposure", "aperture"))
         assert told == tuple(pytest.approx(x) if isinstance(x, float) else x for x in expected)
 
@@ -139,10 +138,9 @@ class TestFilterArrayFault(BaseTester):
         raw = RawCapture.from_counts(torch.from_numpy(COUNTS)[None], pattern, 64, 1023)
         assert filter_array_fault(encode_dng(raw)) is None
 
-    @needs_data
     @pytest.mark.parametrize("name", README)
     def test_smoke_nothing_is_wrong_with_cameras(self, name):
-        assert filter_array_fault((DATA / name).read_bytes()) is None
+        assert filter_array_fault(shared(f"data/{name}").read_bytes()) is None
 
     @pytest.mark.parametrize(
         ("tag", "changes", "fault"),

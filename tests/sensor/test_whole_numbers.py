@@ -16,7 +16,7 @@ from kornia_tidy.sensor.demosaic import LIBRAW, LIBRAW_LOCAL, LIBRAW_REACH, demo
 from kornia_tidy.sensor.filter_array import filter_tile
 from kornia_tidy.sensor.raw_file import RawCapture
 from kornia_tidy.sensor.whole_numbers import FEWEST_ROWS, LARGEST_BAND, ROWS_AT_ONCE, band_edges, in_whole_numbers
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 
 LOCAL = [
     (letters, name)
@@ -53,10 +53,9 @@ class TestInWholeNumbers(BaseTester):
         monkeypatch.setattr(demosaicing, "LIBRAW_REACH", 0)
         assert not torch.equal(demosaic(mosaic, *filter_tile("RGGB"), "libraw_ahd"), whole)
 
-    @needs_data
     @pytest.mark.parametrize("name", ["ahd", "ppg"])
     def test_feature_a_cameras_file_too(self, name, monkeypatch):
-        raw = RawCapture.open(DATA / "raw/syoyo+tinydng/colorchart.dng")
+        raw = RawCapture.open(shared("data/raw/syoyo+tinydng/colorchart.dng"))
         monkeypatch.setattr(whole_numbers, "LARGEST_BAND", 1 << 18)
         bands = raw.to_rgb(f"libraw_{name}")
         monkeypatch.setattr(demosaicing, "LIBRAW_LOCAL", ())

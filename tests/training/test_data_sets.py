@@ -17,7 +17,7 @@ from kornia_tidy.training.data_sets import SCENES, make_scenes
 from kornia_tidy.training.scenes import SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.tasks import nearness
-from tests.base import DATA, BaseTester, needs_data
+from tests.base import BaseTester, shared
 from tests.data.published import write_flying_things, write_nyu
 
 pytestmark = pytest.mark.filterwarnings(
@@ -224,7 +224,6 @@ class TestEndToEnd(BaseTester):
         summary = json.loads((tmp_path / "e" / "summary.json").read_text())
         assert (summary["scenes"], summary["split"]) == (PAIRS, "all")
 
-    @needs_data
     @pytest.mark.parametrize("name", FILES)
     def test_feature_real_samples(self, name, tmp_path, capsys):
         """Samples of the published files, where the readers expect them."""
@@ -233,10 +232,10 @@ class TestEndToEnd(BaseTester):
         root.mkdir()
         if name == "nyu":
             for file in ("nyu_depth_v2_labeled", "splits"):
-                (root / f"{file}.mat").symlink_to(DATA / "nyu_layout" / f"{file}_TINY.mat")
+                (root / f"{file}.mat").symlink_to(shared(f"data/nyu_layout/{file}_TINY.mat"))
         elif name == "rgbd-folder":
             for file in ("color", "depth"):
-                (root / file).symlink_to(DATA / "rgbd" / "slambook2" / "ch5_rgbd" / file)
+                (root / file).symlink_to(shared(f"data/rgbd/slambook2/ch5_rgbd/{file}", {"*.*": 5}))
             about = {"image": "color/*.png", "depth": "depth/*.pgm", "scale": 0.001}
             (root / "rgbd.json").write_text(json.dumps(about))
         else:
@@ -245,9 +244,10 @@ class TestEndToEnd(BaseTester):
                     for kind, suffix in (("frames_cleanpass", "png"), ("disparity", "pfm")):
                         view = root / kind / part / f"{sequence:04d}" / "left"
                         view.mkdir(parents=True)
-                        source = DATA / "rgbd" / "flyingthings3d_subset" / kind / "0000" / "left"
                         frame = ("0006", "0012")[sequence % 2]
-                        (view / f"{frame}.{suffix}").symlink_to(source / f"{frame}.{suffix}")
+                        (view / f"{frame}.{suffix}").symlink_to(
+                            shared(f"data/rgbd/flyingthings3d_subset/{kind}/0000/left/{frame}.{suffix}")
+                        )
         row, summary = train_and_evaluate(name, root, tmp_path, capsys)
         assert 0 < float(row["depth_counted"]) <= 1
         assert 0 < float(row["depth_rmse"]) < 2

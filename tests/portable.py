@@ -1,0 +1,286 @@
+"""The tests as other machines would run them: one factor at a time, then a table of what was run and what was not.
+
+``python -m tests.portable`` takes up to 20 minutes on two cores; ``--quick`` takes a share of it, ``--only aten`` the
+factors whose names begin so, and ``--list`` shows them all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+KERNELS = (
+    "tests/scene/test_direct.py",
+    "tests/scene/test_occlusion_direct.py",
+    "tests/optics/test_mutual_intensity.py",
+)
+RENDERING = (
+    "tests/scene",
+    "tests/optics",
+    "tests/test_tidy_optics.py",
+    "tests/test_motion.py",
+    "tests/test_multi_shot.py",
+    "tests/test_capture_error.py",
+    "tests/test_render_cost.py",
+    "tests/test_pipelines_captures.py",
+    "tests/systems/test_presets.py",
+)
+TRANSFORMS = (  # and matrix products
+    *RENDERING,
+    "tests/calibration",
+    "tests/reconstruction/test_tikhonov.py",
+    "tests/reconstruction/test_tikhonov_modules.py",
+    "tests/reconstruction/test_periodic.py",
+    "tests/reconstruction/test_refocused.py",
+    "tests/test_planning.py",
+)
+NUMBERS = (*TRANSFORMS, "tests/reconstruction", "tests/sensor", "tests/training", "tests/test_pretrained.py")
+
+# What /proc/cpuinfo calls what code for these processors uses.
+AVX2 = frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"})
+AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512dq", "avx512vl"}
+V2 = frozenset({"sse4_2", "ssse3", "popcnt", "cx16"})
+
+# Printed by an interpreter in a factor's environment: what is in use there.
+PROBE = """
+import hashlib, json, warnings
+import torch
+from kornia_tidy.compiled import compiled
+from kornia_tidy.scene.direct import SOURCE
+warnings.simplefilter("ignore")
+generator = torch.Generator().manual_seed(0)
+one, two = torch.rand(2, 96, 96, generator=generator, dtype=torch.float64)
+products = torch.cat([one @ two, torch.linalg.inv(one), torch.fft.fft2(two).real])
+print(json.dumps({
+    "aten": torch.backends.cpu.get_cpu_capability(),
+    "mkl": hashlib.sha256(products.numpy().tobytes()).hexdigest() if torch.backends.mkl.is_available() else "",
+    "compiled": compiled(SOURCE, torch.float32) is not None,
+    "threads": torch.get_num_threads(),
+}))
+"""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What this machine is, and what is in use on it if nobody says otherwise."""
+
+    processor: str
+    can: frozenset[str]
+    usual: dict[str, object]
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One thing in which machines differ.
+
+    Args:
+        name: of it, in the table.
+        environment: what makes this machine differ so.
+        tests: that it can touch.
+        quick: those of the quick run; none leaves it out.
+        needs: what the processor must be able to do.
+        compiler: the program that must be there.
+        refuse: why what is in use there is not what was asked for, or None; given the machine and what is in use.
+    """
+
+    name: str
+    environment: dict[str, str]
+    tests: tuple[str, ...]
+    quick: tuple[str, ...] = ()
+    needs: frozenset[str] = frozenset()
+    compiler: str = ""
+    refuse: Callable[[Machine, dict[str, object]], str | None] = field(default=lambda machine, used: None)
+
+
+def _not_aten(level: str) -> Callable[[Machine, dict[str, object]], str | None]:
+    def refuse(_: Machine, used: dict[str, object]) -> str | None:
+        return None if used["aten"] == level else f"PyTorch uses {used['aten']} nevertheless"
+
+    return refuse
+
+
+def _same_mkl(machine: Machine, used: dict[str, object]) -> str | None:
+    if not used["mkl"]:
+        return "this PyTorch is without oneMKL"
+    same = used["mkl"] == machine.usual.get("mkl")
+    return f"oneMKL computes to the last bit as without it on this processor ({machine.processor})" if same else None
+
+
+def _not_compiled(_: Machine, used: dict[str, object]) -> str | None:
+    return None if used["compiled"] else "the compiler does not compile the C sources so"
+
+
+def _compiled(_: Machine, used: dict[str, object]) -> str | None:
+    return "the C sources are compiled nevertheless" if used["compiled"] else None
+
+
+def _one_core(_: Machine, used: dict[str, object]) -> str | None:
+    return None if used["threads"] == 2 else f"PyTorch uses {used['threads']} threads"
+
+
+def _c(name: str, compiler: str, *options: str, needs: frozenset[str] = frozenset(), quick: bool = False) -> Factor:
+    environment = {"CC": " ".join((compiler, *options))}
+    return Factor(name, environment, RENDERING, KERNELS if quick else (), needs, compiler, _not_compiled)
+
+
+FACTORS = (
+    Factor("aten default", {"ATEN_CPU_CAPABILITY": "default"}, NUMBERS, ("tests/scene",), refuse=_not_aten("DEFAULT")),
+    Factor("aten avx2", {"ATEN_CPU_CAPABILITY": "avx2"}, NUMBERS, (), AVX2, refuse=_not_aten("AVX2")),
+    Factor("aten avx512", {"ATEN_CPU_CAPABILITY": "avx512"}, NUMBERS, (), AVX512, refuse=_not_aten("AVX512")),
+    Factor("onemkl avx2", {"MKL_ENABLE_INSTRUCTIONS": "AVX2"}, TRANSFORMS, (), AVX2, refuse=_same_mkl),
+    Factor("onemkl compatible", {"MKL_CBWR": "COMPATIBLE"}, TRANSFORMS, KERNELS, refuse=_same_mkl),
+    _c("c x86-64-v2", "gcc", "-march=x86-64-v2", needs=V2, quick=True),
+    _c("c x86-64-v3", "gcc", "-march=x86-64-v3", needs=V2 | AVX2),
+    _c("c native gcc", "gcc"),
+    _c("c native clang", "clang", quick=True),
+    Factor(
+        "c no compiler", {"CC": "false"}, (*RENDERING, "tests/test_compiled.py"), ("tests/scene",), refuse=_compiled
+    ),
+    Factor("threads 1", {"OMP_NUM_THREADS": "1"}, NUMBERS),
+    Factor("threads 2", {"OMP_NUM_THREADS": "2"}, NUMBERS, ("tests/scene",), refuse=_one_core),
+)
+
+
+@dataclass
+class Outcome:
+    """A row of the table."""
+
+    name: str
+    tests: int = 0
+    passed: int = 0
+    failed: int = 0
+    skipped: int = 0
+    seconds: float = 0.0
+    remark: str = ""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the factors that are asked for; 1 if a test failed in any."""
+    parser = argparse.ArgumentParser(prog="python -m tests.portable", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", metavar="NAME", help="factors whose names begin so")
+    parser.add_argument("--quick", action="store_true", help="a share of it: two to three minutes on two cores")
+    parser.add_argument("--list", action="store_true", help="show the factors and run none")
+    args = parser.parse_args(arguments)
+    chosen = [f for f in FACTORS if f.name.startswith(args.only or "") and (f.quick or not args.quick)]
+    if not chosen:
+        parser.error(f"no factor's name begins with {args.only!r}: there are {', '.join(f.name for f in FACTORS)}")
+    if args.list:
+        for factor in chosen:
+            words = " ".join(f"{key}={value!r}" for key, value in factor.environment.items())
+            print(f"{factor.name:18} {words:34} {' '.join(factor.quick if args.quick else factor.tests)}")
+        return 0
+    machine = this_machine()
+    outcomes = []
+    for factor in chosen:
+        print(f"=== {factor.name}", flush=True)
+        outcomes.append(run(factor, machine, factor.quick if args.quick else factor.tests))
+    print(table(outcomes, machine))
+    return int(any(outcome.failed for outcome in outcomes))
+
+
+def this_machine() -> Machine:
+    """Look at the processor, and at what is in use without any factor."""
+    about: dict[str, str] = {}
+    if (path := Path("/proc/cpuinfo")).is_file():
+        lines = path.read_text().split("\n\n")[0].splitlines()
+        about = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    name = about.get("model name") or platform.processor() or platform.machine()
+    return Machine(name, frozenset(about.get("flags", "").split()), probe({}))
+
+
+def environment(factor: dict[str, str]) -> dict[str, str]:
+    """Return a factor's environment: only what it names differs from what `make test` has."""
+    names = {name for each in FACTORS for name in each.environment}
+    plain = {key: value for key, value in os.environ.items() if key not in names}
+    return {**plain, "OMP_NUM_THREADS": "1", **factor}
+
+
+def probe(factor: dict[str, str]) -> dict[str, object]:
+    """Return what is in use in an environment; empty if not even that can be found out."""
+    command = [sys.executable, "-c", PROBE]
+    told = subprocess.run(
+        command, env=environment(factor), cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
+    )
+    if told.returncode:
+        print(told.stderr[-2000:])
+        return {}
+    return json.loads(told.stdout.splitlines()[-1])
+
+
+def why_not(factor: Factor, machine: Machine) -> str | None:
+    """Return why a factor cannot be had on this machine, or None."""
+    if missing := sorted(factor.needs - machine.can):
+        return f"this processor ({machine.processor}) has no {', '.join(missing)}"
+    if factor.compiler and shutil.which(factor.compiler) is None:
+        return f"{factor.compiler} is not on this machine"
+    used = probe(factor.environment)
+    return factor.refuse(machine, used) if used else None
+
+
+def run(factor: Factor, machine: Machine, tests: tuple[str, ...]) -> Outcome:
+    """Run the tests of a factor, or say why not."""
+    outcome, start = Outcome(factor.name), time.perf_counter()
+    if reason := why_not(factor, machine):
+        outcome.remark = f"not run: {reason}"
+        print(outcome.remark)
+        return outcome
+    processes = max(1, (os.cpu_count() or 1) // int(factor.environment.get("OMP_NUM_THREADS", "1")))
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.xml"
+        command = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", f"--junitxml={report}", "-p"]
+        command += ["no:cacheprovider", f"--numprocesses={min(8, processes)}", "--dist=loadfile"]
+        # What is meant here is no warning: code that is not compiled, or without threads.
+        command += ["-W", "ignore:compiled code", *drop_nested(tests)]
+        status = subprocess.run(command, env=environment(factor.environment), cwd=ROOT, check=False).returncode
+        if report.is_file():
+            count(outcome, ET.parse(report).getroot())
+    if status and not outcome.failed:
+        outcome.failed, outcome.remark = 1, f"pytest ended with status {status}"
+    outcome.seconds = time.perf_counter() - start
+    return outcome
+
+
+def drop_nested(paths: Sequence[str]) -> list[str]:
+    """Return paths once each, without those inside another, which pytest would run twice."""
+    unique = list(dict.fromkeys(paths))
+    return [path for path in unique if not any(path.startswith(f"{other}/") for other in unique)]
+
+
+def count(outcome: Outcome, report: ET.Element) -> None:
+    """Add up a report of pytest's."""
+    for suite in report.iter("testsuite"):
+        outcome.tests += int(suite.get("tests", 0))
+        outcome.failed += int(suite.get("failures", 0)) + int(suite.get("errors", 0))
+        outcome.skipped += int(suite.get("skipped", 0))
+    outcome.passed = outcome.tests - outcome.failed - outcome.skipped
+
+
+def table(outcomes: Sequence[Outcome], machine: Machine) -> str:
+    """Return what was run as a table of Markdown."""
+    rows = [
+        f"\n{machine.processor}, {os.cpu_count()} cores; PyTorch's own choice is {machine.usual.get('aten')}\n",
+        "| factor | tests | passed | failed | skipped | s | |",
+        "|---|--:|--:|--:|--:|--:|---|",
+    ]
+    rows += [
+        f"| {o.name} | {o.tests} | {o.passed} | {o.failed} | {o.skipped} | {o.seconds:.0f} | {o.remark} |"
+        for o in outcomes
+    ]
+    return "\n".join([*rows, f"\n{sum(o.seconds for o in outcomes):.0f} s in all"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

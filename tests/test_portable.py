@@ -1,0 +1,101 @@
+"""What the run as other machines promises: skipped factors are said, and a failure is not lost."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from tests import portable
+from tests.base import BaseTester
+from tests.portable import AVX512, FACTORS, Factor, Machine, Outcome, main
+
+PLAIN = Machine("a processor", portable.V2, {"aten": "DEFAULT", "mkl": "0"})
+USED = {"aten": "DEFAULT", "mkl": "1", "compiled": True, "threads": 1}
+
+
+@pytest.fixture
+def probed(monkeypatch):
+    """What is in use, whatever is asked for; and no processes."""
+    used = dict(USED)
+    monkeypatch.setattr(portable, "probe", lambda environment: used)
+    monkeypatch.setattr(portable, "this_machine", lambda: PLAIN)
+    return used
+
+
+def factor(name: str) -> Factor:
+    return next(f for f in FACTORS if f.name == name)
+
+
+class TestPortable(BaseTester):
+    def test_feature_every_test_that_is_named_is_there(self):
+        assert all((portable.ROOT / path).exists() for f in FACTORS for path in (*f.tests, *f.quick))
+        assert len({f.name for f in FACTORS}) == len(FACTORS)
+
+    @pytest.mark.usefixtures("probed")
+    @pytest.mark.parametrize(
+        ("name", "reason"),
+        [
+            ("aten avx2", r"this processor \(a processor\) has no abm, avx2, "),
+            ("c x86-64-v3", r"this processor \(a processor\) has no abm, avx2, "),
+            ("c native clang", "clang is not on this machine"),
+            ("threads 2", "PyTorch uses 1 threads"),
+            ("c no compiler", "the C sources are compiled nevertheless"),
+            ("onemkl compatible", None),
+        ],
+    )
+    def test_feature_what_cannot_be_had_is_said(self, name, reason, monkeypatch):
+        monkeypatch.setattr(portable.shutil, "which", lambda program: None)
+        outcome = portable.why_not(factor(name), PLAIN)
+        assert (outcome is None) == (reason is None)
+        if reason:
+            assert re.search(reason, str(outcome))
+
+    def test_feature_what_a_machine_does_not_heed_is_said(self, probed):
+        probed["mkl"] = PLAIN.usual["mkl"]
+        assert "to the last bit as without it on this processor (a processor)" in str(
+            portable.why_not(factor("onemkl compatible"), PLAIN)
+        )
+        machine = replace(PLAIN, can=AVX512)
+        assert portable.why_not(factor("aten avx512"), machine) == "PyTorch uses DEFAULT nevertheless"
+
+    def test_feature_reports_are_added_up(self):
+        report = portable.ET.fromstring(
+            '<testsuites><testsuite tests="7" failures="1" errors="1" skipped="2"/></testsuites>'
+        )
+        outcome = Outcome("one")
+        portable.count(outcome, report)
+        assert (outcome.tests, outcome.passed, outcome.failed, outcome.skipped) == (7, 3, 2, 2)
+
+    @pytest.mark.usefixtures("probed")
+    def test_feature_the_table_has_what_was_run_and_what_was_not(self, monkeypatch, capsys):
+        def run(factor, machine, tests):
+            return Outcome(factor.name, tests=2, passed=1, failed=int(factor.name == "threads 2"), remark="why")
+
+        monkeypatch.setattr(portable, "run", run)
+        assert main(["--only", "aten"]) == 0
+        assert main(["--only", "threads"]) == 1
+        told = capsys.readouterr().out
+        for name in ("aten default", "aten avx2", "aten avx512", "threads 1", "threads 2"):
+            assert f"| {name} | 2 | 1 |" in told
+        assert "onemkl" not in told
+
+    def test_feature_listing_runs_nothing(self, capsys, monkeypatch):
+        monkeypatch.setattr(portable, "this_machine", lambda: pytest.fail("looked at the machine"))
+        assert main(["--list"]) == 0
+        told = capsys.readouterr().out
+        assert all(f.name in told for f in FACTORS)
+
+    def test_exception_a_name_that_is_none(self, capsys):
+        with pytest.raises(SystemExit):
+            main(["--only", "arm"])
+        assert "no factor's name begins with 'arm': there are aten default," in capsys.readouterr().err
+
+    def test_feature_only_the_factor_differs(self, monkeypatch):
+        monkeypatch.setenv("CC", "mine")
+        monkeypatch.setenv("OMP_NUM_THREADS", "7")
+        made = portable.environment({"MKL_CBWR": "COMPATIBLE"})
+        assert "CC" not in made
+        assert (made["OMP_NUM_THREADS"], made["MKL_CBWR"]) == ("1", "COMPATIBLE")
+        assert portable.drop_nested(["tests/a", "tests/a/b.py", "tests/a", "tests/c.py"]) == ["tests/a", "tests/c.py"]
