@@ -38,7 +38,8 @@ def check_defocus_range(
         window: side of the PSFs in pixels if it is fixed.
 
     Raises:
-        ValueError: if there are more than 4096 layers, or a disc is wider than 8 of the largest windows, of 65 px or more.
+        ValueError: if there are more than 4096 layers, or a disc is wider than 8 of the largest windows (at least of
+            65 px).
 
     Example:
         >>> check_defocus_range((-20.0, 20.0), 2.1e-7, Fidelity(), None)
