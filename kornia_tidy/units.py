@@ -80,14 +80,14 @@ or give linear light with color_space='linear'
 
 
 def normalised(lowest: float, highest: float, darkest: float) -> str | None:
-    """Return a sentence on an image whose extremes are those of a normalised one, else None.
+    """Return a sentence on an image whose extremes are those of a normalised one, else None, for NaN too.
 
     Args:
         lowest: least value.
         highest: greatest value.
         darkest: how far below zero values may be, and a tenth of the greatest in any case.
     """
-    if lowest >= darkest or -lowest < 0.1 * highest:
+    if not lowest < darkest or -lowest < 0.1 * highest:
         return None
     return (
         f"image holds values from {lowest:.3g} to {highest:.3g}, and light is not negative: if it was normalised by a "

@@ -19,6 +19,7 @@ PARTS: dict[str, tuple[type, str, str]] = {
 """Of each part its type, an example for people, and an attribute that its type must have."""
 
 WIDEST_BLUR = 8  # times the largest window: one that wide holds a fiftieth of the light, 1 / (pi / 4 * 64)
+USUAL_WINDOW = 65  # px; small pictures have smaller ones, which says nothing of the lens
 MOST_LAYERS = 4096
 
 
@@ -37,7 +38,8 @@ def check_defocus_range(
         window: side of the PSFs in pixels if it is fixed.
 
     Raises:
-        ValueError: if there are more than 4096 layers, or a disc is wider than 8 of the largest windows.
+        ValueError: if there are more than 4096 layers, or a disc is wider than 8 of the largest windows (at least of
+            65 px).
 
     Example:
         >>> check_defocus_range((-20.0, 20.0), 2.1e-7, Fidelity(), None)
@@ -50,7 +52,7 @@ Fidelity.max_window or layer_spacing
     lo, hi = defocus_range
     size = float(step.detach()) if isinstance(step, Tensor) else step
     blur, layers = 2 * max(-lo, hi) * REFERENCE_WAVELENGTH / (math.pi * size), (hi - lo) / fidelity.layer_spacing
-    widest = WIDEST_BLUR * max(window or 0, fidelity.max_window)
+    widest = WIDEST_BLUR * max(window or 0, fidelity.max_window, USUAL_WINDOW)
     if blur > widest or layers > MOST_LAYERS:
         raise ValueError(
             f"a defocus from {lo:.4g} to {hi:.4g} rad needs {layers:.0f} layers of PSFs {blur:.0f} px wide, of which "
