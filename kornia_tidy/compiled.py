@@ -34,7 +34,7 @@ SHARED = Path(__file__).with_name("vectors.h")  # what sources include
 FLAGS = ("-O3", "-std=gnu11", "-ffp-contract=fast", "-fPIC", "-shared", f"-I{SHARED.parent}")
 NATIVE = {"x86_64": "-march=native", "AMD64": "-march=native"}
 THREADS = "-fopenmp"  # PyTorch has brought OpenMP's library along, but a compiler may lack its own
-SECONDS = 60  # to wait for a compiler, which needs two
+SECONDS = 120  # to wait for a compiler, which needs two to seven on an idle processor
 COST = "takes 1.5 to 6 times as long"  # measured on one real scene: gather 1.6, PSFs 1.8, occlusion 5.6
 
 _hung: list[str] = []  # what is said of a compiler that was ended: it is not called again
