@@ -19,12 +19,13 @@ from kornia_tidy.tidy_optics import TiDyOptics
 MEASURED_CODE = (
     "**/*.c",
     "**/*.h",
-    "camera_survey.py",
+    "camera_*.py",
     "candidates.py",
     "capture_error.py",
     "checks.py",
     "compiled.py",
     "fidelity.py",
+    "following.py",
     "occlusion_cost.py",
     "optics/**/*.py",
     "planning.py",
@@ -32,10 +33,12 @@ MEASURED_CODE = (
     "render_plan.py",
     "scene/**/*.py",
     "sensor/*.py",
+    "threads.py",
     "tidy_optics.py",
     "tradeoff/costs.py",
     "tradeoff/ladder.py",
     "tradeoff/measure.py",
+    "units.py",
 )
 
 
