@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from kornia_tidy import cli
 from tests.base import BaseTester
@@ -57,9 +63,45 @@ class TestMain(BaseTester):
         assert captured.err == "kornia-tidy: error: depth must be positive\n"
         assert captured.out == ""
 
-    def test_exception_of_a_programmer_is_not_hidden(self, command_that):
-        with pytest.raises(ZeroDivisionError):
-            cli.main(command_that(lambda: 1 / 0))
+    def test_exception_of_a_programmer_is_one_sentence_and_status_70(self, command_that, capsys, monkeypatch):
+        monkeypatch.delenv(cli.DEBUG, raising=False)
+        assert cli.main(command_that(lambda: 1 / 0)) == 70
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "a fault of kornia-tidy, not yours (ZeroDivisionError: division by zero); please report it" in line
+
+    def test_exception_shows_where_it_came_from_if_asked(self, command_that, capsys, monkeypatch):
+        monkeypatch.setenv(cli.DEBUG, "1")
+        assert cli.main(command_that(lambda: 1 / 0)) == 70
+        lines = capsys.readouterr().err.splitlines()
+        assert lines[0].startswith("Traceback")
+        assert lines[-1].startswith("kornia-tidy: error: this is a fault")
+
+    @pytest.mark.parametrize(
+        "action", [lambda: torch.empty(1 << 60), lambda: bytearray(1 << 62)], ids=["torch", "python"]
+    )
+    def test_exception_no_memory_is_one_sentence_and_status_2(self, action, command_that, capsys):
+        assert cli.main(command_that(action)) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("kornia-tidy: error: the memory that this needs is not there")
+
+    def test_feature_a_reader_that_leaves_is_no_error(self, tmp_path):
+        """As `kornia-tidy ... | head` does: nothing is said, and the status is that of SIGPIPE."""
+        read, write = os.pipe()
+        os.close(read)
+        command = [sys.executable, "-m", "kornia_tidy", "masks", "show", str(tmp_path / "heights.npy")]
+        np.save(tmp_path / "heights.npy", np.zeros((1, 3, 3)))
+        done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
+        os.close(write)
+        assert (done.returncode, done.stderr) == (141, b"")
+
+    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
+    def test_exception_a_full_disk_under_the_report(self, tmp_path):
+        command = [sys.executable, "-m", "kornia_tidy", "masks", "show", str(tmp_path / "heights.npy")]
+        np.save(tmp_path / "heights.npy", np.zeros((1, 3, 3)))
+        with open("/dev/full", "w") as full:
+            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
+        assert done.returncode == 2
+        assert done.stderr.decode().splitlines() == ["kornia-tidy: error: [Errno 28] No space left on device"]
 
     def test_feature_interruption_returns_130(self, command_that, capsys):
         def interrupt():

@@ -13,6 +13,8 @@ from kornia_tidy.data.image_files import SUFFIXES
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.optics.camera import ThinLensCamera
 
+MOST_PROCESSES = 1024  # more would only bring a machine down
+
 
 def add_depth_options(parser: argparse.ArgumentParser) -> None:
     """Add what a depth file needs to become metres."""
@@ -101,6 +103,13 @@ def seed(text: str) -> int:
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"a seed must be a whole number from 0 to 2^63 - 1, got {text!r}")
     return value
+
+
+def processes(text: str) -> int:
+    """Return a number of processes that a machine may start, 0 included."""
+    if not (text.isascii() and text.isdigit() and int(text[:9]) <= MOST_PROCESSES):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to {MOST_PROCESSES}, got {text!r:.40}")
+    return int(text)
 
 
 def read_scene(args: argparse.Namespace) -> Scene:
