@@ -6,13 +6,14 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench targets clean
+.PHONY: help demo test mutations lint bench targets clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo     coded captures and what networks make of them: outputs/demo.png, reconstruction.png"
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
 	@echo "make test     the tests, a process for each core; ARGS='-k camera' runs some of them, ARGS='-n0' in one process"
+	@echo "make mutations  damaged files through the command: 200 of them, or ARGS='--count 5000 --seed 1 --kind png'"
 	@echo "make lint     style, spelling and types"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
@@ -26,6 +27,10 @@ demo: $(READY)
 
 test: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 --dist=loadfile $(ARGS)
+
+# What fails is kept in outputs/mutations.
+mutations: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutations $(or $(ARGS),--count 200)
 
 lint: $(READY)
 	@$(BIN)/ruff check

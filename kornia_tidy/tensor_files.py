@@ -44,4 +44,4 @@ def read_tensors(
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (no mapping)
             return tensors, dict(file.metadata() or {})
     except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # the latter of types PyTorch does not know
-        raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error}") from None
+        raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error!s:.300}") from None

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 
 from kornia_tidy import cli
 from tests.base import BaseTester
+from tests.forks import fork, wait
 
 
 class TestMain(BaseTester):
@@ -84,24 +84,31 @@ class TestMain(BaseTester):
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("kornia-tidy: error: the memory that this needs is not there")
 
-    def test_feature_a_reader_that_leaves_is_no_error(self, tmp_path):
+    def test_feature_a_reader_that_leaves_is_no_error(self, tmp_path, capfd):
         """As `kornia-tidy ... | head` does: nothing is said, and the status is that of SIGPIPE."""
         read, write = os.pipe()
         os.close(read)
-        command = [sys.executable, "-m", "kornia_tidy", "masks", "show", str(tmp_path / "heights.npy")]
-        np.save(tmp_path / "heights.npy", np.zeros((1, 3, 3)))
-        done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
-        os.close(write)
-        assert (done.returncode, done.stderr) == (141, b"")
+        assert self.printing_to(write, tmp_path) == 141
+        assert capfd.readouterr().err == ""
 
     @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
-    def test_exception_a_full_disk_under_the_report(self, tmp_path):
-        command = [sys.executable, "-m", "kornia_tidy", "masks", "show", str(tmp_path / "heights.npy")]
-        np.save(tmp_path / "heights.npy", np.zeros((1, 3, 3)))
-        with open("/dev/full", "w") as full:
-            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
-        assert done.returncode == 2
-        assert done.stderr.decode().splitlines() == ["kornia-tidy: error: [Errno 28] No space left on device"]
+    def test_exception_a_full_disk_under_the_report(self, tmp_path, capfd):
+        assert self.printing_to(os.open("/dev/full", os.O_WRONLY), tmp_path) == 2
+        assert capfd.readouterr().err == "kornia-tidy: error: [Errno 28] No space left on device\n"
+
+    @staticmethod
+    def printing_to(file, folder):
+        """Return the exit status of a command that prints to a file of the system."""
+        np.save(folder / "heights.npy", np.zeros((1, 3, 3)))
+        status = folder / "status"
+
+        def child():
+            sys.stdout = os.fdopen(file, "w")
+            status.write_text(str(cli.main(["masks", "show", str(folder / "heights.npy")])))
+
+        assert wait(fork(child)) == 0
+        os.close(file)
+        return int(status.read_text())
 
     def test_feature_interruption_returns_130(self, command_that, capsys):
         def interrupt():

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> None:
     scenes = make_scenes(settings, split, args.scenes)
     tell("system", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, {system.step} steps")
     folder.mkdir(parents=True, exist_ok=True)
-    with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene") as progress:
+    with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene", disable=None) as progress:
 
         def each(looked: Looked) -> None:
             if progress.n < args.pictures:

@@ -14,6 +14,7 @@ from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.optics.camera import ThinLensCamera
 
 MOST_PROCESSES = 1024  # more would only bring a machine down
+MOST_MASKS = 1024  # PSFs of more take days
 
 
 def add_depth_options(parser: argparse.ArgumentParser) -> None:
@@ -110,6 +111,14 @@ def processes(text: str) -> int:
     if not (text.isascii() and text.isdigit() and int(text[:9]) <= MOST_PROCESSES):
         raise argparse.ArgumentTypeError(f"must be a whole number from 0 to {MOST_PROCESSES}, got {text!r:.40}")
     return int(text)
+
+
+def mask_count(text: str) -> int:
+    """Return a number of masks of one exposure, if that many can be thought of."""
+    value = int(text)
+    if value > MOST_MASKS:
+        raise argparse.ArgumentTypeError(f"must be {MOST_MASKS} masks or fewer, got {text:.40}")
+    return value
 
 
 def read_scene(args: argparse.Namespace) -> Scene:

@@ -8,7 +8,10 @@ import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 
-_LIBRARIES = re.compile(r"libpng |Corrupt JPEG|Premature end of JPEG|\[ ?(?:WARN|ERROR|INFO):|TIFF\w*: |\S+: Warning, ")
+_LIBRARIES = re.compile(
+    r"libpng |Corrupt JPEG |Premature end of JPEG |Inconsistent progression |Invalid SOS |Unknown Adobe color |"
+    r"Warning: unknown JFIF |Application transferred |\[ ?(?:WARN|ERROR|INFO):|TIFF\w*: |\S+: Warning, "
+)
 _ERROR = 2  # the process's stderr
 _PIPE_HOLDS = 1 << 16
 

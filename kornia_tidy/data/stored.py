@@ -16,9 +16,9 @@ from kornia_tidy.data.picture_header import check_header
 from kornia_tidy.data.quiet import caught
 from kornia_tidy.files import read_bytes
 
-# What libraries print about a picture that they filled up; of bytes too many between its parts they only wonder.
-_DAMAGE = ("libpng error", "Premature end of JPEG", "Corrupt JPEG data")
-_HARMLESS = "extraneous bytes before marker"
+# What libraries print about a picture that they filled up; bytes too many at its end, as some cameras write, are none.
+_DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent progression", "Invalid SOS")
+_HARMLESS = "extraneous bytes before marker 0xd9"
 
 
 def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
@@ -81,7 +81,7 @@ def _decode_with_opencv(data: bytes) -> NDArray[Any]:
         if level != logging.LOG_LEVEL_SILENT:  # another thread may have found it silenced by this one
             logging.setLogLevel(level)
     if decoded is None:
-        raise ValueError("it is not an image in a known format, or it is damaged")
+        raise ValueError("it is damaged, or needs more memory than there is")
     if damage := [line for line in said if line.startswith(_DAMAGE) and _HARMLESS not in line]:
         raise ValueError(f"the file is cut short or damaged ({damage[0]})")
     if decoded.ndim == 2:

@@ -20,6 +20,7 @@ from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.training.tasks import LOSSES, MAPS
 
 SCHEDULES = ("constant", "cosine")
+MOST = 1024  # masks, or depths to refocus to: more would take days
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
 
 
@@ -134,6 +135,9 @@ class TrainingSettings:
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
+        for name in ("masks", "refocus"):
+            if getattr(self, name) > MOST:
+                raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
         check_choice("start", self.start, STARTS)
         if self.start != "noise" and self.masks > 5:
             raise ValueError(f"start {self.start!r} has five masks, got masks={self.masks}; 'noise' has any number")

@@ -68,7 +68,7 @@ def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
         if not isinstance(state, dict):
             raise ValueError(f"its state is a {type(state).__name__}")
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot read {path}: it is no {WHAT} or is damaged: {error}") from error
+        raise ValueError(f"cannot read {path}: it is no {WHAT} or is damaged: {error!s:.300}") from error
     return state
 
 

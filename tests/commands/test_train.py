@@ -51,6 +51,9 @@ class TestTrain(BaseTester):
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
+            (["--masks", "1000000"], "must be 1024 masks or fewer, got 1000000"),
+            (["--size", "1000000"], "the scene has 1000000 x 1000000 pixels, more than 268435456"),
+            (["--workers", "1000000"], "must be a whole number from 0 to 1024"),
             (["--masks", "-1"], "masks must be a whole number of at least 0, got -1"),
             (["--depth-range", "2", "1"], "depth_range"),
             (["--batch", "8"], "4 scenes do not fill a batch of 8"),

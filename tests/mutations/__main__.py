@@ -8,7 +8,6 @@ with the arguments that show it. A raw file takes an interpreter of its own each
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import shutil
 import sys
@@ -19,8 +18,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-
-os.environ["TQDM_DISABLE"] = "1"  # a bar would be no sentence
 
 from tests.mutations.damage import damaged
 from tests.mutations.forked import Outcome, clear, prepare, run, shown
