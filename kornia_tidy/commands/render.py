@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.commands.options import mask_count, processes, seed
+from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
 from kornia_tidy.files import read_bytes
@@ -114,7 +114,7 @@ def add_parser(subparsers: Any) -> None:
     which.add_argument("--checkpoint", metavar="FILE", help="best.safetensors of a training")
     camera.add_argument(
         "--masks",
-        type=mask_count,
+        type=int,
         default=argparse.SUPPRESS,
         metavar="K",
         help="random ones; 0: a Fresnel lens (default: 5)",

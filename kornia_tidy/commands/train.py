@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from kornia_tidy.commands.options import mask_count, processes, seed
+from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.optics.initial_masks import STARTS
@@ -76,7 +76,7 @@ def add_parser(subparsers: Any) -> None:
 
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
-    _setting(system, "masks", type=mask_count, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
+    _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
     _setting(system, "start", choices=STARTS, help="heights of the masks at first; Fisher suits depth, sweep edof")
     _setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
     _setting(

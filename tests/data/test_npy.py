@@ -57,7 +57,7 @@ class TestDecodeNpy(BaseTester):
                 "does not tell data type",
             ),
             ("{'descr': '<f8', 'fortran_order': False, 'shape': (2", "does not tell data type"),
-            ("{'descr': '<f8', 'fortran_order': Fals\xe9, 'shape': (2,), }", "does not tell data type"),
+            ("{'descr': '<f8', 'fortran_order': Tr\xe9e, 'shape': (2,), }", "does not tell data type"),
             ("{'descr': '<f8', 'fortran_order': False, 'shape': " + "(" * 9000, "does not tell data type"),
             ("{'descr': '<f8', 'fortran_order': False, 'shape': (" + "1," * 9000 + ")}", "9000 axes, more than 8"),
             ("{'descr': '<f99', 'fortran_order': False, 'shape': (2,), }", "'<f99', which is none of numbers"),
