@@ -60,7 +60,7 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
         names = [key for key in _KEYS if key in state]
         if not names:
             raise ValueError(
-                f"cannot read {path}: it has no 'masks.phase', only {', '.join(sorted(state)) or 'nothing'}"
+                f"cannot read {path}: it has no 'masks.phase', only {', '.join(sorted(state))[:200] or 'nothing'}"
             )
         material = constant_index(1.5) if material is None else material
         heights = state[names[0]].double() / metres_to_radians(material)

@@ -122,7 +122,7 @@ class PSFBank:
         stored, notes = read_tensors(path, "PSF bank", device)
         form, tensors = notes.get("format"), {name: value for name, value in stored.items() if "." not in name}
         if form != _FORMAT or not {"psfs", "defocus", "energy"} <= set(tensors) <= {*_FIELDS}:
-            raise ValueError(f"{path} is not a PSF bank: its format is {form!r} with {sorted(tensors)}")
+            raise ValueError(f"{path} is not a PSF bank: its format is {form!r:.40} with {sorted(tensors)!r:.200}")
         try:
             return cls(**tensors)
         except ValueError as error:

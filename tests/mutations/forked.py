@@ -10,7 +10,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,12 +18,13 @@ import cv2
 import numpy as np
 from safetensors import safe_open
 
-from kornia_tidy.cli import main
+from kornia_tidy import cli
 from tests.mutations.pristine import Case
 
 SECONDS = 60.0
 MEMORY = 3 << 29  # bytes of address space beyond what this process has
 REFUSED, GUARDED = 2, 70
+UNFORESEEN = "unforeseen"  # a file that names the kind of an error
 LONGEST = 1000  # characters of a sentence
 WARNING, ERROR = re.compile(r"kornia-tidy: warning: \S.*"), re.compile(r"kornia-tidy: error: \S.*")
 
@@ -80,7 +81,7 @@ def _child(case: Case, path: Path, folder: Path) -> None:
         os.chdir(folder)
         for number, name in ((1, "stdout"), (2, "stderr")):
             os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
-        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", 1)
+        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", 1, errors="backslashreplace")
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -97,7 +98,19 @@ def _child(case: Case, path: Path, folder: Path) -> None:
         os._exit(code)
 
 
+def _note_kind(told: Callable[[Exception], int]) -> Callable[[Exception], int]:
+    """Keep what kind of error became a sentence: of what a file holds none but these should come as far."""
+
+    def note(error: Exception) -> int:
+        if not isinstance(error, (OSError, ValueError)) and not cli._is_out_of_memory(error):
+            Path(UNFORESEEN).write_text(type(error).__name__)
+        return told(error)
+
+    return note
+
+
 def _command(case: Case, path: Path) -> int:
+    cli._told = _note_kind(cli._told)
     if callable(case.command):
         try:
             case.command(path)
@@ -105,7 +118,7 @@ def _command(case: Case, path: Path) -> int:
             print(f"kornia-tidy: error: {' '.join(str(error).split())}", file=sys.stderr)
             return REFUSED
         return 0
-    return main(
+    return cli.main(
         [str(path) if word == "IN" else str(path.parent) if word == "FOLDER" else word for word in case.command]
     )
 
@@ -144,7 +157,9 @@ def _faults(case: Case, folder: Path, status: int | None, told: str) -> list[str
             faults.append(f"{len(errors)} sentences with exit status {status}")
         if any(len(line) > LONGEST for line in lines):
             faults.append("a sentence of more than a thousand characters")
-    known = {"in", "stdout", "stderr", *case.outputs}
+    if (folder / UNFORESEEN).exists():
+        faults.append(f"a {(folder / UNFORESEEN).read_text()} came as far as the command")
+    known = {"in", UNFORESEEN, "stdout", "stderr", *case.outputs}
     faults += [f"leaves {name}" for name in sorted(os.listdir(folder)) if name not in known]
     for name in case.outputs:
         faults += _half_written(folder / name, status)
