@@ -63,7 +63,9 @@ def _write_pictures(folder: Path) -> None:
     for bits, name in ((8, "image.png"), (16, "image16.png"), (8, "image.tif"), (16, "image16.tif"), (8, "image.jpg")):
         write_image(folder / name, image, bits)
     write_image(folder / "grey.png", image.mean(0, keepdim=True))
-    cv2.imwrite(str(folder / "progressive.jpg"), np.rint(255 * rows), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    cv2.imwrite(
+        str(folder / "progressive.jpg"), np.rint(255 * rows).astype(np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    )
     cv2.imwrite(str(folder / "float.tif"), rows)
     np.save(folder / "image.npy", rows)
     np.save(folder / "image8.npy", np.rint(255 * rows).astype(np.uint8))
