@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
+
+try:
+    import fcntl
+except ImportError:  # not on Windows, where nothing is locked
+    fcntl = None
 
 _LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # what the writers below call files and folders until they are whole
 
@@ -18,10 +25,13 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is a folder or empty.
+        ValueError: if it is no regular file, empty, or larger than the memory.
     """
     path = check_file(path)
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except MemoryError:
+        raise ValueError(f"cannot read {path}: its {path.stat().st_size} bytes are more than the memory") from None
     if not data:
         raise ValueError(f"cannot read {path}: the file is empty")
     return data
@@ -32,14 +42,48 @@ def check_file(path: str | os.PathLike[str]) -> Path:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is a folder.
+        ValueError: if it is a folder, or no regular file: a pipe or a device might never end.
     """
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"cannot read {path}: it is a folder")
     if not path.exists():
         raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    if not path.is_file():
+        raise ValueError(f"cannot read {path}: it is not a regular file")
     return path
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read a file of JSON.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is not JSON, or is nested too deep; the path is named.
+    """
+    data = read_bytes(path)
+    try:
+        return parse_json(data)
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return what JSON says.
+
+    Raises:
+        ValueError: if it is not JSON, or is nested too deep.
+
+    Example:
+        >>> parse_json("[" * 100_000)
+        Traceback (most recent call last):
+        ...
+        ValueError: its JSON is nested too deep
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("its JSON is nested too deep") from None
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -59,6 +103,7 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
 
     Raises:
         FileNotFoundError: if the folder does not exist.
+        OSError: if it cannot be written, the disk being full for one; the path is named.
         ValueError: if the path is a folder.
     """
     path = Path(path)
@@ -68,8 +113,9 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
         raise ValueError(f"cannot write {path}: it is a folder")
     temporary = path.with_name(f".{uuid4().hex}.tmp")
     try:
-        yield temporary
-        temporary.replace(path)
+        with _named(path):
+            yield temporary
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -93,21 +139,68 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
         raise FileExistsError(f"cannot write {path}: it exists")
     new, old = (path.with_name(f".{uuid4().hex}.tmp") for _ in range(2))
     try:
-        new.mkdir()
-        for name, data in files.items():
-            (new / name).write_bytes(data)
-        if path.exists():
-            path.rename(old)
-        try:
-            new.rename(path)
-        except OSError:
-            if old.exists():
-                old.rename(path)
-            raise
+        with _named(path):
+            new.mkdir()
+            for name, data in files.items():
+                (new / name).write_bytes(data)
+            if path.exists():
+                path.rename(old)
+            try:
+                new.rename(path)
+            except OSError:
+                if old.exists():
+                    old.rename(path)
+                raise
     finally:
         shutil.rmtree(new, ignore_errors=True)
         if path.exists():
             shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
+    """Hold a folder in a block, so that no other process or thread that asks for it does the same in it.
+
+    The system gives it back when the process ends, however it ends; nothing is left in the folder. Where the file
+    system knows no locks, nothing is held.
+
+    Args:
+        folder: that is there.
+        what: is done in it, in words, for the message.
+
+    Raises:
+        ValueError: if another holds it.
+    """
+    if fcntl is None:
+        yield
+        return
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"{what} in {folder} already: wait for it to end, or choose another folder") from None
+        except OSError:
+            pass
+        try:
+            yield
+        finally:
+            # Forks, such as workers that outlive the block, hold the same lock: closing would leave it with them.
+            with suppress(OSError):
+                fcntl.flock(place, fcntl.LOCK_UN)
+    finally:
+        os.close(place)
+
+
+@contextmanager
+def _named(path: Path) -> Generator[None]:
+    """Name the file in what the system says of its own temporary one, or of none: no space left on device."""
+    try:
+        yield
+    except (FileExistsError, FileNotFoundError):  # told from others by those who write into one folder together
+        raise
+    except OSError as error:
+        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:

@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+import os
+import sys
 import warnings
+from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from kornia_tidy import cli
 from tests.base import BaseTester
+from tests.forks import fork, wait
 
 
 class TestMain(BaseTester):
@@ -58,9 +64,52 @@ class TestMain(BaseTester):
         assert captured.err == "kornia-tidy: error: depth must be positive\n"
         assert captured.out == ""
 
-    def test_exception_of_a_programmer_is_not_hidden(self, command_that):
-        with pytest.raises(ZeroDivisionError):
-            cli.main(command_that(lambda: 1 / 0))
+    def test_exception_of_a_programmer_is_one_sentence_and_status_70(self, command_that, capsys, monkeypatch):
+        monkeypatch.delenv(cli.DEBUG, raising=False)
+        assert cli.main(command_that(lambda: 1 / 0)) == 70
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "a fault of kornia-tidy, not yours (ZeroDivisionError: division by zero); please report it" in line
+
+    def test_exception_shows_where_it_came_from_if_asked(self, command_that, capsys, monkeypatch):
+        monkeypatch.setenv(cli.DEBUG, "1")
+        assert cli.main(command_that(lambda: 1 / 0)) == 70
+        lines = capsys.readouterr().err.splitlines()
+        assert lines[0].startswith("Traceback")
+        assert lines[-1].startswith("kornia-tidy: error: this is a fault")
+
+    @pytest.mark.parametrize(
+        "action", [lambda: torch.empty(1 << 60), lambda: bytearray(1 << 62)], ids=["torch", "python"]
+    )
+    def test_exception_no_memory_is_one_sentence_and_status_2(self, action, command_that, capsys):
+        assert cli.main(command_that(action)) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("kornia-tidy: error: the memory that this needs is not there")
+
+    def test_feature_a_reader_that_leaves_is_no_error(self, tmp_path, capfd):
+        """As `kornia-tidy ... | head` does: nothing is said, and the status is that of SIGPIPE."""
+        read, write = os.pipe()
+        os.close(read)
+        assert self.printing_to(write, tmp_path) == 141
+        assert capfd.readouterr().err == ""
+
+    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
+    def test_exception_a_full_disk_under_the_report(self, tmp_path, capfd):
+        assert self.printing_to(os.open("/dev/full", os.O_WRONLY), tmp_path) == 2
+        assert capfd.readouterr().err == "kornia-tidy: error: [Errno 28] No space left on device\n"
+
+    @staticmethod
+    def printing_to(file, folder):
+        """Return the exit status of a command that prints to a file of the system."""
+        np.save(folder / "heights.npy", np.zeros((1, 3, 3)))
+        status = folder / "status"
+
+        def child():
+            sys.stdout = os.fdopen(file, "w")
+            status.write_text(str(cli.main(["masks", "show", str(folder / "heights.npy")])))
+
+        assert wait(fork(child)) == 0
+        os.close(file)
+        return int(status.read_text())
 
     def test_feature_interruption_returns_130(self, command_that, capsys):
         def interrupt():

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import torch
-from safetensors import safe_open
 from torch import Tensor
 
 from kornia_tidy.calibration.dithering import most_aliases
@@ -17,11 +16,13 @@ from kornia_tidy.calibration.point_images import PointImage
 from kornia_tidy.calibration.registration import Registered, register
 from kornia_tidy.calibration.shrinkage import shrink
 from kornia_tidy.checks import check_depth
+from kornia_tidy.files import parse_json
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.phase_masks import MASK_SPAN
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
+from kornia_tidy.tensor_files import read_tensors
 
 MOST_MISFIT = 25.0  # residuals of five times the noise: more is no PSF of these captures
 
@@ -91,12 +92,11 @@ class MeasuredPSFs:
             ValueError: if the file is no PSF bank, or one that was not measured.
         """
         bank = PSFBank.load(path, device)
-        with safe_open(path, framework="pt", device=str(device)) as file:
-            names = {"measured.uncertainty", "measured.distances"} & set(file.keys())
-            tensors = {name.removeprefix("measured."): file.get_tensor(name) for name in names}
-            text = (file.metadata() or {}).get("reports", "")
+        stored, notes = read_tensors(path, "PSF bank", device)
+        names = [name for name in ("measured.uncertainty", "measured.distances") if name in stored]
+        tensors = {name.removeprefix("measured."): stored[name] for name in names}
         try:
-            reports = tuple(PointReport(**report) for report in json.loads(text))
+            reports = tuple(PointReport(**report) for report in parse_json(notes.get("reports", "")))
             return cls(bank, reports=reports, **tensors)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None

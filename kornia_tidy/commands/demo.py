@@ -77,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
         bar_format="{desc}: {bar} {n}/{total} {postfix}",
         file=sys.stderr,
         leave=False,
+        disable=None,
     )
 
     def step(name: str) -> Any:

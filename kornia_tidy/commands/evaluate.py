@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +73,11 @@ def run(args: argparse.Namespace) -> None:
     scenes = make_scenes(settings, split, args.scenes)
     tell("system", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, {system.step} steps")
     folder.mkdir(parents=True, exist_ok=True)
-    with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene") as progress:
+    numbers = count()
+    with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene", disable=None) as progress:
 
         def each(looked: Looked) -> None:
-            if progress.n < args.pictures:
+            if next(numbers) < args.pictures:
                 draw_scene(folder, looked)
             progress.update()
 

@@ -13,6 +13,9 @@ from kornia_tidy.data.image_files import SUFFIXES
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.optics.camera import ThinLensCamera
 
+MOST_PROCESSES = 1024  # more would only bring a machine down
+MOST_MASKS = 1024  # PSFs of more take days
+
 
 def add_depth_options(parser: argparse.ArgumentParser) -> None:
     """Add what a depth file needs to become metres."""
@@ -100,6 +103,21 @@ def seed(text: str) -> int:
         value = -1
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"a seed must be a whole number from 0 to 2^63 - 1, got {text!r}")
+    return value
+
+
+def processes(text: str) -> int:
+    """Return a number of processes that a machine may start, 0 included."""
+    if not (text.isascii() and text.isdigit() and int(text[:9]) <= MOST_PROCESSES):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to {MOST_PROCESSES}, got {text!r:.40}")
+    return int(text)
+
+
+def mask_count(text: str) -> int:
+    """Return a number of masks of one exposure, if that many can be thought of."""
+    value = int(text)
+    if value > MOST_MASKS:
+        raise argparse.ArgumentTypeError(f"must be {MOST_MASKS} masks or fewer, got {text:.40}")
     return value
 
 

@@ -26,7 +26,7 @@ from kornia_tidy.commands.report import tell
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.figures import draw_depth, require_matplotlib
-from kornia_tidy.files import read_bytes, remove_leftovers, write_bytes
+from kornia_tidy.files import parse_json, read_bytes, remove_leftovers, write_bytes
 from kornia_tidy.pretrained import FOLDER, PRETRAINED
 from kornia_tidy.sensor.raw_file import RawCapture
 from kornia_tidy.training.tasks import MAPS
@@ -231,7 +231,7 @@ def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
     if not all(path.is_file() for path in paths):
         return False
     try:
-        record = json.loads(paths[-1].read_bytes())
+        record = parse_json(paths[-1].read_bytes())
     except ValueError:
         return False
     return isinstance(record, dict) and all(record.get(name) == value for name, value in said.items())

@@ -7,7 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kornia_tidy.commands.options import add_camera_options, add_depth_options, make_camera, read_scene, seed
+from kornia_tidy.commands.options import (
+    add_camera_options,
+    add_depth_options,
+    make_camera,
+    mask_count,
+    read_scene,
+    seed,
+)
 from kornia_tidy.commands.raw_options import check_outputs
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
 from kornia_tidy.fidelity import PRESETS
@@ -85,7 +92,7 @@ def add_parser(subparsers: Any) -> None:
     add_depth_options(parser)
     add_camera_options(parser)
     masks = parser.add_argument_group("masks", "23 x 23 pixels of random height, the start of training.")
-    masks.add_argument("--masks", type=int, default=5, metavar="K", help="masks shown in one exposure (default: 5)")
+    masks.add_argument("--masks", type=mask_count, default=5, metavar="K", help="shown in one exposure (default: 5)")
     masks.add_argument("--mask-seed", type=seed, default=0, metavar="N", help="seed of their heights (default: 0)")
     masks.add_argument("--fidelity", choices=tuple(PRESETS), default="balanced", help="(default: balanced)")
     masks.add_argument("--compositing", choices=tuple(COMPOSITING), default="gather", help="(default: gather)")

@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.commands.options import seed
+from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
 from kornia_tidy.files import read_bytes
@@ -79,7 +79,9 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="made if missing")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that render here (default: 1)")
+    parser.add_argument(
+        "--jobs", type=processes, default=1, metavar="N", help="processes that render here (default: 1)"
+    )
     parser.add_argument("--noise-seed", type=seed, default=0, metavar="N", help="of the sensor's noise (default: 0)")
 
     files = parser.add_argument_group("files")
@@ -111,7 +113,11 @@ def add_parser(subparsers: Any) -> None:
     which.add_argument("--preset", choices=tuple(SYSTEMS), metavar="NAME", help=f"one of {', '.join(SYSTEMS)}")
     which.add_argument("--checkpoint", metavar="FILE", help="best.safetensors of a training")
     camera.add_argument(
-        "--masks", type=int, default=argparse.SUPPRESS, metavar="K", help="random ones; 0: a Fresnel lens (default: 5)"
+        "--masks",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="K",
+        help="random ones; 0: a Fresnel lens (default: 5)",
     )
     add_camera_settings(camera)
     camera.add_argument(

@@ -13,6 +13,7 @@ from kornia_tidy.commands.options import (
     add_depth_options,
     check_output,
     make_camera,
+    mask_count,
     read_scene,
     seed,
 )
@@ -69,7 +70,7 @@ def add_parser(subparsers: Any) -> None:
     add_camera_options(parser)
 
     masks = parser.add_argument_group("masks", "23 x 23 pixels of random height, the start of training.")
-    masks.add_argument("--masks", type=int, default=5, metavar="K", help="masks shown in one exposure (default: 5)")
+    masks.add_argument("--masks", type=mask_count, default=5, metavar="K", help="shown in one exposure (default: 5)")
     masks.add_argument("--mask-seed", type=seed, default=0, metavar="N", help="seed of their heights (default: 0)")
 
     capture = parser.add_argument_group("capture")

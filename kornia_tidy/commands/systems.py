@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
     check_output(args.output, args.image, args.depth)
     require_matplotlib()
     stages, portraits = Stages(), []
-    progress = tqdm(systems, desc="systems", file=sys.stderr, leave=False, unit="system")
+    progress = tqdm(systems, desc="systems", file=sys.stderr, leave=False, unit="system", disable=None)
     with torch.no_grad(), progress:
         with stages("scene"):
             image, nearness, scene = _scene(args)

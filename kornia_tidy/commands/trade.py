@@ -13,7 +13,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.commands.options import add_camera_options, add_depth_options, make_camera, read_scene, seed
+from kornia_tidy.commands.options import (
+    add_camera_options,
+    add_depth_options,
+    make_camera,
+    mask_count,
+    read_scene,
+    seed,
+)
 from kornia_tidy.commands.report import scene_in_words, tell
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.rgbd import Scene
@@ -80,7 +87,7 @@ def add_parser(subparsers: Any) -> None:
         "-o", "--output", default="outputs/trade", metavar="FOLDER", help="made if missing (default: outputs/trade)"
     )
     parser.add_argument("--size", type=int, default=512, metavar="PX", help="side of the scene made (default: 512)")
-    parser.add_argument("--masks", type=int, default=5, metavar="K", help="masks in one exposure (default: 5)")
+    parser.add_argument("--masks", type=mask_count, default=5, metavar="K", help="masks in one exposure (default: 5)")
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of masks and scene (default: 0)")
 
     measuring = parser.add_argument_group("what is measured")
@@ -142,7 +149,9 @@ def run(args: argparse.Namespace) -> None:
         reference=args.reference,
         known=known,
     )
-    with tqdm(total=len(settings), desc="trade", file=sys.stderr, leave=False, unit="setting") as progress:
+    with tqdm(
+        total=len(settings), desc="trade", file=sys.stderr, leave=False, unit="setting", disable=None
+    ) as progress:
         try:
             for setting in settings:
                 step = f"{setting.knob} {setting.value}"

@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from kornia_tidy.commands.options import seed
+from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.optics.initial_masks import STARTS
@@ -123,8 +123,10 @@ def add_parser(subparsers: Any) -> None:
 
     machine = parser.add_argument_group("machine")
     machine.add_argument("--accelerator", choices=("cpu", "gpu"), default="cpu", help="(default: cpu)")
-    machine.add_argument("--devices", type=int, default=1, metavar="N", help="processes (default: 1)")
-    machine.add_argument("--workers", type=int, default=0, metavar="N", help="processes that load scenes (default: 0)")
+    machine.add_argument("--devices", type=processes, default=1, metavar="N", help="processes (default: 1)")
+    machine.add_argument(
+        "--workers", type=processes, default=0, metavar="N", help="processes that load scenes (default: 0)"
+    )
     machine.add_argument(
         "--save-every", type=int, default=100, metavar="N", help="steps between checkpoints in an epoch (default: 100)"
     )

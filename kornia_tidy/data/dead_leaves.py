@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.data.leaf_textures import paint_leaves
+from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.seeds import keyed_seed
@@ -166,6 +167,7 @@ def _check_arguments(height: int, width: int, depth_range: tuple[float, float], 
     for name, value in (("height", height), ("width", width), ("num_leaves", num_leaves)):
         if not isinstance(value, Integral) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    check_pixels("the scene", height, width)
     near, far = depth_range
     if not (0 < near < far and math.isfinite(near)):
         raise ValueError(f"depth_range must be (near, far) in metres with 0 < near < far, got {depth_range}")

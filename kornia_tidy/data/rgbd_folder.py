@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import glob
-import json
 import os
 import re
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from kornia_tidy.data.depth_files import check_depth_options
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import read_bytes
+from kornia_tidy.files import read_json
 
 ABOUT = "rgbd.json"
 KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m", "doffs_px")
@@ -31,8 +30,8 @@ class RGBDFolder(SceneDataset):
 
     Raises:
         FileNotFoundError: if there is no folder, or no file fits a pattern.
-        ValueError: if a file has no partner, a pattern has no ``*`` or not as many as the other, or the options
-            contradict each other.
+        ValueError: if a file has no partner, a pattern has no ``*`` or not as many as the other, or leads out of the
+            folder, or the options contradict each other.
 
     Convention:
         - Items are in the order of their names; a name is what the ``*`` stand for, joined by ``/``.
@@ -109,22 +108,44 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
             f"there is no {path}: it tells which files in the folder are pairs and how depth is stored, such as "
             '{"image": "*.png", "depth": "*_depth.png", "scale": 0.001} for millimetres'
         )
-    try:
-        about = json.loads(read_bytes(path))
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+    about = read_json(path)
     if not isinstance(about, dict) or not {"image", "depth"} <= set(about) <= set(KNOWN):
         raise ValueError(f'cannot read {path}: it should hold "image" and "depth" and may hold {", ".join(KNOWN[2:])}')
-    try:
-        return RGBDFolder(root, transform=transform, **about)
-    except (AttributeError, TypeError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+    for name, value in about.items():
+        if not _fits(name, value):
+            raise ValueError(f"cannot read {path}: {name} must be {_kind(name)}, got {value!r:.80}")
+    return RGBDFolder(root, transform=transform, **about)
+
+
+def _kind(name: str) -> str:
+    return {"image": "a text", "depth": "a text", "kind": "a text", "invalid": "a list of numbers"}.get(
+        name, "a number"
+    )
+
+
+def _fits(name: str, value: Any) -> bool:
+    """Whether a value of the description is of the type that the option wants."""
+    if _kind(name) == "a text":
+        return isinstance(value, str)
+    if name == "invalid":
+        return isinstance(value, list) and all(_is_number(entry) for entry in value)
+    return _is_number(value) or (value is None and name in {"focal_px", "baseline_m"})
+
+
+def _is_number(value: Any) -> bool:
+    """Of a size that floats have; JSON's whole numbers have no end."""
+    return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 1000)
 
 
 def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
     """Name, image and depth file of each pair, in the order of names; paths are within the root."""
     if image.count("*") != depth.count("*") or "*" not in image:
-        raise ValueError(f"patterns must have a * and equally many of them, got image={image!r}, depth={depth!r}")
+        raise ValueError(
+            f"patterns must have a * and equally many of them, got image={image!r:.80}, depth={depth!r:.80}"
+        )
+    for pattern in (image, depth):
+        if PurePath(pattern).is_absolute() or ".." in PurePath(pattern).parts or "\0" in pattern:
+            raise ValueError(f"patterns must stay within the folder, got {pattern!r:.80}")
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder {root}")
     images, depths = _matches(root, image), _matches(root, depth)
@@ -135,12 +156,12 @@ def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
         depths = {name: path for name, path in depths.items() if path not in shared}
     for kind, pattern, found in (("image", image, images), ("depth file", depth, depths)):
         if not found:
-            raise FileNotFoundError(f"no {kind} in {root} fits {pattern!r}")
+            raise FileNotFoundError(f"no {kind} in {root} fits {pattern!r:.80}")
     unpaired = [images[name] for name in images.keys() - depths.keys()]
     unpaired += [depths[name] for name in depths.keys() - images.keys()]
     if unpaired:
         shown = ", ".join(sorted(unpaired)[:3]) + (", ..." if len(unpaired) > 3 else "")
-        raise ValueError(f"{len(unpaired)} files in {root} have no partner by {image!r} and {depth!r}: {shown}")
+        raise ValueError(f"{len(unpaired)} files in {root} have no partner by {image!r:.80} and {depth!r:.80}: {shown}")
     return [("/".join(name), images[name], depths[name]) for name in sorted(images)]
 
 

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import os
-from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_tidy.data.npy import MAGIC as NPY
+from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.data.pfm import decode_pfm
+from kornia_tidy.data.picture_header import check_header
+from kornia_tidy.data.quiet import caught
 from kornia_tidy.files import read_bytes
 
-PNG, JPEG, NPY = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"\x93NUMPY"
+# What libraries print about a picture that they filled up; bytes too many at its end, as some cameras write, are none.
+_DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent progression", "Invalid SOS")
+_HARMLESS = "extraneous bytes before marker 0xd9"
 
 
 def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Read the numbers a file stores, as they are: PNG, TIFF, JPEG, PGM/PPM, PFM, NPY and what else OpenCV decodes.
+    """Read the numbers a file stores, as they are: PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP or NPY.
 
-    The format is told from the content, not from the name. An orientation written in EXIF is ignored: depth maps and
-    calibrations belong to the sensor's own grid of pixels.
+    The format is told from the content, not from the name. The size in the header is looked at before anything is
+    decoded, see :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. An orientation written in EXIF is
+    ignored: depth maps and calibrations belong to the sensor's own grid of pixels.
 
     Args:
         path: the file.
@@ -30,7 +36,7 @@ def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is a folder, empty, cut short, damaged or of no known format.
+        ValueError: if it is no regular file, empty, cut short, damaged, of no known format, or has too many pixels.
     """
     return decode_stored(read_bytes(path), path)
 
@@ -43,13 +49,15 @@ def decode_stored(data: bytes, path: str | os.PathLike[str]) -> NDArray[Any]:
     """
     try:
         if data.startswith(NPY):
-            stored = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
+            stored = decode_npy(data)
         elif data.startswith((b"PF", b"Pf")):
             stored = decode_pfm(data)
         else:
             stored = _decode_with_opencv(data)
-    except (ValueError, EOFError, MemoryError, TypeError, OverflowError) as error:
+    except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
+    except MemoryError:
+        raise ValueError(f"cannot read {path}: the memory that it needs is not there") from None
     if stored.ndim == 2:
         stored = stored[..., None]
     if stored.ndim != 3 or 0 in stored.shape:
@@ -60,23 +68,22 @@ def decode_stored(data: bytes, path: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[Any]:
-    # Some versions of OpenCV fill up what is missing at the end with grey, and say nothing. In a JPEG an end marker
-    # must follow the last start of a scan; the data of a scan cannot look like either.
-    cut_jpeg = data.startswith(JPEG) and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    if cut_jpeg or (data.startswith(PNG) and b"IEND" not in data):
-        raise ValueError("the file is cut short")
+    check_header(data)
     logging = cv2.utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # a bad file raises; OpenCV need not print it too
     try:
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        with caught() as said:
+            decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         decoded = None
     finally:
         if level != logging.LOG_LEVEL_SILENT:  # another thread may have found it silenced by this one
             logging.setLogLevel(level)
     if decoded is None:
-        raise ValueError("it is not an image in a known format, or it is damaged")
+        raise ValueError("it is damaged, or needs more memory than there is")
+    if damage := [line for line in said if line.startswith(_DAMAGE) and _HARMLESS not in line]:
+        raise ValueError(f"the file is cut short or damaged ({damage[0]})")
     if decoded.ndim == 2:
         return decoded
     return decoded[..., 2::-1] if decoded.shape[2] > 2 else decoded[..., :1]  # BGR(A) to RGB, or grey with alpha

@@ -14,15 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.data.stored import read_stored
-from kornia_tidy.files import read_bytes, write_folder
+from kornia_tidy.files import read_bytes, read_json, write_folder
 from kornia_tidy.lab.placement import PanelPlacement
 from kornia_tidy.lab.slm_frames import SLMFrames
 from kornia_tidy.lab.timing import FrameTime, frame_times, timing_sheet
 
 FORMAT = "kornia-tidy SLM frames 1"
 SIDECAR, TIMING, TURNS = "frames.json", "timing.csv", "turns.npy"
+LEVELS = 1 << 10  # of grey, at most
 SUFFIXES = (".png", ".tif", ".tiff")
 ALIGNMENT = "least significant bits: grey level g is stored as the number g"
 ORIENTATION = (
@@ -125,9 +127,9 @@ def read_slm_frames(folder: str | os.PathLike[str]) -> SLMFrames:
     folder = Path(folder)
     about = _sidecar(folder)
     try:
-        size = (int(about["mask"][0]), int(about["mask"][1]))
+        size = _rows_and_columns("mask", about["mask"])
         placement = PanelPlacement(
-            panel=tuple(about["panel"]),
+            panel=_rows_and_columns("panel", about["panel"]),
             panel_pitch=about["panel_pitch_m"],
             pupil_radius=about["pupil_radius_m"],
             offset=tuple(about["offset_right_down"]),
@@ -136,10 +138,12 @@ def read_slm_frames(folder: str | os.PathLike[str]) -> SLMFrames:
         )
         level_phases = torch.tensor(about["level_phases_rad"], dtype=torch.float64)
         wavelength, per_metre = float(about["wavelength_m"]), float(about["radians_per_metre"])
-        names, turned, depth = list(about["files"]), about["turns"], int(about["bits_of_file"])
+        names, turned, depth = about["files"], about["turns"], about["bits_of_file"]
+        _check_sidecar(names, level_phases, wavelength, per_metre)
         placement.scale(size)
-    except (KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{folder / SIDECAR} does not describe frames: {type(error).__name__} {error}") from None
+    except (KeyError, TypeError, IndexError, OverflowError, RuntimeError, ValueError) as error:
+        told = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{folder / SIDECAR} does not describe frames: {told:.300}") from None
     grey = torch.cat(
         [_read_frame(folder / Path(name).name, depth, len(level_phases), placement, size) for name in names]
     )
@@ -166,7 +170,8 @@ def check_replaceable(folder: str | os.PathLike[str], replace: bool) -> None:
         raise FileExistsError(f"cannot write {folder}: it is a file, not a folder of frames")
     own: set[str] = set()
     if (folder / SIDECAR).exists():
-        own = {SIDECAR, TIMING, TURNS, *map(str, _sidecar(folder).get("files", []))}
+        files = _sidecar(folder).get("files")
+        own = {SIDECAR, TIMING, TURNS, *map(str, files if isinstance(files, list) else [])}
     strange = sorted(entry.name for entry in folder.iterdir() if entry.name not in own)
     if strange:
         raise FileExistsError(f"cannot replace {folder}: it holds {strange[0]}, which is no part of frames written")
@@ -180,8 +185,8 @@ def read_stored_turns(path: Path) -> np.ndarray:
         ValueError: if it does not hold whole numbers.
     """
     try:
-        turns = np.lib.format.read_array(io.BytesIO(read_bytes(path)), allow_pickle=False)
-    except (EOFError, ValueError) as error:
+        turns = decode_npy(read_bytes(path))
+    except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from None
     if turns.dtype != np.int16:
         raise ValueError(f"cannot read {path}: whole turns are int16, not {turns.dtype}")
@@ -190,13 +195,25 @@ def read_stored_turns(path: Path) -> np.ndarray:
 
 def _sidecar(folder: Path) -> dict[str, Any]:
     path = folder / SIDECAR
-    try:
-        about = json.loads(read_bytes(path))
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
+    about = read_json(path)
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise ValueError(f"cannot read {path}: its format is not {FORMAT!r}")
     return about
+
+
+def _rows_and_columns(name: str, value: Any) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2 or not all(type(side) is int and side > 0 for side in value):
+        raise ValueError(f"{name} must be rows and columns, got {value!r:.80}")
+    return value[0], value[1]
+
+
+def _check_sidecar(names: Any, level_phases: Tensor, wavelength: float, per_metre: float) -> None:
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
+        raise ValueError(f"files must be the names of frames, got {names!r:.80}")
+    if level_phases.ndim != 1 or not 2 <= len(level_phases) <= LEVELS or not bool(level_phases.isfinite().all()):
+        raise ValueError(f"level_phases_rad must be 2 to {LEVELS} finite numbers")
+    check_positive("wavelength_m", wavelength, "metres")
+    check_positive("radians_per_metre", per_metre)
 
 
 def _read_frame(path: Path, depth: int, levels: int, placement: PanelPlacement, size: tuple[int, int]) -> Tensor:

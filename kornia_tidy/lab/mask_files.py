@@ -8,16 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.camera_settings import EXTRA_STATE
 from kornia_tidy.checks import check_choice
+from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.lab.slm_frames import checked_heights
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.optics.phase_masks import metres_to_radians
+from kornia_tidy.tensor_files import read_tensors
 
 SUFFIXES = (".npy", ".safetensors")
 _KEYS = ("masks.phase", "phase")  # of a camera's state, and of its masks alone
@@ -44,11 +45,11 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
     """
     path = Path(path)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)
-    data = read_bytes(path)
     if path.suffix.lower() == ".npy":
+        data = read_bytes(path)
         try:
-            stored = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-        except (EOFError, ValueError) as error:
+            stored = decode_npy(data)
+        except ValueError as error:
             raise ValueError(f"cannot read {path}: {error}") from None
         if stored.dtype.kind != "f" or stored.ndim not in (2, 3):
             raise ValueError(
@@ -56,12 +57,12 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
             )
         heights = torch.from_numpy(stored.astype(np.float64))
     else:
-        state = _read_state(path, data)
+        state = read_tensors(path)[0]
         names = [key for key in _KEYS if key in state]
         if not names:
             raise ValueError(
                 f"cannot read {path}: it has no 'masks.phase', only "
-                f"{', '.join(sorted(state.keys() - {EXTRA_STATE})) or 'nothing'}"
+                f"{', '.join(sorted(state.keys() - {EXTRA_STATE}))[:200] or 'nothing'}"
             )
         material = constant_index(1.5) if material is None else material
         heights = state[names[0]].double() / metres_to_radians(material)
@@ -81,7 +82,7 @@ def read_dwell_shares(path: str | os.PathLike[str]) -> list[float] | None:
     path = Path(path)
     if path.suffix.lower() != ".safetensors":
         return None
-    state = _read_state(path, read_bytes(path))
+    state = read_tensors(path)[0]
     learnt = [v for key, v in state.items() if key.startswith("modulator.") and key.endswith("logits")]
     return learnt[0].double().softmax(0).tolist() if learnt else None
 
@@ -108,10 +109,3 @@ def write_heights(path: str | os.PathLike[str], heights: Tensor, material: Mater
         return
     phase = heights * metres_to_radians(constant_index(1.5) if material is None else material)
     write_bytes(path, save({"masks.phase": phase.float().contiguous()}))
-
-
-def _read_state(path: Path, data: bytes) -> dict[str, Tensor]:
-    try:
-        return load(data)
-    except SafetensorError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.optics.phase_masks import MASK_SPAN
 
 FLIPS = ("none", "left-right", "up-down")
@@ -60,6 +61,7 @@ class PanelPlacement:
     def __post_init__(self) -> None:
         if len(self.panel) != 2 or not all(isinstance(side, int) and side > 0 for side in self.panel):
             raise ValueError(f"panel must be (rows, columns), both positive whole numbers, got {self.panel}")
+        check_pixels("the panel", *self.panel)
         check_positive("panel_pitch", self.panel_pitch, "metres")
         if self.pupil_radius is not None:
             check_positive("pupil_radius", self.pupil_radius, "metres")

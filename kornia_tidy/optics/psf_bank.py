@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite
-from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.files import write_bytes
+from kornia_tidy.tensor_files import read_tensors
 
 STRAY_LIGHT = ("renormalize", "veil", "discard")
 _FORMAT = "kornia_tidy.psf_bank/1"
@@ -119,19 +119,16 @@ class PSFBank:
             FileNotFoundError: if there is no such file.
             ValueError: if the file is not a PSF bank, or a value is NaN or infinite.
         """
-        read_bytes(path)  # missing, a folder or empty: say so
-        try:
-            with safe_open(path, framework="pt", device=str(device)) as file:
-                form = (file.metadata() or {}).get("format")
-                names = [key for key in file.keys() if "." not in key]  # noqa: SIM118 (not a dict)
-                tensors = {key: file.get_tensor(key) for key in names}
-        except SafetensorError as error:
-            raise ValueError(f"{path} is not a readable PSF bank: {error}") from None
+        stored, notes = read_tensors(path, "PSF bank", device)
+        form, tensors = notes.get("format"), {name: value for name, value in stored.items() if "." not in name}
         if form != _FORMAT or not {"psfs", "defocus", "energy"} <= set(tensors) <= {*_FIELDS}:
-            raise ValueError(f"{path} is not a PSF bank: its format is {form!r} with {sorted(tensors)}")
+            raise ValueError(f"{path} is not a PSF bank: its format is {form!r:.40} with {sorted(tensors)!r:.200}")
         for name, value in tensors.items():
             check_finite(f"{name} of {path}", value)
-        return cls(**tensors)
+        try:
+            return cls(**tensors)
+        except ValueError as error:
+            raise ValueError(f"cannot read {path}: {error}") from None
 
     @classmethod
     def from_measured(cls, psfs: Tensor, defocus: Tensor) -> PSFBank:

@@ -15,7 +15,7 @@ from torch import nn
 
 import kornia_tidy
 from kornia_tidy.camera_settings import EXTRA_STATE
-from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.rendering.layout import Layout
 from kornia_tidy.tidy_optics import TiDyOptics
 
@@ -67,8 +67,8 @@ def claim(folder: Path, own: Mapping[str, Any]) -> None:
         write_bytes(path, f"{{\n{lines}\n}}\n".encode())
         return
     try:
-        there = _flat(json.loads(read_bytes(path)))
-    except (AttributeError, ValueError) as error:
+        there = _flat(read_json(path))
+    except AttributeError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     here = _flat(own)
     if other := [name for name in {**there, **here} if there.get(name) != here.get(name)]:

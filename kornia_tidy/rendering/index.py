@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import tarfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from kornia_tidy.files import read_bytes
+from kornia_tidy.files import parse_json, read_bytes, read_json
 from kornia_tidy.rendering.item_files import ABOUT
 from kornia_tidy.rendering.layout import Layout, Part
 
@@ -74,7 +73,7 @@ def read_place(folder: Path, place: str) -> bytes:
 
 
 def _folder_entry(path: Path) -> Entry:
-    about = json.loads(read_bytes(path / ABOUT))
+    about = read_json(path / ABOUT)
     return {"key": path.name, **about, **{file.stem: f"{path.name}/{file.name}" for file in path.iterdir()}}
 
 
@@ -86,5 +85,5 @@ def _shard_entries(path: Path) -> list[Entry]:
             entry = entries.setdefault(key, {"key": key})
             entry[name.partition(".")[0]] = f"{path.name}:{member.offset_data}:{member.size}"
     for entry in entries.values():
-        entry.update(json.loads(read_place(path.parent, entry["scene"])))
+        entry.update(parse_json(read_place(path.parent, entry["scene"])))
     return list(entries.values())

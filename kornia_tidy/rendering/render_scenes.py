@@ -116,7 +116,7 @@ def render_scenes(
         if each is not None:
             captures = _counted(captures, each, found, total)
         for part in missing:
-            with _unless_there(folder / part.name), _told(folder / part.name):
+            with _unless_there(folder / part.name), _told():
                 _write(folder / part.name, itertools.islice(captures, len(part.items)), layout)
     if all((folder / part.name).exists() for part in parts):
         _finish(folder, parts, layout)
@@ -230,17 +230,14 @@ def _write(path: Path, captures: Iterable[Capture], layout: Layout) -> None:
 
 
 @contextmanager
-def _told(path: Path) -> Generator[None]:
+def _told() -> Generator[None]:
     """Say what a failure to write leaves."""
     try:
         yield
     except (FileExistsError, FileNotFoundError):
         raise
     except OSError as error:
-        reason = error.strerror or error
-        raise OSError(
-            f"cannot write {path}: {reason}; what was written before is intact, and the same call goes on from there"
-        ) from error
+        raise OSError(f"{error}; what was written before is intact, and the same call goes on from there") from error
 
 
 @contextmanager
@@ -257,6 +254,6 @@ def _finish(folder: Path, parts: Sequence[Part], layout: Layout) -> None:
     """Write the index, by whichever process sees the last part come; then nobody writes here any more."""
     index = folder / INDEX
     if not index.exists():
-        with _unless_there(index), _told(index):
+        with _unless_there(index), _told():
             write_bytes(index, encode_index(folder, parts, layout))
     remove_leftovers(folder)

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.files import parse_json, read_bytes, write_bytes
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.sensor.raw_file import RawCapture
 from kornia_tidy.sensor.transfer_curve import CurvePoint, black_planes, spatial_points, temporal_points, tile_of
@@ -224,7 +224,7 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
     """
     data = read_bytes(path)
     try:
-        document = json.loads(data)
+        document = parse_json(data)
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise ValueError(f"its format is not {FORMAT!r}")
         channels = {str(name): _numbers(TransferLine, line) for name, line in document.pop("channels").items()}

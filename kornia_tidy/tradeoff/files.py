@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, get_args, get_type_hints
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.files import parse_json, read_bytes, write_bytes
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.ladder import PLAN, PRESET
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
@@ -51,7 +51,7 @@ def read_json(path: str | os.PathLike[str]) -> TradeRun:
     """
     data = read_bytes(path)
     try:
-        document = json.loads(data)
+        document = parse_json(data)
         _check_names("the file", document, {"format", "conditions", "rows"})
         if document["format"] != FORMAT:
             raise ValueError(f"its format is {document['format']!r}, not {FORMAT!r}")

@@ -7,8 +7,8 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
+from torch.utils.data import Dataset
 
+from kornia_tidy.files import only_here
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
@@ -59,11 +61,33 @@ def train(
         The trained module.
 
     Raises:
-        ValueError: if the folder holds another run, or a checkpoint or the data cannot be used.
+        ValueError: if the folder holds another run, one is at work in it, or a checkpoint or the data cannot be used.
         OSError: if the disk is full; the last checkpoint is then intact.
     """
     folder = Path(folder)
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"cannot write into {folder}: it is not a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
+        return _train(
+            settings, folder, scenes, validation, resume, head_from, save_every, workers, progress, trainer_options
+        )
+
+
+def _train(
+    settings: TrainingSettings,
+    folder: Path,
+    scenes: Dataset[Any],
+    validation: Dataset[Any],
+    resume: bool,
+    head_from: str | os.PathLike[str] | None,
+    save_every: int,
+    workers: int,
+    progress: bool,
+    trainer_options: Mapping[str, Any],
+) -> TidyTraining:
+    """Train in a folder that is held."""
     checkpoint = _prepare(folder, settings, resume)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
@@ -114,6 +138,11 @@ def train(
     return module
 
 
+def _is_first_process() -> bool:
+    """Whether this is the one of a run's processes that speaks for all, by what torchrun and Lightning set."""
+    return {os.environ.get(name, "0") for name in ("RANK", "LOCAL_RANK", "NODE_RANK")} == {"0"}
+
+
 def _fit(trainer: pl.Trainer, module: TidyTraining, data: SceneData, checkpoint: Path | None) -> None:
     """Fit, and let Ctrl-C be what it is elsewhere: Lightning ignores further ones and leaves the interpreter."""
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -130,10 +159,7 @@ def _fit(trainer: pl.Trainer, module: TidyTraining, data: SceneData, checkpoint:
 
 
 def _prepare(folder: Path, settings: TrainingSettings, resume: bool) -> Path | None:
-    """Make the folder; return the checkpoint to go on from, if there is one."""
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write into {folder}: it is not a folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write the settings of a new run; return the checkpoint to go on from, if there is one."""
     path, last = folder / SETTINGS, folder / LAST
     if not resume:
         if last.exists():

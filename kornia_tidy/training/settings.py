@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
 from typing import Any, Self
 
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.optics.camera import ThinLensCamera
 from kornia_tidy.optics.initial_masks import STARTS
 from kornia_tidy.scene.compositing import COMPOSITING
@@ -19,6 +20,7 @@ from kornia_tidy.scene.convolution import BORDERS
 from kornia_tidy.training.tasks import LOSSES, MAPS
 
 SCHEDULES = ("constant", "cosine")
+MOST = 1024  # masks, or depths to refocus to: more would take days
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
 
 
@@ -118,6 +120,7 @@ class TrainingSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _check_types(self)
         check_choice("task", self.task, tuple(MAPS))
         check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
@@ -132,6 +135,9 @@ class TrainingSettings:
             value = getattr(self, name)
             if not isinstance(value, int) or value < lowest:
                 raise ValueError(f"{name} must be a whole number of at least {lowest}, got {value!r}")
+        for name in ("masks", "refocus"):
+            if getattr(self, name) > MOST:
+                raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
         check_choice("start", self.start, STARTS)
         if self.start != "noise" and self.masks > 5:
             raise ValueError(f"start {self.start!r} has five masks, got masks={self.masks}; 'noise' has any number")
@@ -166,11 +172,13 @@ class TrainingSettings:
         """Return the settings of a dictionary.
 
         Raises:
-            ValueError: if a name is unknown or a value is not allowed.
+            ValueError: if it is no dictionary, a name is unknown, or a value is not allowed or of another type.
         """
+        if not isinstance(values, Mapping):
+            raise ValueError(f"settings must be values by name, got {values!r:.80}")
         known = {field.name for field in fields(cls)}
         if unknown := sorted(set(values) - known):
-            raise ValueError(f"settings hold unknown names: {', '.join(unknown)}")
+            raise ValueError(f"settings hold unknown names: {', '.join(unknown)[:200]}")
         return cls(**values)
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -185,11 +193,48 @@ class TrainingSettings:
             FileNotFoundError: if there is no file.
             ValueError: if it is not JSON of settings.
         """
+        values = read_json(path)
         try:
-            values = json.loads(read_bytes(Path(path)))
             return cls.from_dict(values)
-        except (TypeError, ValueError) as error:
+        except ValueError as error:
             raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def _check_types(settings: TrainingSettings) -> None:
+    """Refuse values of other types, as a damaged file may hold; whole numbers do where others are meant."""
+    for field in fields(settings):
+        name, value = field.name, getattr(settings, field.name)
+        if value is None and "None" in str(field.type):
+            continue
+        kind = str(field.type).split(" | ")[0]
+        if not _is_a(kind, value):
+            raise ValueError(f"{name} must be {_KINDS[kind]}, got {value!r:.80}")
+
+
+_KINDS = {
+    "str": "a text",
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a finite number",
+    "tuple[float, float]": "two numbers",
+}
+
+
+def _is_a(kind: str, value: Any) -> bool:
+    if kind == "tuple[float, float]":
+        return isinstance(value, (tuple, list)) and len(value) == 2 and all(_is_number(end) for end in value)
+    if kind == "float":
+        return _is_number(value) and math.isfinite(value)
+    if kind == "int":
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, {"str": str, "bool": bool}[kind])
+
+
+def _is_number(value: Any) -> bool:
+    """Of a size that floats have, as JSON's whole numbers have no end; or infinity."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max or value == math.inf
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
-from kornia_tidy.files import replacing
+from kornia_tidy.files import parse_json, replacing
+from kornia_tidy.tensor_files import read_tensors
 
 FORMAT = "kornia_tidy state 1"
+WHAT = "checkpoint of kornia_tidy"
 _PLAIN = (str, bool, int, float, type(None))
 _TENSOR, _TUPLE, _PAIRS = "$tensor", "$tuple", "$pairs"  # what JSON has no word for
 
@@ -47,7 +49,8 @@ def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
                 os.fsync(written.fileno())  # or a power cut could leave the new name on data never stored
     except (OSError, SafetensorError) as error:
         kept = "; the one written before is intact" if Path(path).is_file() else ""
-        raise OSError(f"cannot write {path}: {error}{kept}") from error
+        told = error if isinstance(error, OSError) else f"cannot write {path}: {error}"
+        raise OSError(f"{told}{kept}") from error
 
 
 def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -57,19 +60,16 @@ def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
         FileNotFoundError: if there is no file.
         ValueError: if it is damaged, or none of these files.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    tensors, header = read_tensors(path, WHAT)
     try:
-        with safe_open(path, framework="pt") as stored:
-            header = stored.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise ValueError(f"its format is {header.get('format')!r}, not {FORMAT!r}")
-            # Copies: nobody should train in memory that is mapped from a file about to be replaced.
-            tensors = {name: stored.get_tensor(name).clone() for name in stored.keys()}  # noqa: SIM118 (no mapping)
-        return _decode(json.loads(header["state"]), tensors)
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot read {path}: it is no checkpoint of kornia_tidy or is damaged: {error}") from error
+        if header.get("format") != FORMAT:
+            raise ValueError(f"its format is {header.get('format')!r}, not {FORMAT!r}")
+        state = _decode(parse_json(header["state"]), tensors)
+        if not isinstance(state, dict):
+            raise ValueError(f"its state is a {type(state).__name__}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"cannot read {path}: it is no {WHAT} or is damaged: {error!s:.300}") from error
+    return state
 
 
 def _encode(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:

@@ -103,17 +103,45 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
         ValueError: if it is no checkpoint, or weights and settings do not fit; the difference is named.
     """
     state = read_state(path)
-    if state.get("settings") is None:
+    _check_parts(state, path)
+    if state["settings"] is None:
         raise ValueError(
             f"{path} does not say how its camera and network were made, as they were given as objects: make them anew "
             f"and use load_weights"
         )
-    settings = TrainingSettings.from_dict(state["settings"])
+    try:
+        settings = TrainingSettings.from_dict(state["settings"])
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    _check_sizes(state, settings, str(path))
     optics, head = build_optics(settings), build_head(settings)
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
         look_through(head, optics)
     return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]))
+
+
+def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
+    """Refuse a state whose parts are not those of a checkpoint."""
+    weights, step = state.get("state_dict"), state.get("global_step")
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise ValueError(f"cannot read {path}: it is a checkpoint without weights, or is damaged")
+    if not isinstance(step, int) or "settings" not in state:
+        raise ValueError(f"cannot read {path}: it is a checkpoint without step or settings, or is damaged")
+
+
+def _check_sizes(state: Mapping[str, Any], settings: TrainingSettings, name: str) -> None:
+    """Refuse settings of another camera or network than the weights are of, before any memory is taken for these."""
+    masks = state["state_dict"].get("optics.masks.phase")
+    if masks is not None and settings.masks and len(masks) != settings.masks:
+        raise ValueError(f"{name} does not fit: it holds {len(masks)} masks, and its settings tell of {settings.masks}")
+    try:
+        with torch.device("meta"):  # shapes without memory
+            head = build_head(settings)
+    except RuntimeError as error:
+        raise ValueError(f"cannot read {name}: no network can be made by its settings: {error}") from error
+    prefix = _head_prefix(state["state_dict"])
+    check_weights(head, below(state["state_dict"], prefix), f"{name}, {prefix.removesuffix('.')}")
 
 
 def load_weights(
@@ -137,13 +165,17 @@ def load_weights(
     state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
     name = name or str(checkpoint)
     weights: dict[str, Tensor] = state["state_dict"]
-    averaged = any(key.startswith("average.") for key in weights)
-    parts = [(optics, "optics."), (head, "average.network." if averaged else "head.")]
+    parts = [(optics, "optics."), (head, _head_prefix(weights))]
     wanted = [(part, below(weights, prefix), prefix) for part, prefix in parts if part is not None]
     for part, own, prefix in wanted:
         check_weights(part, own, f"{name}, {prefix.removesuffix('.')}")
     for part, own, _ in wanted:
         part.load_state_dict(own)
+
+
+def _head_prefix(weights: Mapping[str, Tensor]) -> str:
+    """Where in a checkpoint the network is: of the moving average, if there is one."""
+    return "average.network." if any(key.startswith("average.") for key in weights) else "head."
 
 
 def below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

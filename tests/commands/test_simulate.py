@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import resource
 
 import numpy as np
 import pytest
@@ -165,6 +167,27 @@ class TestSimulate(BaseTester):
         assert "error: " in last
         assert sentence in last
         assert {p: p.stat().st_mtime_ns for p in scene.iterdir()} == before
+
+    def test_exception_a_full_disk_is_one_sentence_that_names_the_file(self, scene, capsys):
+        """A limit on the size of files stands for the disk: the write fails half-way, as on a full one."""
+        command = ["simulate", "image.png", "--depth", "depth.pfm", "--fidelity", "draft", "-o"]
+        assert main([*command, "first.png"]) == 0  # compiles what is not compiled yet, which needs the disk too
+        before = sorted(os.listdir())
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 10, limits[1]))
+        try:
+            status = main([*command, "out.png"])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert status == 2
+        assert "error: cannot write out.png: File too large\n" in capsys.readouterr().err
+        assert sorted(os.listdir()) == before
+
+    @pytest.mark.timeout(30)
+    def test_exception_a_pipe_as_image(self, scene, capsys):
+        os.mkfifo("pipe.png")
+        assert main(["simulate", "pipe.png", "--depth", "depth.pfm"]) == 2
+        assert "error: cannot read pipe.png: it is not a regular file\n" in capsys.readouterr().err
 
 
 class TestMiddleDepths(BaseTester):

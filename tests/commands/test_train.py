@@ -51,6 +51,9 @@ class TestTrain(BaseTester):
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
+            (["--masks", "1000000"], "masks must be 1024 or fewer, got 1000000"),
+            (["--refocus", "1000000"], "refocus must be 1024 or fewer, got 1000000"),
+            (["--size", "1000000"], "the scene has 1000000 x 1000000 pixels, more than 268435456"),
             (["--masks", "-1"], "masks must be a whole number of at least 0, got -1"),
             (["--depth-range", "2", "1"], "depth_range"),
             (["--batch", "8"], "4 scenes do not fill a batch of 8"),
@@ -61,6 +64,13 @@ class TestTrain(BaseTester):
     def test_exception_is_one_sentence(self, options, sentence, tmp_path, capsys):
         assert main(["train", *SMALL, *options, "-o", str(tmp_path / "run")]) == 2
         assert sentence in capsys.readouterr().err
+
+    @pytest.mark.parametrize("option", ["--workers", "--devices"])
+    def test_exception_more_processes_than_a_machine_bears(self, option, tmp_path, capsys):
+        with pytest.raises(SystemExit) as exit_:
+            main(["train", *SMALL, option, "1000000", "-o", str(tmp_path / "run")])
+        assert exit_.value.code == 2
+        assert "must be a whole number from 0 to 1024, got '1000000'" in capsys.readouterr().err
 
     def test_exception_processes_of_torchrun_that_devices_does_not_tell(self, tmp_path, monkeypatch, capsys):
         """Each would train by itself, and overwrite what the others write."""

@@ -85,7 +85,7 @@ class TestReadImage(BaseTester):
             (np.zeros((2, 2, 5)), "this has 5"),
             (np.zeros(7), r"rows, columns and channels, this is \(7,\)"),
             (np.zeros((0, 3)), "rows, columns and channels"),
-            (np.array([{"code": "never run"}]), "allow_pickle=False"),
+            (np.array([{"code": "never run"}]), "names the data type '.O', which is none of numbers"),
         ],
     )
     def test_exception_array_is_no_image(self, values, message, tmp_path):

@@ -84,6 +84,14 @@ class TestRGBDFolder(BaseTester):
         with pytest.raises(FileNotFoundError, match=r"no depth file in .* fits '\*\.pfm'"):
             RGBDFolder(tmp_path, "*.png", "*.pfm")
 
+    @pytest.mark.parametrize("pattern", ["/etc/*", "../*.png", "a/../../*.png", "..", "*/\0"])
+    def test_exception_patterns_that_lead_out_of_the_folder(self, tmp_path, pattern):
+        write(tmp_path, "in/x.png", "in/x.pfm", 1)
+        (tmp_path / "secret.png").write_bytes((tmp_path / "in/x.png").read_bytes())
+        for image, depth in ((pattern, "*.pfm"), ("*.png", pattern)):
+            with pytest.raises(ValueError, match=r"(must stay within the folder|equally many)"):
+                RGBDFolder(tmp_path / "in", image, depth)
+
     @pytest.mark.parametrize(("image", "depth"), [("*.png", "x.pfm"), ("x.png", "x.pfm"), ("*/*.png", "*.pfm")])
     def test_exception_patterns_without_equally_many_stars(self, tmp_path, image, depth):
         with pytest.raises(ValueError, match=r"must have a \* and equally many"):
@@ -138,7 +146,13 @@ class TestDescribedFolder(BaseTester):
             ('{"image": "*.png"}', 'it should hold "image" and "depth"'),
             ('{"image": "*.png", "depth": "*_d.png", "unit": 1}', 'it should hold "image" and "depth"'),
             ('{"image": "*.png", "depth": "*_d.png", "scale": "mm"}', "cannot read .*rgbd.json: "),
-            ('{"image": 1, "depth": 2}', "cannot read .*rgbd.json: "),
+            ('{"image": 1, "depth": 2}', "cannot read .*rgbd.json: image must be a text, got 1"),
+            ('{"image": "/etc/*", "depth": "*_d.png"}', "must stay within the folder, got '/etc/"),
+            ('{"image": "*.png", "depth": "*_d.png", "invalid": 5}', "invalid must be a list of numbers, got 5"),
+            ('{"image": "*.png", "depth": "*_d.png", "invalid": [null]}', "invalid must be a list of numbers"),
+            ('{"image": "*.png", "depth": "*_d.png", "scale": true}', "scale must be a number, got True"),
+            ('{"image": "*.png", "depth": "*_d.png", "scale": 1' + "0" * 400 + "}", "scale must be a number, got 1000"),
+            ("[" * 100_000, "cannot read .*rgbd.json: its JSON is nested too deep"),
             ('{"image": "*.png", "depth": "*_d.png", "scale": -1}', "scale must be positive"),
         ],
     )

@@ -54,11 +54,11 @@ class TestPSFBank(BaseTester):
         with pytest.raises(ValueError, match="empty"):
             PSFBank.load(path)
         path.write_bytes(b"not a bank, though long enough to have a header")
-        with pytest.raises(ValueError, match="not a readable PSF bank"):
+        with pytest.raises(ValueError, match="it is no PSF bank or is damaged"):
             PSFBank.load(path)
         bank.save(path)
         path.write_bytes(path.read_bytes()[:-100])
-        with pytest.raises(ValueError, match="not a readable PSF bank"):
+        with pytest.raises(ValueError, match="it is no PSF bank or is damaged"):
             PSFBank.load(path)
         save_file({"weights": torch.ones(3)}, path)
         with pytest.raises(ValueError, match="is not a PSF bank"):

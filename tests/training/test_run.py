@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy.data import DeadLeaves
+from kornia_tidy.files import only_here
 from kornia_tidy.training import data_sets, scenes, state_file
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.state_file import read_state
@@ -43,6 +44,13 @@ class TestTrain(BaseTester):
         names = {path.name for path in (tmp_path / "pictures").iterdir()}
         assert {"epoch_0001_masks.png", "epoch_0001_psfs.png", "epoch_0001_estimates.png"} <= names
         assert list((tmp_path / "tensorboard").glob("events.*"))
+
+    def test_exception_a_second_run_in_the_folder_of_one_at_work(self, tmp_path):
+        with only_here(tmp_path, "a training is at work"):
+            for resume in (False, True):
+                with pytest.raises(ValueError, match=r"a training is at work in .* already: wait for it to end"):
+                    train(SETTINGS, tmp_path, resume=resume)
+            assert os.listdir(tmp_path) == []
 
     def test_feature_learning_lowers_the_loss(self, tmp_path):
         train(SETTINGS.replace(size=64, validation_scenes=2, epochs=12, augment=False, ema=0.0), tmp_path)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
-from kornia_tidy.training.state_file import read_state, write_state
+from kornia_tidy.training.state_file import FORMAT, read_state, write_state
 from tests.base import BaseTester
 
 KEYS = st.one_of(st.text(max_size=5), st.integers(-3, 3))
@@ -99,3 +99,11 @@ class TestStateFile(BaseTester):
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert read_state(path) == {"step": 1}
         assert [file.name for file in tmp_path.iterdir()] == ["last.safetensors"]
+
+    @pytest.mark.parametrize(
+        "state", ["[1, 2]", "[" * 100_000, '{"a": {"$tensor": ["x"]}}', '{"a": {"$pairs": 3}}', "\x00"]
+    )
+    def test_exception_a_state_that_cannot_be(self, state, tmp_path):
+        save_file({"weight": torch.ones(2)}, tmp_path / "a", {"format": FORMAT, "state": state})
+        with pytest.raises(ValueError, match="it is no checkpoint of kornia_tidy or is damaged"):
+            read_state(tmp_path / "a")

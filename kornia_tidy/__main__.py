@@ -1,0 +1,8 @@
+"""`python -m kornia_tidy` is the command `kornia-tidy`."""
+
+import sys
+
+from kornia_tidy.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+"""What a picture file says of its size before anything is decoded, and whether all of it is there.
+
+Decoders take memory for what a header promises; and some fill up what is missing with grey, and say nothing.
+
+Source: PNG 1.2, sections 3 and 4.1; ITU-T T.81 (JPEG), annex B; TIFF 6.0, section 2; Netpbm's ppm(5); Microsoft's
+BITMAPINFOHEADER; RFC 9649 (WebP).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+TIFF_LITTLE, TIFF_BIG = (b"II*\0", b"II+\0"), (b"MM\0*", b"MM\0+")
+LARGEST = 1 << 28  # pixels
+VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
+FORMATS = "PNG, JPEG, TIFF, PGM, PPM, PFM, BMP, WebP or NPY"
+
+_STARTS_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # which are tables, reserved, and arithmetic conditions
+_START_OF_SCAN, _END = 0xDA, 0xD9
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length: restarts and the start
+_NETPBM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})\s")
+
+Size = tuple[int, int]
+"""Rows and columns."""
+
+
+def check_header(data: bytes) -> None:
+    """Refuse a picture file that is of no known format, that is cut short, or whose header promises too many pixels.
+
+    Raises:
+        ValueError: if so.
+    """
+    for beginnings, size_of in _READERS:
+        if data.startswith(beginnings):
+            try:
+                rows, columns = size_of(data)
+            except (IndexError, struct.error):
+                raise ValueError("the file is cut short") from None
+            check_pixels("the picture", rows, columns)
+            return
+    raise ValueError(f"it is not an image in a known format: {FORMATS}")
+
+
+def check_pixels(name: str, rows: int, columns: int) -> None:
+    """Refuse a size that no memory would hold, before any is taken.
+
+    The limit is 2^28 pixels (16384 x 16384), or what ``KORNIA_TIDY_MAX_PIXELS`` says in the environment.
+
+    Raises:
+        ValueError: if the size is beyond it.
+
+    Example:
+        >>> check_pixels("the scene", 10**6, 10**6)
+        Traceback (most recent call last):
+        ...
+        ValueError: the scene has 1000000 x 1000000 pixels, more than 268435456: set KORNIA_TIDY_MAX_PIXELS to allow it
+    """
+    text = os.environ.get(VARIABLE, "")
+    most = int(text) if text.isascii() and text.isdigit() else LARGEST
+    if rows * columns > most:
+        raise ValueError(f"{name} has {rows} x {columns} pixels, more than {most}: set {VARIABLE} to allow it")
+
+
+def _png(data: bytes) -> Size:
+    """The size; every chunk that counts must be there and undamaged, to the last."""
+    last, size = b"", (0, 0)
+    place = len(PNG)
+    while last != b"IEND":
+        length, last = struct.unpack_from(">I4s", data, place)
+        end = place + 8 + length
+        (sum_,) = struct.unpack_from(">I", data, end)
+        critical = not last[0] & 0x20
+        if critical and zlib.crc32(memoryview(data)[place + 4 : end]) != sum_:
+            raise ValueError("the file is damaged: a check sum in it is wrong")
+        if place == len(PNG):
+            if last != b"IHDR":
+                raise ValueError("the file is damaged: it does not begin with its size")
+            columns, rows = struct.unpack_from(">II", data, place + 8)
+            size = rows, columns
+        place = end + 4
+    return size
+
+
+def _jpeg(data: bytes) -> Size:
+    """The size; an end marker must follow the last start of a scan, as the data of a scan cannot look like either."""
+    size, scan = None, None
+    for marker, place in _segments(data):
+        if marker in _STARTS_OF_FRAME and size is None:
+            rows, columns = struct.unpack_from(">HH", data, place + 5)
+            size = rows, columns
+        if marker == _START_OF_SCAN:
+            scan = place
+    if size is None or scan is None or data.rfind(b"\xff\xd9") < scan:
+        raise ValueError("the file is cut short")
+    return size
+
+
+def _segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Each marker and where it stands, up to the end of the picture or of the file."""
+    place = 2
+    while (place := data.find(b"\xff", place)) >= 0 and place + 1 < len(data):
+        marker = data[place + 1]
+        if marker == _END:
+            return
+        if marker in {0x00, 0xFF} or marker in _ALONE:  # a byte of the data, filling, or nothing behind it
+            place += 1 if marker == 0xFF else 2
+            continue
+        yield marker, place
+        place += 2 + struct.unpack_from(">H", data, place + 2)[0]
+
+
+def _tiff(data: bytes) -> Size:
+    """The size in the first directory, which is the one decoded."""
+    order, big = "<" if data[:2] == b"II" else ">", data[2 if data[:2] == b"II" else 3] == 0x2B
+    count_form, entry_form, entry_size = ("Q", "HHQ", 20) if big else ("H", "HHI", 12)
+    (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
+    (count,) = struct.unpack_from(order + count_form, data, place)
+    place += struct.calcsize(order + count_form)
+    sizes = {0x0100: 0, 0x0101: 0}
+    for entry in range(place, min(place + count * entry_size, len(data)), entry_size):
+        tag, kind, _ = struct.unpack_from(order + entry_form, data, entry)
+        if tag in sizes:
+            form = {3: "H", 4: "I", 16: "Q"}.get(kind)
+            if form is None:
+                raise ValueError("the file is damaged: its size is of no whole numbers")
+            (sizes[tag],) = struct.unpack_from(order + form, data, entry + struct.calcsize(order + entry_form))
+    return sizes[0x0101], sizes[0x0100]
+
+
+def _netpbm(data: bytes) -> Size:
+    match = _NETPBM.match(data)
+    if match is None:
+        raise ValueError("it is not an image in a known format, or its header is damaged")
+    return int(match[2]), int(match[1])
+
+
+def _bmp(data: bytes) -> Size:
+    form = "<HH" if struct.unpack_from("<I", data, 14)[0] == 12 else "<ii"
+    columns, rows = struct.unpack_from(form, data, 18)
+    return abs(rows), abs(columns)  # rows below zero: from the top
+
+
+def _webp(data: bytes) -> Size:
+    """Its three kinds: with more than a picture, lossless, and lossy."""
+    kind = data[12:16]
+    if data[8:12] != b"WEBP" or kind not in {b"VP8X", b"VP8L", b"VP8 "}:
+        raise ValueError("it is not an image in a known format, or its header is damaged")
+    if kind == b"VP8X":
+        columns, rows = (int.from_bytes(data[place : place + 3], "little") + 1 for place in (24, 27))
+    elif kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        columns, rows = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        columns, rows = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
+    return rows, columns
+
+
+_READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], Size]], ...] = (
+    ((PNG,), _png),
+    ((JPEG,), _jpeg),
+    ((*TIFF_LITTLE, *TIFF_BIG), _tiff),
+    (tuple(b"P%d" % kind for kind in range(1, 7)), _netpbm),
+    ((b"BM",), _bmp),
+    ((b"RIFF",), _webp),
+)

@@ -1,0 +1,47 @@
+"""Safetensors files: tensors by name, and words beside them, read without trust in either."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from kornia_tidy.files import check_file
+
+
+def read_tensors(
+    path: str | os.PathLike[str], what: str = "safetensors file", device: torch.device | str = "cpu"
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read a safetensors file.
+
+    Args:
+        path: the file.
+        what: it should be, in words, for the message.
+        device: of the tensors.
+
+    Returns:
+        Tensors by name, in memory of their own and not the file's; and the words of its header, by name.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no regular file, damaged, or of another kind.
+
+    Example:
+        >>> import tempfile
+        >>> from safetensors.torch import save_file
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_file({"phase": torch.ones(2)}, f"{folder}/a.safetensors", {"of": "a mask"})
+        ...     read_tensors(f"{folder}/a.safetensors")
+        ({'phase': tensor([1., 1.])}, {'of': 'a mask'})
+    """
+    path = check_file(path)
+    try:
+        if not path.stat().st_size:
+            raise SafetensorError("the file is empty")
+        with safe_open(path, framework="pt", device=str(device)) as file:
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (no mapping)
+            return tensors, dict(file.metadata() or {})
+    except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # the latter of types PyTorch does not know
+        raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error!s:.300}") from None

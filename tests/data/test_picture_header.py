@@ -1,0 +1,146 @@
+"""Files that claim what is not there: refused by their headers, before any memory is taken."""
+
+from __future__ import annotations
+
+import resource
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data.picture_header import LARGEST, VARIABLE, check_header, check_pixels
+from tests.base import BaseTester
+from tests.forks import fork, wait
+
+SUFFIXES = (".png", ".jpg", ".tif", ".ppm", ".bmp", ".webp")
+GREY = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+
+
+def encoded(suffix: str, *options: int) -> bytes:
+    return cv2.imencode(suffix, GREY, list(options))[1].tobytes()
+
+
+def png_of(rows: int, columns: int, packed: bytes) -> bytes:
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)), (b"IDAT", packed), (b"IEND", b""))
+    body = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def enlarged(suffix: str) -> bytes:
+    """A file whose header promises more than 10^10 pixels, or all it can say."""
+    data = bytearray(encoded(suffix))
+    if suffix == ".png":
+        return png_of(10**6, 10**6, b"")
+    if suffix == ".jpg":
+        place = data.index(b"\xff\xc0")
+        data[place + 5 : place + 9] = b"\xff\xff\xff\xff"
+    elif suffix == ".tif":
+        for tag in (0x0100, 0x0101):
+            place = data.index(struct.pack("<H", tag), struct.unpack_from("<I", data, 4)[0])
+            data[place + 2 : place + 12] = struct.pack("<HII", 4, 1, 10**6)
+    elif suffix == ".ppm":
+        return b"P6\n# a comment\n1000000 1000000\n255\n" + bytes(99)
+    elif suffix == ".bmp":
+        data[18:26] = struct.pack("<ii", 10**6, -(10**6))
+    else:
+        return b"RIFF\x20\0\0\0WEBPVP8X\x0a\0\0\0" + bytes(4) + b"\xff" * 6 + bytes(10)
+    return bytes(data)
+
+
+class TestCheckHeader(BaseTester):
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_feature_whole_files_pass(self, suffix):
+        check_header(encoded(suffix))
+
+    @pytest.mark.parametrize(
+        ("suffix", "options"),
+        [
+            (".jpg", (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)),
+            (".jpg", (cv2.IMWRITE_JPEG_RST_INTERVAL, 1)),
+            (".webp", (cv2.IMWRITE_WEBP_QUALITY, 50)),
+        ],
+    )
+    def test_feature_variants_pass(self, suffix, options):
+        check_header(encoded(suffix, *options))
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_exception_an_absurd_size_is_refused_by_the_header(self, suffix):
+        with pytest.raises(ValueError, match=rf"the picture has \d+ x \d+ pixels, more than {LARGEST}: set {VARIABLE}"):
+            check_header(enlarged(suffix))
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_exception_any_cut_is_one_sentence(self, suffix, tmp_path, capfd):
+        data, path = encoded(suffix), tmp_path / "a"
+        for kept in range(1, len(data) - 1, len(data) // 20):
+            path.write_bytes(data[:kept])
+            with pytest.raises(ValueError, match=r"cannot read .*a: [^\n]+$"):
+                read_image(path)
+        assert capfd.readouterr().err == ""
+
+    @pytest.mark.parametrize("suffix", [".gif", ".jp2", ".hdr"])
+    def test_exception_formats_whose_size_is_not_looked_at(self, suffix):
+        with pytest.raises(ValueError, match="not an image in a known format: PNG, JPEG, TIFF"):
+            check_header(encoded(suffix))
+
+    def test_exception_a_jpeg_that_ends_before_its_time(self, tmp_path, capfd):
+        """Decoders fill the rest with grey; only libjpeg's warning, which is printed by C, tells of it."""
+        data = encoded(".jpg")
+        (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2] + b"\xff\xd9")
+        with pytest.raises(ValueError, match=r"a\.jpg: the file is cut short or damaged \(Corrupt JPEG data"):
+            read_image(tmp_path / "a.jpg")
+        assert capfd.readouterr().err == ""
+
+    def test_exception_a_png_with_too_few_lines(self, tmp_path, capfd):
+        (tmp_path / "a.png").write_bytes(png_of(40, 60, zlib.compress(bytes(61 * 20))))
+        with pytest.raises(ValueError, match=r"a\.png: .*damaged"):
+            read_image(tmp_path / "a.png")
+        assert capfd.readouterr().err == ""
+
+    def test_exception_a_png_with_a_wrong_check_sum(self):
+        data = bytearray(encoded(".png"))
+        data[len(data) // 2] ^= 1
+        with pytest.raises(ValueError, match="a check sum in it is wrong"):
+            check_header(bytes(data))
+
+    def test_exception_long_blanks_in_a_header_take_no_time(self):
+        with pytest.raises(ValueError, match="its header is damaged"):
+            check_header(b"P5" + b" " * 100_000 + b"x")
+
+
+class TestCheckPixels(BaseTester):
+    def test_feature_the_limit_can_be_raised_and_lowered(self, monkeypatch):
+        check_pixels("the scene", 1 << 14, 1 << 14)
+        with pytest.raises(ValueError, match="the scene has 16384 x 16385 pixels, more than 268435456"):
+            check_pixels("the scene", 1 << 14, (1 << 14) + 1)
+        monkeypatch.setenv(VARIABLE, "100")
+        with pytest.raises(ValueError, match="10 x 11 pixels, more than 100"):
+            check_pixels("the scene", 10, 11)
+        monkeypatch.setenv(VARIABLE, str(1 << 40))
+        check_pixels("the scene", 10**6, 10**6)
+
+    @pytest.mark.parametrize(
+        ("limit", "sentence"), [("", "20000 x 20000 pixels, more than 268435456"), ("9" * 12, "more memory than")]
+    )
+    def test_exception_a_small_file_of_400_megapixels_under_a_limit_of_memory(
+        self, limit, sentence, tmp_path, monkeypatch
+    ):
+        """Where the limit of pixels is raised, what is left of the memory refuses it."""
+        packer = zlib.compressobj(1)
+        lines = b"".join([packer.compress(bytes(20_001 * 100)) for _ in range(200)]) + packer.flush()
+        (tmp_path / "bomb.png").write_bytes(png_of(20_000, 20_000, lines))
+        assert (tmp_path / "bomb.png").stat().st_size < 4 << 20
+        monkeypatch.setenv(VARIABLE, limit)
+
+        def child():
+            used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 28), used + (1 << 28)))
+            with pytest.raises(ValueError, match=sentence):
+                read_image(tmp_path / "bomb.png")
+
+        assert wait(fork(child)) == 0

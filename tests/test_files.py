@@ -1,0 +1,117 @@
+"""Reading and writing whole files: what is no file, what does not fit, what is locked."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import threading
+
+import pytest
+
+from kornia_tidy.data.image_files import read_image
+from kornia_tidy.files import only_here, parse_json, read_bytes, read_json, write_bytes, write_folder
+from tests.base import BaseTester
+from tests.forks import fork, wait
+
+
+@pytest.fixture
+def small_disk():
+    """A limit on the size of files stands for the disk: writing fails half-way, as on a full one."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 12, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+class TestReading(BaseTester):
+    @pytest.mark.timeout(20)
+    def test_exception_a_pipe_is_refused_and_not_waited_for(self, tmp_path):
+        os.mkfifo(tmp_path / "pipe.png")
+        with pytest.raises(ValueError, match=r"cannot read .*pipe\.png: it is not a regular file"):
+            read_image(tmp_path / "pipe.png")
+
+    @pytest.mark.timeout(20)
+    @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="there is no such device")
+    def test_exception_a_device_is_refused(self):
+        with pytest.raises(ValueError, match="cannot read /dev/zero: it is not a regular file"):
+            read_bytes("/dev/zero")
+
+    def test_exception_json_nested_too_deep(self, tmp_path):
+        for text in ("[" * 100_000 + "]" * 100_000, '{"a":' * 100_000 + "1" + "}" * 100_000):
+            (tmp_path / "a.json").write_text(text)
+            with pytest.raises(ValueError, match=r"cannot read .*a\.json: its JSON is nested too deep"):
+                read_json(tmp_path / "a.json")
+
+    @pytest.mark.parametrize("text", [b"{", b"\xff\xfe\x00", b"[1" + b"0" * 5000 + b"]"])
+    def test_exception_what_is_no_json(self, text):
+        with pytest.raises(ValueError, match=r"\w"):
+            parse_json(text)
+
+
+class TestWriting(BaseTester):
+    def test_exception_a_full_disk_names_the_file_and_leaves_nothing(self, small_disk, tmp_path):
+        with pytest.raises(OSError, match=r"^cannot write .*out\.png: File too large$"):
+            write_bytes(tmp_path / "out.png", bytes(1 << 14))
+        with pytest.raises(OSError, match=r"^cannot write .*slm: File too large$"):
+            write_folder(tmp_path / "slm", {"a": b"1", "b": bytes(1 << 14)})
+        assert os.listdir(tmp_path) == []
+
+    def test_exception_a_full_disk_leaves_what_was_there(self, small_disk, tmp_path):
+        write_bytes(tmp_path / "out.png", b"before")
+        with pytest.raises(OSError, match="cannot write"):
+            write_bytes(tmp_path / "out.png", bytes(1 << 14))
+        assert (tmp_path / "out.png").read_bytes() == b"before"
+        assert os.listdir(tmp_path) == ["out.png"]
+
+
+class TestOnlyHere(BaseTester):
+    def test_exception_the_second_is_refused_and_the_folder_given_back(self, tmp_path):
+        with only_here(tmp_path, "a training is at work"):
+            with (
+                pytest.raises(ValueError, match=r"a training is at work in .* already: wait for it to end"),
+                only_here(tmp_path, "a training is at work"),
+            ):
+                pass
+            assert os.listdir(tmp_path) == []
+        with only_here(tmp_path, "a training is at work"):
+            pass
+
+    def test_exception_another_thread_and_another_process(self, tmp_path):
+        refused = []
+
+        def work():
+            try:
+                with only_here(tmp_path, "it"):
+                    pass
+            except ValueError:
+                refused.append(True)
+            assert refused
+
+        with only_here(tmp_path, "it"):
+            thread = threading.Thread(target=work)
+            thread.start()
+            thread.join()
+            assert refused
+            refused.clear()
+            assert wait(fork(work)) == 0
+
+    def test_feature_a_killed_process_gives_it_back(self, tmp_path):
+        def child():
+            with only_here(tmp_path, "it"):
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        assert wait(fork(child)) == -signal.SIGKILL
+        with only_here(tmp_path, "it"):
+            pass
+
+    def test_feature_forks_that_live_on_do_not_hold_it(self, tmp_path):
+        read, write = os.pipe()
+        with only_here(tmp_path, "it"):
+            process = fork(lambda: os.read(read, 1))
+        with only_here(tmp_path, "it"):
+            pass
+        os.write(write, b"x")
+        wait(process)

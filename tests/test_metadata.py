@@ -1,0 +1,28 @@
+"""What an index of packages shows of this one."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.base import BaseTester
+
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+
+
+class TestMetadata(BaseTester):
+    def test_smoke_authors_and_addresses(self):
+        assert [author["name"] for author in PROJECT["authors"]] == ["The kornia_tidy authors"]
+        assert set(PROJECT["urls"]) == {"Documentation", "Source", "Issues"}
+        assert all(address.startswith("https://") for address in PROJECT["urls"].values())
+
+    def test_smoke_the_package_runs_as_the_command(self, monkeypatch, capsys):
+        monkeypatch.setattr(sys, "argv", ["kornia_tidy", "--version"])
+        with pytest.raises(SystemExit) as exit_:
+            runpy.run_module("kornia_tidy", run_name="__main__")
+        assert exit_.value.code == 0
+        assert capsys.readouterr().out.startswith("kornia-tidy ")
