@@ -52,7 +52,7 @@ def scores(image, depth, camera, noise):
     raw = RawCapture.from_scene(image, depth, optics, camera, noise, generator=torch.Generator().manual_seed(0))
     read = RawCapture.open(encode_dng(raw))
     assert torch.equal(read.counts, raw.counts)
-    light = read.to_rgb(encoded=False, upright=False)
+    light = read.to_rgb(white_balance="daylight", encoded=False, upright=False)
     estimate = reconstruct_light(head, light).image
     capture = linear_rgb_to_rgb(light.clamp(0, 1))
     return *(float(psnr(picture[None], image[None])) for picture in (capture, estimate)), raw

@@ -18,7 +18,7 @@ PARTS: dict[str, tuple[type, str, str]] = {
 }
 """Of each part its type, an example for people, and an attribute that its type must have."""
 
-WIDEST_BLUR = 8  # times the largest window: one that wide holds a fiftieth of the light, 1 / (pi / 4 * 64)
+WIDEST_BLUR = 10  # times the largest window, which then holds 1.3 % of the light: 1 / (pi / 4 * 100)
 USUAL_WINDOW = 65  # px; small pictures have smaller ones, which says nothing of the lens
 MOST_LAYERS = 4096
 
@@ -38,7 +38,7 @@ def check_defocus_range(
         window: side of the PSFs in pixels if it is fixed.
 
     Raises:
-        ValueError: if there are more than 4096 layers, or a disc is wider than 8 of the largest windows (at least of
+        ValueError: if there are more than 4096 layers, or a disc is wider than 10 of the largest windows (at least of
             65 px).
 
     Example:
@@ -46,7 +46,7 @@ def check_defocus_range(
         >>> check_defocus_range((-19375.0, 19375.0), 2e-7, Fidelity(), None)
         Traceback (most recent call last):
         ValueError: a defocus from -1.938e+04 to 1.938e+04 rad needs 19375 layers of PSFs 32686 px wide, of which at \
-most 4096 and 520 px are allowed: give lengths in metres, choose a smaller aperture or depth_range, or raise \
+most 4096 and 650 px are allowed: give lengths in metres, choose a smaller aperture or depth_range, or raise \
 Fidelity.max_window or layer_spacing
     """
     lo, hi = defocus_range

@@ -111,7 +111,7 @@ class TestConditions(BaseTester):
         script = "import sys, kornia_tidy.tradeoff.measure, kornia_tidy.planning; print(*sys.modules)"
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, text=True)
         root = Path(kornia_tidy.__file__).parent
-        elsewhere = {"dataset_transform", "files", "motion", "multi_shot", "__init__"}
+        elsewhere = {"dataset_transform", "files", "motion", "multi_shot", "tensor_files", "__init__"}
         elsewhere |= {"tradeoff/conditions", "tradeoff/figure", "tradeoff/files", "tradeoff/__init__"}
         names = {
             name.partition(".")[2].replace(".", "/") for name in done.stdout.split() if name.startswith("kornia_tidy.")

@@ -224,6 +224,8 @@ class TestEndToEnd(BaseTester):
         summary = json.loads((tmp_path / "e" / "summary.json").read_text())
         assert (summary["scenes"], summary["split"]) == (PAIRS, "all")
 
+    # The units of flying things are nobody's metres; where all of it is far for a lens, that is told.
+    @pytest.mark.filterwarnings("ignore:the nearest pixel is")
     @pytest.mark.parametrize("name", FILES)
     def test_feature_real_samples(self, name, tmp_path, capsys):
         """Samples of the published files, where the readers expect them."""

@@ -16,7 +16,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 MASK_SPAN = 2.3  # pupil radii across a mask's shorter side: the paper's 23 pixels of a tenth of a radius
 NOISE_RMS = 2.05  # radians at 530 nm: that of the paper's start, heights uniform on [0, 1.2e-6] m at index 1.5
 HEIGHTS = (1e-9, 1e-3)  # m; what an element or a panel may be high
-HEIGHT_STEPS = (1e-15, 1e-4)  # m; what a step of learning may move
+HEIGHT_STEPS = (1e-40, 1e-4)  # m; what a step of learning may move: next to nothing is no wrong unit
 
 Size = int | tuple[int, int]
 """Pixels of a mask: along both sides, or (rows, columns)."""
