@@ -20,15 +20,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.depth_energy import Depths, octave_filters
 from kornia_tidy.optics.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
 from kornia_tidy.scene.convolution import next_fast_size, pad_border
-from kornia_tidy.scene.layers import layer_weights
+from kornia_tidy.scene.layers import assign_layers
 
 CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
 GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
 _BLOCK = 1024  # px; larger images are looked at block by block
-_BINS = 256  # of the histogram of defocus
-_REGIONS = 8  # of defocus, whose outlines scatter makes visible
+ALIKE = 2.0  # rad; how far apart in defocus changes of PSFs are still alike
+_NEGLIGIBLE = 1e-2  # of a spectrum's mean; frequencies with less power do not count
+_USUAL = 0.1  # of the spectrum's shape is that of a photograph
 
 
 def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
@@ -179,36 +181,53 @@ def natural_power(channels: int, size: int) -> Tensor:
     return (power * (CONTRAST**2 / power.sum())).expand(channels, -1, -1)
 
 
-def region_power(light: Tensor, defocus: Tensor, border: str, size: int) -> Tensor:
-    """Return the summed power spectra of an image's regions of like defocus, each cut out on black.
-
-    Scatter blurs each region alone, so their outlines count, which gather does not see.
+class SceneLight:
+    """The power of a scene's light by channel, octave and depth, and the shape of its spectrum within each octave.
 
     Args:
-        light: (B, C, H, W).
-        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-        border: as for :func:`power_spectrum`.
-        size: side N of the frequency grid.
+        power: of the light, (C, N, N // 2 + 1), see :func:`power_spectrum`.
+        psi: (b,) defocus in the scene, ascending.
+        energies: (C, octaves, b) where depths add up by themselves; (C, octaves, b, b) where they add up to light.
     """
-    levels = np.quantile(defocus.double().cpu().numpy(), np.arange(1, _REGIONS) / _REGIONS)
-    region = torch.bucketize(defocus, torch.as_tensor(levels).to(defocus).unique())
-    regions = (light * (region == index) for index in range(int(region.max()) + 1))
-    return torch.stack([power_spectrum(part, border, size) for part in regions]).sum(0)
 
+    def __init__(self, power: Tensor, psi: Tensor, energies: Tensor) -> None:
+        self.psi, self.energies = psi, energies
+        self._power = power
+        self._shapes: dict[int, Tensor] = {}
 
-def defocus_histogram(defocus: Tensor, lo: float, hi: float) -> tuple[Tensor, Tensor]:
-    """Return the mean defocus of each bin that is not empty, and the share of the pixels in it, float64.
+    @classmethod
+    def seen(cls, light: Tensor, depths: Depths, border: str, size: int, compositing: str) -> SceneLight:
+        """Return that of an image, as it is composed."""
+        power = power_spectrum(light, border, size)
+        octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
+        if compositing == "gather":
+            return cls(power, depths.psi, octaves[..., None] * depths.shares(light))
+        return cls(power, depths.psi, depths.products(light))
 
-    Example:
-        >>> defocus_histogram(torch.tensor([-30.0, 5.0, 5.0, 7.0]), -20, 20)
-        (tensor([-20.,   5.,   7.], dtype=torch.float64), tensor([0.2500, 0.5000, 0.2500], dtype=torch.float64))
-    """
-    psi = defocus.detach().double().flatten().cpu().clamp(lo, hi)
-    low, high = float(psi.min()), float(psi.max())
-    index = ((psi - low) * (_BINS / max(high - low, 1e-9))).long().clamp(max=_BINS - 1)
-    count = torch.bincount(index, minlength=_BINS).double()
-    mean = torch.bincount(index, psi, minlength=_BINS) / count.clamp(min=1)
-    return mean[count > 0], count[count > 0] / len(psi)
+    @classmethod
+    def unseen(cls, depths: Depths, channels: int, size: int) -> SceneLight:
+        """Return that of a typical photograph, alike at all depths."""
+        power = natural_power(channels, size)
+        octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
+        return cls(power, depths.psi, octaves[..., None] * depths.share)
+
+    def shapes(self, window: int) -> Tensor:
+        """Return the shapes of the spectrum, each with a sum of one, on a grid for PSFs of a window.
+
+        Of an octave that the image as a whole does not have, that of a photograph.
+
+        Returns:
+            (C, octaves, M, M // 2 + 1) float64.
+        """
+        full = self._power.shape[-2]
+        size = min(full, spectrum_size(window))
+        if size not in self._shapes:
+            power = coarser(self._power, size) if size < full else self._power
+            usual = natural_power(1, size) * power.sum((-2, -1), keepdim=True).clamp(min=1e-30)
+            power = power.clamp(min=0) + _USUAL * usual
+            octaves = power[:, None] * octave_filters(size)
+            self._shapes[size] = octaves / octaves.sum((-2, -1), keepdim=True)
+        return self._shapes[size]
 
 
 def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: float) -> tuple[Tensor, Sequence[float]]:
@@ -231,7 +250,11 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
     mode = "nearest" if layers == "nearest" else "linear"
     taken_from = fine_nodes(nodes) if layers in TAPS else tuple(nodes)
     at = torch.tensor(taken_from, dtype=torch.float64)
-    weights = layer_weights(psi.double().view(1, 1, 1, -1), at, mode)[0, :, 0].T
+    lower, fraction = (each.flatten() for each in assign_layers(psi.double().view(1, 1, 1, -1), at, mode))
+    weights = torch.zeros(len(psi), len(at), dtype=torch.float64)
+    row = torch.arange(len(psi))
+    weights[row, lower] = 1 - fraction
+    weights[row, (lower + 1).clamp(max=len(at) - 1)] += fraction
     if layers not in TAPS:
         return weights, nodes
     samples = guarded(nodes, TAPS[layers] // 2)
@@ -247,62 +270,67 @@ class LayerErrors:
     Args:
         nodes: Chebyshev nodes that carry the PSFs of the masks, see :func:`nodes_needed`.
         psfs: (n, C, P, P) PSFs there, not normalised.
-        psi: (b,) defocus in the scene, and
-        share: the share of the pixels at each.
-        power: see :func:`power_spectrum`; of any grid not smaller than ``spectrum_size(P)``.
+        light: of the scene.
     """
 
-    def __init__(self, nodes: Tensor, psfs: Tensor, psi: Tensor, share: Tensor, power: Tensor) -> None:
-        self._nodes, self._psi, self._share = nodes, psi, share
-        size = min(power.shape[-2], spectrum_size(psfs.shape[-1]))
-        power = coarser(power, size) if size < power.shape[-2] else power
-        self._products = torch.stack(
-            [_products(own, weight) for own, weight in zip(psfs.unbind(1), power, strict=True)]
-        )
+    def __init__(self, nodes: Tensor, psfs: Tensor, light: SceneLight) -> None:
+        self._nodes, self._light = nodes, light
+        shapes = light.shapes(psfs.shape[-1])
+        self._products = torch.stack([_products(own, shape) for own, shape in zip(psfs.unbind(1), shapes, strict=True)])
 
     def rows(self, nodes: Sequence[float], layers: str, band: float) -> Tensor:
         """Return the coefficients of what the scene's pixels are blurred with, (b, n)."""
-        weights, at = layer_coefficients(self._psi, nodes, layers, band)
+        weights, at = layer_coefficients(self._light.psi, nodes, layers, band)
         return weights @ chebyshev_weights(torch.tensor(at, dtype=torch.float64), self._nodes)
 
     def own_rows(self) -> Tensor:
         """Return the coefficients of a PSF of its own for each depth, (b, n)."""
-        return chebyshev_weights(self._psi, self._nodes)
+        return chebyshev_weights(self._light.psi, self._nodes)
 
     def __call__(self, ours: Tensor, theirs: Tensor) -> float:
         """Return the difference between captures of these coefficients, full scale 1."""
-        difference = ours - theirs
-        squares = torch.einsum("cbi,bi,b->c", difference @ self._products, difference, self._share)
+        difference, energies = ours - theirs, self._light.energies
+        responses = difference @ self._products  # (C, octaves, b, n)
+        if energies.ndim == 4:
+            squares = ((energies @ difference) * responses).sum((1, 2, 3))
+        else:
+            squares = (energies * (responses * difference).sum(-1)).sum((1, 2))
         return math.sqrt(max(0.0, float(squares.mean())))
 
 
-def _products(psfs: Tensor, power: Tensor) -> Tensor:
-    size = power.shape[-2]
-    spectra = torch.view_as_real(torch.fft.rfft2(psfs.float(), s=(size, size)).flatten(1)).double()
-    return (spectra * power.flatten()[:, None]).flatten(1) @ spectra.flatten(1).mT
+def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
+    """Return the products of PSFs of one channel with each other in each octave, (octaves, n, n).
+
+    In float64: of layers close to each other all but a millionth cancels.
+    """
+    size = shapes.shape[-2]
+    spectra = torch.view_as_real(torch.fft.rfft2(psfs.double(), s=(size, size)).flatten(1))
+    products = []
+    for weight in shapes.flatten(1):
+        counts = weight > _NEGLIGIBLE / len(weight)
+        own = spectra[:, counts]
+        products.append((own * weight[counts, None]).flatten(1) @ own.flatten(1).mT)
+    return torch.stack(products)
 
 
-def change_error(nodes: Sequence[float], changes: Tensor, psi: Tensor, share: Tensor, power: Tensor) -> float:
+def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> float:
     """Return the root mean square difference that changes of PSFs make on a scene.
 
     Args:
         nodes: ascending defocus in radians where the changes are known; in between they are as large as there.
         changes: (len(nodes), C, P, P).
-        psi: (b,) defocus in the scene, and
-        share: the share of the pixels at each.
-        power: see :func:`power_spectrum`; of any grid not smaller than ``spectrum_size(P)``.
-
-    Example:
-        >>> double = torch.zeros(1, 1, 1, 1) + 1.0  # what a PSF of twice the light adds
-        >>> image = torch.rand(1, 1, 9, 9, dtype=torch.float64)
-        >>> error = change_error((0.0,), double, torch.zeros(1), torch.ones(1), power_spectrum(image, "circular", 9))
-        >>> abs(error - float(image.std(correction=0))) < 1e-6
-        True
+        light: of the scene.
     """
-    size = min(power.shape[-2], spectrum_size(changes.shape[-1]))
-    power = coarser(power, size) if size < power.shape[-2] else power
-    squares = (_power(torch.fft.rfft2(changes, s=(size, size))) * power).sum((-2, -1)).mean(1).clamp(min=0).numpy()
-    return math.sqrt(float(np.interp(psi.numpy(), nodes, squares) @ share.numpy()))
+    shapes = light.shapes(changes.shape[-1])
+    power = _power(torch.fft.rfft2(changes, s=(shapes.shape[-2],) * 2))
+    known = torch.einsum("dcyx,cjyx->cjd", power.double(), shapes).clamp(min=0)
+    squares = torch.as_tensor(np.apply_along_axis(lambda own: np.interp(light.psi.numpy(), nodes, own), -1, known))
+    if light.energies.ndim == 3:
+        return math.sqrt(float((squares * light.energies).sum((1, 2)).mean()))
+    sizes = squares.sqrt()
+    near = torch.exp(-0.5 * ((light.psi[:, None] - light.psi) / ALIKE).square())
+    sums = [((energies @ sizes[..., None])[..., 0] * sizes).sum(-1) for energies in (light.energies, light.energies * near)]
+    return math.sqrt(max(0.0, float(torch.maximum(*sums).sum(1).mean())))
 
 
 def _endless(block: Tensor, border: str, size: int) -> Tensor:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import product, repeat
 from typing import Any
 
 import torch
@@ -26,15 +26,13 @@ from kornia_tidy.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIG
 from kornia_tidy.capture_error import (
     CONTRAST,
     LayerErrors,
+    SceneLight,
     change_error,
-    defocus_histogram,
     layer_coefficients,
-    natural_power,
-    power_spectrum,
-    region_power,
     spectrum_size,
 )
 from kornia_tidy.checks import check_positive
+from kornia_tidy.depth_energy import Depths
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
 from kornia_tidy.optics.defocus_interpolation import TAPS, fine_nodes, guarded
@@ -104,24 +102,20 @@ class PlannedScene:
         self.reference = survey.reference(height, width)
         size = spectrum_size(window_side(self.reference))
         colours = range(1, len(survey.spectrum.basis or (1,)))
+        self._depths = Depths(defocus, *survey.defocus_range, survey.border)
         if light is None:  # whose colours, if they matter, may differ as much as its pixels
-            self._power, self._level = natural_power(survey.channels, size), 0.5
+            self._light, self._level = SceneLight.unseen(self._depths, survey.channels, size), 0.5
             self._contrast = CONTRAST
-            self._colour_powers = [self._power for _ in colours]
+            self._colours = [self._light for _ in colours]
         else:
-            self._power, self._level = self._power_of(light, size), float(light.double().square().mean().sqrt())
+            self._light, self._level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
             self._contrast = float(light.double().std(correction=0))
-            self._colour_powers = [self._power_of(light.roll(-k, 1) - light, size) for k in colours]
-        self._psi, self._share = defocus_histogram(defocus, *survey.defocus_range)
-        self._layers = LayerErrors(*survey.layer_survey(), self._psi, self._share, self._power)
+            self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
+        self._layers = LayerErrors(*survey.layer_survey(), self._light)
         self._rows = self._layer_rows(self.reference)
 
-    def _power_of(self, light: Tensor, size: int) -> Tensor:
-        border = self._survey.border
-        power = power_spectrum(light, border, size)
-        if self._survey.compositing != "gather":
-            power = power + region_power(light, self._defocus, border, size)
-        return power
+    def _seen_light(self, light: Tensor, size: int) -> SceneLight:
+        return SceneLight.seen(light, self._depths, self._survey.border, size, self._survey.compositing)
 
     def error(self, fidelity: Fidelity) -> float:
         """Return the predicted error of a fidelity, full scale 1: at most its window is that of the reference.
@@ -238,7 +232,7 @@ class PlannedScene:
         if key not in self._known:
             nodes, psfs = self._survey.window_survey(full)
             around = slice(
-                max(0, bisect_right(nodes, float(self._psi[0])) - 1), bisect_left(nodes, float(self._psi[-1])) + 1
+                max(0, bisect_right(nodes, float(self._depths.psi[0])) - 1), bisect_left(nodes, float(self._depths.psi[-1])) + 1
             )
             nodes, psfs = nodes[around], psfs[around]
             kept = _cropped(psfs, window)
@@ -246,7 +240,7 @@ class PlannedScene:
                 kept = kept / kept.sum((-2, -1), keepdim=True)
             changes = -psfs
             _cropped(changes, window).add_(kept)
-            self._known[key] = change_error(nodes, changes, self._psi, self._share, self._power)
+            self._known[key] = change_error(nodes, changes, self._light)
         return self._known[key]
 
     def _point_error(self, tolerance: float) -> float:
@@ -254,7 +248,7 @@ class PlannedScene:
             return 0.0
         if tolerance not in self._known:
             nodes, changes = self._survey.pixel_changes(tolerance)
-            self._known[tolerance] = change_error(nodes, changes, self._psi, self._share, self._power)
+            self._known[tolerance] = change_error(nodes, changes, self._light)
         return self._known[tolerance]
 
     def _wavelength_error(self, count: int | None) -> float:
@@ -263,11 +257,8 @@ class PlannedScene:
         key = ("wavelengths", count)
         if key not in self._known:
             nodes, changes = self._survey.wavelength_changes(count)
-            powers = (self._power, *self._colour_powers)
-            self._known[key] = sum(
-                change_error(nodes, change, self._psi, self._share, power)
-                for change, power in zip(changes, powers, strict=True)
-            )
+            lights = (self._light, *self._colours)
+            self._known[key] = sum(map(change_error, repeat(nodes), changes, lights))
         return self._known[key]
 
     def _samples(self, fidelity: Fidelity) -> Sequence[float]:
@@ -278,7 +269,7 @@ class PlannedScene:
         """How many PSFs are computed for the scene: all from the first that it takes light from to the last."""
         key = ("computed", fidelity.layers, fidelity.layer_spacing)
         if key not in self._known:
-            ends = torch.stack([self._psi.min(), self._psi.max()])
+            ends = torch.stack([self._depths.psi[0], self._depths.psi[-1]])
             weights, _ = layer_coefficients(ends, self._survey.nodes(fidelity), fidelity.layers, self._survey.band)
             used = torch.nonzero((weights != 0).any(0)).flatten()
             self._known[key] = int(used[-1] - used[0] + 1)

@@ -1,0 +1,199 @@
+r"""Where in depth the light of a scene varies, octave by octave.
+
+A texture and the dark around it may lie at different depths, so the power of an image says little of what one PSF makes
+of it. Here it is told apart twice. Box averages over cells of :math:`2^j` pixels split it into octaves: what is lost
+from one level to the next, :math:`m_j^2 - m_{j+1}^2` summed over cells, is the power that passes
+
+.. math:: K_j(f) = B_j(f) - B_{j+1}(f), \qquad B_j(f) = \prod_{x, y} \frac{\sin^2(\pi 2^j f)}{4^j \sin^2(\pi f)}
+
+on average over where the cells begin; :math:`K_j \ge 0`, and with the last average they sum to one. And as the averages
+stay in place, the power of each octave is given to the depths where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+LEVELS = 5  # octaves told apart: from 2 px to 32; slower ones stand together
+REACHES = (1, 3, 9)  # cells around, over which light is taken to spread: the largest sum counts
+_REACH_CELL = 8  # px; of octaves finer than this
+_OFFSET = 21  # px; of cells of any size, so that what begins at round pixels is cut by those of every level
+
+
+def octave_filters(size: int, levels: int = LEVELS) -> Tensor:
+    """Return how much of the power at each frequency belongs to each octave, the finest first; they sum to one.
+
+    Args:
+        size: side N of the frequency grid.
+        levels: octaves told apart; one more holds all that is slower.
+
+    Returns:
+        (levels + 1, N, N // 2 + 1) float64.
+
+    Example:
+        >>> filters = octave_filters(16)
+        >>> filters.shape, bool((filters >= 0).all()), bool(torch.allclose(filters.sum(0), torch.ones(16, 9).double()))
+        (torch.Size([6, 16, 9]), True, True)
+    """
+    down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
+    boxes = [torch.ones(size, len(across), dtype=torch.float64)]
+    for level in range(levels):
+        pair = [torch.cos(math.pi * 2**level * f).square() for f in (down, across)]
+        boxes.append(boxes[-1] * pair[0][:, None] * pair[1])
+    return torch.stack([*(a - b for a, b in zip(boxes, boxes[1:], strict=False)), boxes[-1]])
+
+
+class Depths:
+    """The depths of a scene in bins, and its pixels laid out in cells.
+
+    Args:
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+        lo: least defocus of the camera, and
+        hi: largest: what lies beyond is clamped.
+        border: what lies beyond the image, see :mod:`kornia_tidy.scene.convolution`.
+        bins: how many there may be.
+
+    Attributes:
+        psi: (b,) float64, the mean defocus of each bin that is not empty, ascending.
+        share: (b,) the share of the pixels in it.
+    """
+
+    def __init__(self, defocus: Tensor, lo: float, hi: float, border: str, bins: int = 256) -> None:
+        at = defocus.detach().double().cpu().clamp(lo, hi)
+        low, high = float(at.min()), float(at.max())
+        index = ((at - low) * (bins / max(high - low, 1e-9))).long().clamp(max=bins - 1)
+        count = torch.bincount(index.flatten(), minlength=bins)
+        sums = torch.bincount(index.flatten(), at.flatten(), minlength=bins)
+        full = count > 0
+        self.psi, self.share = sums[full] / count[full], count[full].double() / at.numel()
+        self._index = (full.cumsum(0) - 1)[index]
+        self._border = border
+        self._rows, self._columns = (_cells(side, border) for side in defocus.shape[-2:])
+
+    def _laid_out(self, plane: Tensor, outside: float | Tensor) -> Tensor:
+        """Return (B, C, H, W) planes with what the border puts around them, in whole cells of the largest size."""
+        rows, columns = self._rows, self._columns
+        laid = plane[..., rows.clamp(min=0)[:, None], columns.clamp(min=0)]
+        if self._border != "zero":
+            return laid
+        return torch.where((rows[:, None] >= 0) & (columns >= 0), laid, outside)
+
+    def _labels(self, batch: int) -> Tensor:
+        """Return the bin of each pixel as laid out, the number of bins where there is none, (B, 1, H', W')."""
+        outside = torch.tensor(len(self.psi))
+        return self._laid_out(self._index, outside).expand(batch, -1, -1, -1)
+
+    def shares(self, light: Tensor) -> Tensor:
+        r"""Return which share of each octave's power depths take in that blur the light around them, as gather does.
+
+        A pixel takes light in from as far as its PSF reaches. So the power is spread over several reaches, from none
+        to some tens of pixels, and of what they give to a depth the most counts: shares of an octave sum to one or
+        more. No share is larger than one.
+
+        Args:
+            light: (B, C, H, W).
+
+        Returns:
+            (C, levels + 1, b) float64.
+        """
+        light = light.detach().cpu()
+        mean = light.mean((-2, -1), keepdim=True)
+        averages = self._laid_out(light - mean, -mean)
+        labels = self._labels(len(light)).flatten()
+        octaves = []
+        for level in range(LEVELS + 1):
+            squares = averages.square()
+            if level < LEVELS:
+                coarser = avg_pool2d(averages, 2)
+                squares, averages = avg_pool2d(squares, 2) - coarser.square(), coarser
+            side = 2 ** min(level + 1, LEVELS)
+            octaves.append(self._largest(squares.clamp(min=0), side, labels))
+        return torch.stack(octaves, 1)
+
+    def _largest(self, squares: Tensor, side: int, labels: Tensor) -> Tensor:
+        """Return the largest share of each bin over all reaches, (C, b), of the power in cells of so many pixels."""
+        total = squares.sum((0, 2, 3)).double()[:, None]
+        count = len(self.psi)
+        largest = torch.zeros(squares.shape[1], count, dtype=torch.float64)
+        for reach in REACHES:
+            own, cell = squares, side
+            if reach > 1:
+                if side < _REACH_CELL:
+                    own, cell = avg_pool2d(own, _REACH_CELL // side), _REACH_CELL
+                own = avg_pool2d(own, reach, 1, reach // 2, count_include_pad=False)
+            spread = own.repeat_interleave(cell, -2).repeat_interleave(cell, -1).transpose(0, 1).flatten(1)
+            sums = spread.new_zeros(count + 1, len(spread)).index_add_(0, labels, spread.T).T[:, :count]
+            largest = torch.maximum(largest, sums.double() / side**2 / total)
+        return torch.where(total > 0, largest.clamp(max=1), self.share)
+
+    def products(self, light: Tensor) -> Tensor:
+        """Return the products of the light at two depths in each octave, as scatter adds it up.
+
+        Light at each depth alone, black elsewhere, has outlines that the image has not; where depths are alike, those
+        of one cancel those of the next. The sum over both depths is the power of the image.
+
+        Args:
+            light: (B, C, H, W).
+
+        Returns:
+            (C, levels + 1, b, b) float64, a mean over pixels; of the last octave less that of the means.
+        """
+        light = light.detach().float().cpu()
+        count, pixels = len(self.psi), light[:, 0].numel()
+        planes = self._laid_out(light, 0.0).transpose(0, 1)
+        labels = self._labels(len(light))[:, 0]
+        pixels = pixels if self._border == "zero" else labels.numel()
+        products = []
+        for plane in planes:
+            levels = [_products_at(plane, labels, level, count) for level in range(2)]
+            cells = _cell_sums(plane, labels, 2, count)
+            for level in range(2, LEVELS + 1):
+                levels.append((cells.flatten(0, 2).T @ cells.flatten(0, 2)).double() / 4**level)
+                if level < LEVELS:
+                    cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
+            sums = cells.sum((1, 2)).double()
+            levels.append(sums.T @ sums / (pixels / len(light)))
+            products.append(torch.stack([a - b for a, b in zip(levels, levels[1:], strict=False)]) / pixels)
+        return torch.stack(products)
+
+
+def _cells(side: int, border: str) -> Tensor:
+    """Return which row of the image each row of whole cells is, -1 for none."""
+    whole = 2**LEVELS * math.ceil((side + _OFFSET) / 2**LEVELS)
+    at = torch.arange(whole) - _OFFSET
+    if border == "zero":
+        return torch.where((at >= 0) & (at < side), at, -1)
+    if border == "circular":
+        return at % side
+    period = max(1, 2 * side - 2)
+    at = at % period
+    return torch.minimum(at, period - at)
+
+
+def _products_at(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
+    """Return the products of the sums over cells of a fine level, pair by pair."""
+    side = 2**level
+    light, own = (_in_cells(each, side) for each in (plane, labels))
+    pairs = own[:, :, None] * (count + 1) + own[:, None]
+    weights = light[:, :, None] * light[:, None]
+    sums = torch.bincount(pairs.flatten(), weights.flatten(), minlength=(count + 1) ** 2)
+    return sums.double().view(count + 1, count + 1)[:count, :count] / 4**level
+
+
+def _in_cells(plane: Tensor, side: int) -> Tensor:
+    return plane.unflatten(1, (-1, side)).unflatten(3, (-1, side)).transpose(2, 3).flatten(3).flatten(0, 2)
+
+
+def _cell_sums(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
+    """Return the sum of the light at each depth in each cell, (B, rows, columns, b)."""
+    batch, height, width = (len(plane), *(side >> level for side in plane.shape[-2:]))
+    rows, columns = torch.arange(height << level) >> level, torch.arange(width << level) >> level
+    cells = (torch.arange(batch)[:, None, None] * height + rows[:, None]) * width + columns
+    sums = torch.zeros(batch * height * width * (count + 1), dtype=plane.dtype)
+    sums.index_add_(0, (cells * (count + 1) + labels).flatten(), plane.flatten())
+    return sums.view(batch, height, width, count + 1)[..., :count]
