@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.depth_energy import Depths, octave_filters
+from kornia_tidy.depth_energy import Depths, brightest_around, octave_filters
 from kornia_tidy.optics.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
 from kornia_tidy.scene.convolution import next_fast_size, pad_border
 from kornia_tidy.scene.layers import assign_layers
@@ -187,10 +187,11 @@ class SceneLight:
     Args:
         power: of the light, (C, N, N // 2 + 1), see :func:`power_spectrum`.
         psi: (b,) defocus in the scene, ascending.
-        energies: (C, octaves, b) where depths add up by themselves; (C, octaves, b, b) where they add up to light.
+        energies: of one kind of light or of several, of which the one that makes most of a difference counts: each
+            (C, octaves, b) where depths add up by themselves, (C, octaves, b, b) where they add up to light.
     """
 
-    def __init__(self, power: Tensor, psi: Tensor, energies: Tensor) -> None:
+    def __init__(self, power: Tensor, psi: Tensor, *energies: Tensor) -> None:
         self.psi, self.energies = psi, energies
         self._power = power
         self._shapes: dict[int, Tensor] = {}
@@ -199,10 +200,19 @@ class SceneLight:
     def seen(cls, light: Tensor, depths: Depths, border: str, size: int, compositing: str) -> SceneLight:
         """Return that of an image, as it is composed."""
         power = power_spectrum(light, border, size)
-        octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
         if compositing == "gather":
-            return cls(power, depths.psi, octaves[..., None] * depths.shares(light))
-        return cls(power, depths.psi, depths.products(light))
+            octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
+            return cls(power, depths.psi, octaves[..., None] * depths.shares(light) / depths.seen)
+        lights = [light]
+        if compositing == "occlusion":  # what is dark hides what is bright
+            lights.append(brightest_around(light) - light)
+        energies = [depths.products(each) / depths.seen for each in lights]
+        if border == "zero":
+            for each, own in zip(lights, energies, strict=True):
+                means = depths.means(each)
+                missed = _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
+                own[:, -1] += missed * means[:, :, None] * means[:, None]
+        return cls(power, depths.psi, *energies)
 
     @classmethod
     def unseen(cls, depths: Depths, channels: int, size: int) -> SceneLight:
@@ -289,13 +299,14 @@ class LayerErrors:
 
     def __call__(self, ours: Tensor, theirs: Tensor) -> float:
         """Return the difference between captures of these coefficients, full scale 1."""
-        difference, energies = ours - theirs, self._light.energies
+        difference = ours - theirs
         responses = difference @ self._products  # (C, octaves, b, n)
-        if energies.ndim == 4:
-            squares = ((energies @ difference) * responses).sum((1, 2, 3))
-        else:
-            squares = (energies * (responses * difference).sum(-1)).sum((1, 2))
-        return math.sqrt(max(0.0, float(squares.mean())))
+        alone = (responses * difference).sum(-1)
+        squares = [
+            ((own @ difference) * responses).sum((1, 2, 3)) if own.ndim == 4 else (own * alone).sum((1, 2))
+            for own in self._light.energies
+        ]
+        return math.sqrt(max(0.0, *(float(each.mean()) for each in squares)))
 
 
 def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
@@ -325,12 +336,16 @@ def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> 
     power = _power(torch.fft.rfft2(changes, s=(shapes.shape[-2],) * 2))
     known = torch.einsum("dcyx,cjyx->cjd", power.double(), shapes).clamp(min=0)
     squares = torch.as_tensor(np.apply_along_axis(lambda own: np.interp(light.psi.numpy(), nodes, own), -1, known))
-    if light.energies.ndim == 3:
-        return math.sqrt(float((squares * light.energies).sum((1, 2)).mean()))
     sizes = squares.sqrt()
-    near = torch.exp(-0.5 * ((light.psi[:, None] - light.psi) / ALIKE).square())
-    sums = [((energies @ sizes[..., None])[..., 0] * sizes).sum(-1) for energies in (light.energies, light.energies * near)]
-    return math.sqrt(max(0.0, float(torch.maximum(*sums).sum(1).mean())))
+    alike = torch.exp(-0.5 * ((light.psi[:, None] - light.psi) / ALIKE).square())
+    errors = [0.0]
+    for own in light.energies:
+        if own.ndim == 3:
+            errors.append(float((squares * own).sum((1, 2)).mean()))
+            continue
+        sums = [((each @ sizes[..., None])[..., 0] * sizes).sum(-1) for each in (own, own * alike)]
+        errors.append(float(torch.maximum(*sums).sum(1).mean()))
+    return math.sqrt(max(errors))
 
 
 def _endless(block: Tensor, border: str, size: int) -> Tensor:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 LEVELS = 5  # octaves told apart: from 2 px to 32; slower ones stand together
 REACHES = (1, 3, 9)  # cells around, over which light is taken to spread: the largest sum counts
@@ -56,14 +56,16 @@ class Depths:
         lo: least defocus of the camera, and
         hi: largest: what lies beyond is clamped.
         border: what lies beyond the image, see :mod:`kornia_tidy.scene.convolution`.
+        margin: pixels at each side of the image that the capture does not show.
         bins: how many there may be.
 
     Attributes:
         psi: (b,) float64, the mean defocus of each bin that is not empty, ascending.
         share: (b,) the share of the pixels in it.
+        seen: the share of the image that the capture shows.
     """
 
-    def __init__(self, defocus: Tensor, lo: float, hi: float, border: str, bins: int = 256) -> None:
+    def __init__(self, defocus: Tensor, lo: float, hi: float, border: str, margin: int = 0, bins: int = 256) -> None:
         at = defocus.detach().double().cpu().clamp(lo, hi)
         low, high = float(at.min()), float(at.max())
         index = ((at - low) * (bins / max(high - low, 1e-9))).long().clamp(max=bins - 1)
@@ -72,7 +74,10 @@ class Depths:
         full = count > 0
         self.psi, self.share = sums[full] / count[full], count[full].double() / at.numel()
         self._index = (full.cumsum(0) - 1)[index]
-        self._border = border
+        self._border, self._margin = border, margin
+        height, width = defocus.shape[-2:]
+        self._shape = height, width
+        self.seen = (height - 2 * margin) * (width - 2 * margin) / (height * width)
         self._rows, self._columns = (_cells(side, border) for side in defocus.shape[-2:])
 
     def _laid_out(self, plane: Tensor, outside: float | Tensor) -> Tensor:
@@ -82,6 +87,13 @@ class Depths:
         if self._border != "zero":
             return laid
         return torch.where((rows[:, None] >= 0) & (columns >= 0), laid, outside)
+
+    def _in_view(self) -> Tensor:
+        """Return which pixels the capture shows, (H, W)."""
+        height, width = self._shape
+        rows, columns = torch.arange(height), torch.arange(width)
+        rows, columns = torch.minimum(rows, rows.flip(0)), torch.minimum(columns, columns.flip(0))
+        return (rows[:, None] >= self._margin) & (columns >= self._margin)
 
     def _labels(self, batch: int) -> Tensor:
         """Return the bin of each pixel as laid out, the number of bins where there is none, (B, 1, H', W')."""
@@ -104,7 +116,10 @@ class Depths:
         light = light.detach().cpu()
         mean = light.mean((-2, -1), keepdim=True)
         averages = self._laid_out(light - mean, -mean)
-        labels = self._labels(len(light)).flatten()
+        labels = self._labels(len(light))
+        if self._margin:
+            labels = torch.where(self._laid_out(self._in_view(), torch.tensor(False)), labels, len(self.psi))
+        labels = labels.flatten()
         octaves = []
         for level in range(LEVELS + 1):
             squares = averages.square()
@@ -131,6 +146,12 @@ class Depths:
             largest = torch.maximum(largest, sums.double() / side**2 / total)
         return torch.where(total > 0, largest.clamp(max=1), self.share)
 
+    def means(self, light: Tensor) -> Tensor:
+        """Return the mean over the image of the light at each depth, (C, b) float64."""
+        planes = light.detach().cpu().transpose(0, 1).flatten(1).double()
+        labels = self._index.expand(len(light), -1, -1, -1).flatten()
+        return planes.new_zeros(len(planes), len(self.psi)).index_add_(1, labels, planes) / planes.shape[1]
+
     def products(self, light: Tensor) -> Tensor:
         """Return the products of the light at two depths in each octave, as scatter adds it up.
 
@@ -144,10 +165,12 @@ class Depths:
             (C, levels + 1, b, b) float64, a mean over pixels; of the last octave less that of the means.
         """
         light = light.detach().float().cpu()
-        count, pixels = len(self.psi), light[:, 0].numel()
+        count = len(self.psi)
         planes = self._laid_out(light, 0.0).transpose(0, 1)
         labels = self._labels(len(light))[:, 0]
-        pixels = pixels if self._border == "zero" else labels.numel()
+        inside = (labels[:1, None] < count).float()
+        covered = avg_pool2d(inside, 2**LEVELS)[0]
+        pixels = len(light) * float(inside.sum())
         products = []
         for plane in planes:
             levels = [_products_at(plane, labels, level, count) for level in range(2)]
@@ -156,10 +179,26 @@ class Depths:
                 levels.append((cells.flatten(0, 2).T @ cells.flatten(0, 2)).double() / 4**level)
                 if level < LEVELS:
                     cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
-            sums = cells.sum((1, 2)).double()
-            levels.append(sums.T @ sums / (pixels / len(light)))
-            products.append(torch.stack([a - b for a, b in zip(levels, levels[1:], strict=False)]) / pixels)
+            slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2).double()
+            levels = [*(a - b for a, b in zip(levels, levels[1:], strict=False)), slow.T @ slow / 4**LEVELS]
+            products.append(torch.stack(levels) / pixels)
         return torch.stack(products)
+
+
+def brightest_around(light: Tensor) -> Tensor:
+    """Return the brightest light within some tens of pixels of each, averaged over two by two; (B, C, H, W).
+
+    Example:
+        >>> star = torch.zeros(1, 1, 64, 64)
+        >>> star[..., 20, 20] = 4
+        >>> brightest_around(star)[0, 0, 30, ::20].tolist()
+        [1.0, 1.0, 1.0, 0.0]
+    """
+    side = _REACH_CELL
+    height, width = light.shape[-2:]
+    cells = max_pool2d(avg_pool2d(light, 2, ceil_mode=True, count_include_pad=False), side // 2, ceil_mode=True)
+    cells = max_pool2d(cells, REACHES[-1], 1, REACHES[-1] // 2)
+    return cells.repeat_interleave(side, -2)[..., :height, :].repeat_interleave(side, -1)[..., :width]
 
 
 def _cells(side: int, border: str) -> Tensor:
