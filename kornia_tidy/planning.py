@@ -18,6 +18,7 @@ from dataclasses import replace
 from itertools import product, repeat
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,12 +49,15 @@ from kornia_tidy.render_cost import (
 )
 from kornia_tidy.render_plan import RenderPlan
 from kornia_tidy.scene.convolution import pad_border
+from kornia_tidy.scene.occlusion import EPSILON
 from kornia_tidy.scene.tiles import Labels
 
 SAFETY = 1.4  # on 35 photographs measured errors were up to 1.2 times what the formula says
 WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
-OCCLUSION = 1.2  # of what is predicted for scatter; on adversarial scenes measured up to 1.1
+POINT_SAFETY = 2.0  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
+OCCLUSION = 1.0  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
+OCCLUSION_WINDOW = 0.8  # of what is predicted for scatter of a window: what is beyond it is normalised away
 ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; measured up to 1.9e-3
 _ENOUGH = 0.05  # of the tolerance: more wavelengths than leave this gain nothing
 
@@ -112,7 +116,7 @@ class PlannedScene:
             self._light, self._level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
             self._contrast = float(light.double().std(correction=0))
             self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
-        self._layers = LayerErrors(*survey.layer_survey(), self._light)
+        self._layers = LayerErrors(*survey.layer_survey(window_side(self.reference)), self._light)
         self._rows = self._layer_rows(self.reference)
 
     def _seen_light(self, light: Tensor, size: int) -> SceneLight:
@@ -201,12 +205,13 @@ class PlannedScene:
         )
 
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
-        share = OCCLUSION if self._occlusion else 1.0
-        window_error = self._window_error(window_side(fidelity), fidelity.stray_light)
+        share, of_window = (OCCLUSION, OCCLUSION_WINDOW) if self._occlusion else (1.0, 1.0)
+        window_error = of_window * self._window_error(window_side(fidelity), fidelity.stray_light)
+        layer_error = SAFETY * share * self._layer_error(fidelity)
         return [
-            ("layers", SAFETY * share * self._layer_error(fidelity) + self._order_error(fidelity)),
-            ("window", WINDOW_SAFETY * share * window_error),
-            ("points a pixel", SAFETY * share * self._point_error(fidelity.pixel_tolerance)),
+            ("layers", layer_error + self._order_error(fidelity) + self._dark_error(fidelity)),
+            ("window", WINDOW_SAFETY * window_error),
+            ("points a pixel", POINT_SAFETY * share * self._point_error(fidelity.pixel_tolerance)),
             ("wavelengths", SAFETY * share * self._wavelength_error(fidelity.wavelengths)),
             ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self._level),
         ]
@@ -226,6 +231,18 @@ class PlannedScene:
             return 0.0  # nearest layers are much further off anyway
         own, theirs = self._rendered(fidelity), self._rendered(self.reference)
         return 0.0 if own == theirs else ORDER_ERROR * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
+
+    def _dark_error(self, fidelity: Fidelity) -> float:
+        """What it changes that white which is seen by little of a PSF does not stay white, where things hide others.
+
+        A layer seen by a share E of its PSF loses EPSILON / E of its light, and other layers are seen by other shares.
+        """
+        if not self._occlusion or fidelity.replace(name="") == self.reference.replace(name=""):
+            return 0.0
+        nodes, psfs = self._survey.window_survey(window_side(self.reference))
+        held = _cropped(psfs, window_side(fidelity)).sum((-2, -1)).amin(1)
+        lost = EPSILON / np.interp(self._depths.psi, nodes, held) - EPSILON
+        return 2 * self._level * float((self._depths.share.numpy() * lost**2).sum() ** 0.5)
 
     def _window_error(self, window: int, stray_light: str) -> float:
         key = (window, stray_light)
@@ -248,7 +265,7 @@ class PlannedScene:
         if tolerance <= REFERENCE.pixel_tolerance:
             return 0.0
         if tolerance not in self._known:
-            nodes, changes = self._survey.pixel_changes(tolerance)
+            nodes, changes = self._survey.pixel_changes(tolerance, window_side(self.reference))
             self._known[tolerance] = change_error(nodes, changes, self._light)
         return self._known[tolerance]
 
@@ -257,7 +274,7 @@ class PlannedScene:
             return 0.0
         key = ("wavelengths", count)
         if key not in self._known:
-            nodes, changes = self._survey.wavelength_changes(count)
+            nodes, changes = self._survey.wavelength_changes(count, window_side(self.reference))
             lights = (self._light, *self._colours)
             self._known[key] = sum(map(change_error, repeat(nodes), changes, lights))
         return self._known[key]
