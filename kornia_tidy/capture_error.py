@@ -14,7 +14,7 @@ looked at where it is: in PSFs a few radians apart, as its size hardly depends o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -28,8 +28,9 @@ from kornia_tidy.scene.layers import assign_layers
 CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
 GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
 _BLOCK = 1024  # px; larger images are looked at block by block
+_GRID = 33  # depths at which changes of PSFs are compared
 ALIKE = 2.0  # rad; how far apart in defocus changes of PSFs are still alike
-_NEGLIGIBLE = 1e-2  # of a spectrum's mean; frequencies with less power do not count
+_NEGLIGIBLE = 1e-3  # of an octave's power: the frequencies that have least of it do not count
 _USUAL = 0.1  # of the spectrum's shape is that of a photograph
 
 
@@ -192,9 +193,15 @@ class SceneLight:
     """
 
     def __init__(self, power: Tensor, psi: Tensor, *energies: Tensor) -> None:
-        self.psi, self.energies = psi, energies
+        self.psi, self.energies = psi, [each if each.ndim == 3 else each.float() for each in energies]
         self._power = power
         self._shapes: dict[int, Tensor] = {}
+        # What changes slowly with defocus need not be known at each of them.
+        self.grid = torch.linspace(float(psi[0]), float(psi[-1]), _GRID, dtype=torch.float64)
+        spread = interpolation(psi, self.grid.tolist()) if psi[-1] > psi[0] else torch.ones(1, _GRID).double() / _GRID
+        self._on_grid = [
+            each @ spread if each.ndim == 3 else spread.mT @ (each @ spread.float()).double() for each in self.energies
+        ]
 
     @classmethod
     def seen(cls, light: Tensor, depths: Depths, border: str, size: int, compositing: str) -> SceneLight:
@@ -220,6 +227,23 @@ class SceneLight:
         power = natural_power(channels, size)
         octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
         return cls(power, depths.psi, octaves[..., None] * depths.share)
+
+    def mean_square(self, squares: Tensor) -> Iterator[float]:
+        """Yield the mean square that a change of PSFs makes of each kind of light.
+
+        Changes at two depths are alike, or as unlike as those farther than ``ALIKE`` apart: whichever makes more.
+
+        Args:
+            squares: (C, octaves, grid) of what the change leaves of light of power one, at the depths of ``grid``.
+        """
+        sizes = squares.clamp(min=0).sqrt()
+        alike = torch.exp(-0.5 * ((self.grid[:, None] - self.grid) / ALIKE).square())
+        for own in self._on_grid:
+            if own.ndim == 3:
+                yield float((squares * own).sum((1, 2)).mean())
+            else:
+                sums = [((each @ sizes[..., None])[..., 0] * sizes).sum(-1) for each in (own, own * alike)]
+                yield float(torch.maximum(*sums).clamp(min=0).sum(1).mean())
 
     def shapes(self, window: int) -> Tensor:
         """Return the shapes of the spectrum, each with a sum of one, on a grid for PSFs of a window.
@@ -303,7 +327,7 @@ class LayerErrors:
         responses = difference @ self._products  # (C, octaves, b, n)
         alone = (responses * difference).sum(-1)
         squares = [
-            ((own @ difference) * responses).sum((1, 2, 3)) if own.ndim == 4 else (own * alone).sum((1, 2))
+            ((own @ difference.float()) * responses).sum((1, 2, 3)) if own.ndim == 4 else (own * alone).sum((1, 2))
             for own in self._light.energies
         ]
         return math.sqrt(max(0.0, *(float(each.mean()) for each in squares)))
@@ -318,7 +342,8 @@ def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
     spectra = torch.view_as_real(torch.fft.rfft2(psfs.double(), s=(size, size)).flatten(1))
     products = []
     for weight in shapes.flatten(1):
-        counts = weight > _NEGLIGIBLE / len(weight)
+        ordered = weight.sort(descending=True).values
+        counts = weight >= ordered[int((ordered.cumsum(0) < 1 - _NEGLIGIBLE).sum())]
         own = spectra[:, counts]
         products.append((own * weight[counts, None]).flatten(1) @ own.flatten(1).mT)
     return torch.stack(products)
@@ -334,18 +359,20 @@ def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> 
     """
     shapes = light.shapes(changes.shape[-1])
     power = _power(torch.fft.rfft2(changes, s=(shapes.shape[-2],) * 2))
-    known = torch.einsum("dcyx,cjyx->cjd", power.double(), shapes).clamp(min=0)
-    squares = torch.as_tensor(np.apply_along_axis(lambda own: np.interp(light.psi.numpy(), nodes, own), -1, known))
-    sizes = squares.sqrt()
-    alike = torch.exp(-0.5 * ((light.psi[:, None] - light.psi) / ALIKE).square())
-    errors = [0.0]
-    for own in light.energies:
-        if own.ndim == 3:
-            errors.append(float((squares * own).sum((1, 2)).mean()))
-            continue
-        sums = [((each @ sizes[..., None])[..., 0] * sizes).sum(-1) for each in (own, own * alike)]
-        errors.append(float(torch.maximum(*sums).sum(1).mean()))
-    return math.sqrt(max(errors))
+    known = (power.double().transpose(0, 1).flatten(2) @ shapes.flatten(2).mT).clamp(min=0)  # (C, nodes, octaves)
+    squares = interpolation(light.grid, nodes) @ known
+    return math.sqrt(max(light.mean_square(squares.mT)))
+
+
+def interpolation(at: Tensor, nodes: Sequence[float]) -> Tensor:
+    """Return the weights of linear interpolation between nodes, constant beyond them, (len(at), len(nodes)).
+
+    Example:
+        >>> interpolation(torch.tensor([0.5, 9.0]), (0.0, 2.0)).tolist()
+        [[0.75, 0.25], [0.0, 1.0]]
+    """
+    columns = [np.interp(at.numpy(), nodes, row) for row in np.eye(len(nodes))]
+    return torch.as_tensor(np.stack(columns, 1), dtype=torch.float64)
 
 
 def _endless(block: Tensor, border: str, size: int) -> Tensor:

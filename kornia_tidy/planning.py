@@ -18,7 +18,6 @@ from dataclasses import replace
 from itertools import product, repeat
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +28,7 @@ from kornia_tidy.capture_error import (
     LayerErrors,
     SceneLight,
     change_error,
+    interpolation,
     layer_coefficients,
     spectrum_size,
 )
@@ -107,7 +107,8 @@ class PlannedScene:
         size = spectrum_size(window_side(self.reference))
         colours = range(1, len(survey.spectrum.basis or (1,)))
         margin = window_side(self.reference) // 2 if survey.border == "valid" else 0
-        self._depths = Depths(defocus, *survey.defocus_range, survey.border, margin)
+        bins = 256 if survey.compositing == "gather" else 128
+        self._depths = Depths(defocus, *survey.defocus_range, survey.border, margin, bins)
         if light is None:  # whose colours, if they matter, may differ as much as its pixels
             self._light, self._level = SceneLight.unseen(self._depths, survey.channels, size), 0.5
             self._contrast = CONTRAST
@@ -237,12 +238,18 @@ class PlannedScene:
 
         A layer seen by a share E of its PSF loses EPSILON / E of its light, and other layers are seen by other shares.
         """
-        if not self._occlusion or fidelity.replace(name="") == self.reference.replace(name=""):
+        if not self._occlusion or self._is_reference(fidelity):
             return 0.0
-        nodes, psfs = self._survey.window_survey(window_side(self.reference))
-        held = _cropped(psfs, window_side(fidelity)).sum((-2, -1)).amin(1)
-        lost = EPSILON / np.interp(self._depths.psi, nodes, held) - EPSILON
-        return 2 * self._level * float((self._depths.share.numpy() * lost**2).sum() ** 0.5)
+        key = ("dark", fidelity.window)
+        if key not in self._known:
+            nodes, psfs = self._survey.window_survey(window_side(self.reference))
+            held = _cropped(psfs, window_side(fidelity)).sum((-2, -1)).amin(1).double()
+            lost = EPSILON / (interpolation(self._depths.psi, nodes) @ held) - EPSILON
+            self._known[key] = 2 * self._level * float((self._depths.share @ lost.square()).sqrt())
+        return self._known[key]
+
+    def _is_reference(self, fidelity: Fidelity) -> bool:
+        return replace(fidelity, name=self.reference.name) == self.reference
 
     def _window_error(self, window: int, stray_light: str) -> float:
         key = (window, stray_light)
