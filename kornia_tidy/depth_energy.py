@@ -132,7 +132,8 @@ class Depths:
 
     def _largest(self, squares: Tensor, side: int, labels: Tensor) -> Tensor:
         """Return the largest share of each bin over all reaches, (C, b), of the power in cells of so many pixels."""
-        total = squares.sum((0, 2, 3)).double()[:, None]
+        inside = avg_pool2d(self._laid_out(torch.ones(1, 1, *self._shape), 0.0), side)
+        total = (squares * inside).sum((0, 2, 3)).double()[:, None]
         count = len(self.psi)
         largest = torch.zeros(squares.shape[1], count, dtype=torch.float64)
         for reach in REACHES:
@@ -186,18 +187,17 @@ class Depths:
 
 
 def brightest_around(light: Tensor) -> Tensor:
-    """Return the brightest light within some tens of pixels of each, averaged over two by two; (B, C, H, W).
+    """Return the brightest light about each pixel, averaged over cells of eight pixels a side; (B, C, H, W).
 
     Example:
         >>> star = torch.zeros(1, 1, 64, 64)
-        >>> star[..., 20, 20] = 4
-        >>> brightest_around(star)[0, 0, 30, ::20].tolist()
-        [1.0, 1.0, 1.0, 0.0]
+        >>> star[..., 20, 20] = 64
+        >>> brightest_around(star)[0, 0, 30, ::15].tolist()
+        [0.0, 1.0, 1.0, 0.0, 0.0]
     """
     side = _REACH_CELL
     height, width = light.shape[-2:]
-    cells = max_pool2d(avg_pool2d(light, 2, ceil_mode=True, count_include_pad=False), side // 2, ceil_mode=True)
-    cells = max_pool2d(cells, REACHES[-1], 1, REACHES[-1] // 2)
+    cells = max_pool2d(avg_pool2d(light, side, ceil_mode=True, count_include_pad=False), 3, 1, 1)
     return cells.repeat_interleave(side, -2)[..., :height, :].repeat_interleave(side, -1)[..., :width]
 
 

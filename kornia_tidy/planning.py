@@ -56,8 +56,8 @@ SAFETY = 1.4  # on 35 photographs measured errors were up to 1.2 times what the 
 WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
 POINT_SAFETY = 2.0  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
-OCCLUSION = 1.0  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
-OCCLUSION_WINDOW = 0.8  # of what is predicted for scatter of a window: what is beyond it is normalised away
+OCCLUSION = 1.3  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
+OCCLUSION_WINDOW = 1.3  # of a window likewise
 ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; measured up to 1.9e-3
 _ENOUGH = 0.05  # of the tolerance: more wavelengths than leave this gain nothing
 
@@ -207,7 +207,9 @@ class PlannedScene:
 
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
         share, of_window = (OCCLUSION, OCCLUSION_WINDOW) if self._occlusion else (1.0, 1.0)
-        window_error = of_window * self._window_error(window_side(fidelity), fidelity.stray_light)
+        narrower = window_side(fidelity) < window_side(self.reference)
+        ways = (fidelity.stray_light, *(["outlines"] if self._occlusion and narrower else []))
+        window_error = of_window * max(self._window_error(window_side(fidelity), way) for way in ways)
         layer_error = SAFETY * share * self._layer_error(fidelity)
         return [
             ("layers", layer_error + self._order_error(fidelity) + self._dark_error(fidelity)),
@@ -260,8 +262,10 @@ class PlannedScene:
                 max(0, bisect_right(nodes, float(self._depths.psi[0])) - 1), bisect_left(nodes, float(self._depths.psi[-1])) + 1
             )
             nodes, psfs = nodes[around], psfs[around]
+            if stray_light == "outlines":  # of what hides, which no light goes around: of either window they are whole
+                psfs = psfs / psfs.sum((-2, -1), keepdim=True)
             kept = _cropped(psfs, window)
-            if stray_light == "renormalize":
+            if stray_light != "veil":
                 kept = kept / kept.sum((-2, -1), keepdim=True)
             changes = -psfs
             _cropped(changes, window).add_(kept)
