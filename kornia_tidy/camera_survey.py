@@ -18,7 +18,7 @@ from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
-from kornia_tidy.render_cost import BankGeometry, window_side
+from kornia_tidy.render_cost import BankGeometry
 from kornia_tidy.scene.convolution import largest_window
 
 _TOLERANCE = 0.3  # of pixels: differences of PSFs need not be known better than to some per cent

@@ -13,7 +13,7 @@ stay in place, the power of each octave is given to the depths where it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -45,7 +45,7 @@ def octave_filters(size: int, levels: int = LEVELS) -> Tensor:
     for level in range(levels):
         pair = [torch.cos(math.pi * 2**level * f).square() for f in (down, across)]
         boxes.append(boxes[-1] * pair[0][:, None] * pair[1])
-    return torch.stack([*(a - b for a, b in zip(boxes, boxes[1:], strict=False)), boxes[-1]])
+    return torch.stack([*(a - b for a, b in pairwise(boxes)), boxes[-1]])
 
 
 class Depths:
@@ -88,12 +88,13 @@ class Depths:
             return laid
         return torch.where((rows[:, None] >= 0) & (columns >= 0), laid, outside)
 
-    def _in_view(self) -> Tensor:
-        """Return which pixels the capture shows, (H, W)."""
+    def _once(self, margin: int) -> Tensor:
+        """Return 1 where each pixel of the image lies as laid out but for a margin, 0 elsewhere, (1, 1, H', W')."""
+        inside = torch.zeros(1, 1, len(self._rows), len(self._columns))
         height, width = self._shape
-        rows, columns = torch.arange(height), torch.arange(width)
-        rows, columns = torch.minimum(rows, rows.flip(0)), torch.minimum(columns, columns.flip(0))
-        return (rows[:, None] >= self._margin) & (columns >= self._margin)
+        top, left = _OFFSET + margin, _OFFSET + margin
+        inside[..., top : _OFFSET + height - margin, left : _OFFSET + width - margin] = 1
+        return inside
 
     def _labels(self, batch: int) -> Tensor:
         """Return the bin of each pixel as laid out, the number of bins where there is none, (B, 1, H', W')."""
@@ -117,8 +118,7 @@ class Depths:
         mean = light.mean((-2, -1), keepdim=True)
         averages = self._laid_out(light - mean, -mean)
         labels = self._labels(len(light))
-        if self._margin:
-            labels = torch.where(self._laid_out(self._in_view(), torch.tensor(False)), labels, len(self.psi))
+        labels = torch.where(self._once(self._margin) > 0, labels, len(self.psi))
         labels = labels.flatten()
         octaves = []
         for level in range(LEVELS + 1):
@@ -132,7 +132,7 @@ class Depths:
 
     def _largest(self, squares: Tensor, side: int, labels: Tensor) -> Tensor:
         """Return the largest share of each bin over all reaches, (C, b), of the power in cells of so many pixels."""
-        inside = avg_pool2d(self._laid_out(torch.ones(1, 1, *self._shape), 0.0), side)
+        inside = avg_pool2d(self._once(0), side)
         total = (squares * inside).sum((0, 2, 3)).double()[:, None]
         count = len(self.psi)
         largest = torch.zeros(squares.shape[1], count, dtype=torch.float64)
@@ -181,7 +181,7 @@ class Depths:
                 if level < LEVELS:
                     cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
             slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2).double()
-            levels = [*(a - b for a, b in zip(levels, levels[1:], strict=False)), slow.T @ slow / 4**LEVELS]
+            levels = [*(a - b for a, b in pairwise(levels)), slow.T @ slow / 4**LEVELS]
             products.append(torch.stack(levels) / pixels)
         return torch.stack(products)
 

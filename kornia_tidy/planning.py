@@ -23,15 +23,7 @@ from torch import Tensor
 
 from kornia_tidy.camera_survey import CameraSurvey, PlannableCamera
 from kornia_tidy.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_ladder
-from kornia_tidy.capture_error import (
-    CONTRAST,
-    LayerErrors,
-    SceneLight,
-    change_error,
-    interpolation,
-    layer_coefficients,
-    spectrum_size,
-)
+from kornia_tidy.capture_error import LayerErrors, change_error, layer_coefficients
 from kornia_tidy.checks import check_positive
 from kornia_tidy.depth_energy import Depths
 from kornia_tidy.fidelity import Fidelity
@@ -51,6 +43,7 @@ from kornia_tidy.render_plan import RenderPlan
 from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.occlusion import EPSILON
 from kornia_tidy.scene.tiles import Labels
+from kornia_tidy.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 
 SAFETY = 1.4  # on 35 photographs measured errors were up to 1.2 times what the formula says
 WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
@@ -259,7 +252,8 @@ class PlannedScene:
         if key not in self._known:
             nodes, psfs = self._survey.window_survey(full)
             around = slice(
-                max(0, bisect_right(nodes, float(self._depths.psi[0])) - 1), bisect_left(nodes, float(self._depths.psi[-1])) + 1
+                max(0, bisect_right(nodes, float(self._depths.psi[0])) - 1),
+                bisect_left(nodes, float(self._depths.psi[-1])) + 1,
             )
             nodes, psfs = nodes[around], psfs[around]
             if stray_light == "outlines":  # of what hides, which no light goes around: of either window they are whole

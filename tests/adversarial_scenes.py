@@ -13,13 +13,15 @@ import warnings
 from collections import defaultdict
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from pathlib import Path
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
-from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics
+from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics, camera_survey
 from kornia_tidy.candidates import REFERENCE
 from kornia_tidy.optics import CubicMask
 from tests.planning_rig import MASKS, Rig, smooth
@@ -103,15 +105,13 @@ class Outcome:
 
 @lru_cache(maxsize=64)
 def _rig(compositing: str, border: str, mask: str) -> Rig:
-    optics = TiDyOptics(
-        MASK_KINDS[mask](), DefocusRange(-20, 20), sensor=None, compositing=compositing, border=border
-    )
+    optics = TiDyOptics(MASK_KINDS[mask](), DefocusRange(-20, 20), sensor=None, compositing=compositing, border=border)
     return Rig(optics)
 
 
 def judge(case: Case) -> Outcome:
     """Plan a case's scene and capture it both ways."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), patch.object(camera_survey, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
         warnings.simplefilter("ignore")  # that windows this narrow do not hold the light they should
         rig, (light, defocus) = _rig(case.compositing, case.border, case.mask), case.scene()
         plan = rig.planner.scene(defocus, light).plan(case.tolerance)
@@ -148,7 +148,7 @@ def _window(size: tuple[int, int], generator: torch.Generator, least: int = 3, m
     return slices[0], slices[1]
 
 
-def patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def textured_patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """A patch of black and white pixels on black at another depth, or its negative."""
     (own, other), where = _depths(generator), _window(size, generator)
     light, defocus = torch.zeros(1, 3, *size), _plane(size, other)
@@ -157,7 +157,7 @@ def patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Te
     return (1 - light if _uniform(0, 1, generator) < 0.25 else light), defocus
 
 
-def flat_patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def plain_patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """A plain patch before or behind texture, faint or bright."""
     (own, other), where = _depths(generator), _window(size, generator)
     light, defocus = torch.rand(1, 3, *size, generator=generator), _plane(size, other)
@@ -196,7 +196,9 @@ def checkerboard(size: tuple[int, int], generator: torch.Generator) -> tuple[Ten
     side = int(torch.randint(1, 17, (), generator=generator))
     rows, columns = (torch.arange(length) // side for length in size)
     odd = ((rows[:, None] + columns) % 2).bool().expand(1, 1, *size)
-    texture = torch.rand(1, 3, *size, generator=generator) if _uniform(0, 1, generator) < 0.7 else torch.ones(1, 3, *size)
+    texture = (
+        torch.rand(1, 3, *size, generator=generator) if _uniform(0, 1, generator) < 0.7 else torch.ones(1, 3, *size)
+    )
     return torch.where(odd, texture, 0.0 if _uniform(0, 1, generator) < 0.6 else 0.5), torch.where(odd, own, other)
 
 
@@ -259,7 +261,7 @@ def odd_pixel(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor
 
 def one_depth(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """All at one depth: a patch of texture in the dark."""
-    light, defocus = patch(size, generator)
+    light, defocus = textured_patch(size, generator)
     return light, torch.full_like(defocus, float(defocus.flatten()[0]))
 
 
@@ -277,9 +279,9 @@ def noisy_patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tens
 
 def texture_in_step(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Light and depth are the same noise: what is bright is near."""
-    noise = smooth((1, 1, *size), _uniform(0.3, 4, generator), generator)
+    shared = smooth((1, 1, *size), _uniform(0.3, 4, generator), generator).sigmoid()
     lo, hi = sorted(_depths(generator))
-    return noise.sigmoid().repeat(1, 3, 1, 1), lo + (hi - lo) * noise.sigmoid()
+    return shared.repeat(1, 3, 1, 1), lo + (hi - lo) * shared
 
 
 def tiny(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -292,8 +294,8 @@ def tiny(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Ten
 
 
 SCENES = {
-    "patch": patch,
-    "plain patch": flat_patch,
+    "patch": textured_patch,
+    "plain patch": plain_patch,
     "lights": lights,
     "half black": half_black,
     "checkerboard": checkerboard,
@@ -318,18 +320,21 @@ def report(outcomes: list[Outcome]) -> str:
     for outcome in outcomes:
         rows[outcome.case.compositing, "all"].append(outcome)
         rows[outcome.case.compositing, outcome.case.kind].append(outcome)
-    lines = ["compositing  kind             scenes  reference  beyond  worst measured/tolerance, /predicted  predicted/measured"]
+    table = [
+        "compositing  kind             scenes  reference  beyond  worst measured/tolerance, /predicted  "
+        "median predicted/measured"
+    ]
     for (compositing, kind), own in sorted(rows.items()):
         measured = [each for each in own if each.measured > 0]
         worst = max((each.measured / each.case.tolerance for each in own), default=0.0)
         honest = max((each.measured / each.predicted for each in measured), default=0.0)
         ratio = median(each.predicted / each.measured for each in measured) if measured else float("nan")
         beyond = sum(each.measured > each.case.tolerance for each in own)
-        lines.append(
+        table.append(
             f"{compositing:12} {kind:16} {len(own):6} {sum(each.reference for each in own):10} {beyond:7} "
             f"{worst:24.3f} {honest:12.3f} {ratio:19.2f}"
         )
-    return "\n".join(lines)
+    return "\n".join(table)
 
 
 def main() -> None:
@@ -339,21 +344,13 @@ def main() -> None:
     parser.add_argument("beyond", type=int)
     parser.add_argument("--record", help="file that a line of JSON is added to for each scene")
     options = parser.parse_args()
-    narrow()
     outcomes = []
     for seed in range(options.first, options.beyond):
         outcomes.append(judge(Case.of_seed(seed)))
         if options.record:
-            with open(options.record, "a") as file:
+            with Path(options.record).open("a") as file:
                 file.write(json.dumps(asdict(outcomes[-1])) + "\n")
     print(report(outcomes))
-
-
-def narrow() -> None:
-    """Make the reference's window ``NARROW`` at most."""
-    from kornia_tidy import camera_survey
-
-    camera_survey.REFERENCE = REFERENCE.replace(name="reference", max_window=NARROW)
 
 
 if __name__ == "__main__":
