@@ -22,6 +22,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 LEVELS = 5  # octaves told apart: from 2 px to 32; slower ones stand together
 REACHES = (1, 3, 9)  # cells around, over which light is taken to spread: the largest sum counts
 _REACH_CELL = 8  # px; of octaves finer than this
+_STRIP = 1 << 18  # px; larger images are taken some rows at a time
 _OFFSET = 21  # px; of cells of any size, so that what begins at round pixels is cut by those of every level
 
 
@@ -171,18 +172,19 @@ class Depths:
         labels = self._labels(len(light))[:, 0]
         inside = (labels[:1, None] < count).float()
         covered = avg_pool2d(inside, 2**LEVELS)[0]
-        pixels = len(light) * float(inside.sum())
+        drawn_out = self._border == "replicate"  # what is drawn out into streaks comes on top of the image
+        pixels = len(light) * (self._shape[0] * self._shape[1] if drawn_out else float(inside.sum()))
+        rows = 2**LEVELS * max(1, _STRIP // (2**LEVELS * labels.shape[0] * labels.shape[-1]))
         products = []
         for plane in planes:
-            levels = [_products_at(plane, labels, level, count) for level in range(2)]
-            cells = _cell_sums(plane, labels, 2, count)
-            for level in range(2, LEVELS + 1):
-                levels.append((cells.flatten(0, 2).T @ cells.flatten(0, 2)).double() / 4**level)
-                if level < LEVELS:
-                    cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
+            strips = [
+                _products_of_cells(*strip, count)
+                for strip in zip(plane.split(rows, 1), labels.split(rows, 1), strict=True)
+            ]
+            levels, cells = sum(levels for levels, _ in strips), torch.cat([cells for _, cells in strips], 1)
             slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2).double()
-            levels = [*(a - b for a, b in pairwise(levels)), slow.T @ slow / 4**LEVELS]
-            products.append(torch.stack(levels) / pixels)
+            levels = torch.cat([-levels.diff(dim=0), (slow.T @ slow)[None] / 4**LEVELS])
+            products.append(levels / pixels)
         return torch.stack(products)
 
 
@@ -209,9 +211,22 @@ def _cells(side: int, border: str) -> Tensor:
         return torch.where((at >= 0) & (at < side), at, -1)
     if border == "circular":
         return at % side
+    if border == "replicate":
+        return at.clamp(0, side - 1)
     period = max(1, 2 * side - 2)
     at = at % period
     return torch.minimum(at, period - at)
+
+
+def _products_of_cells(plane: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the products of the sums over cells of each level, (levels + 1, b, b), and the sums over the largest."""
+    levels = [_products_at(plane, labels, level, count) for level in range(2)]
+    cells = _cell_sums(plane, labels, 2, count)
+    for level in range(2, LEVELS + 1):
+        levels.append((cells.flatten(0, 2).T @ cells.flatten(0, 2)).double() / 4**level)
+        if level < LEVELS:
+            cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
+    return torch.stack(levels), cells
 
 
 def _products_at(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:

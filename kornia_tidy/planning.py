@@ -1,13 +1,19 @@
 """Planning: the cheapest fidelity that captures a scene within an error, found without capturing it.
 
 The error meant is the root mean square difference of the noise-free capture, in linear light and full scale 1, from
-the one that the preset ``reference`` would give. It is predicted from the scene's defocus and power spectrum, see
-:mod:`kornia_tidy.capture_error`; the cost by formula, see :mod:`kornia_tidy.render_cost`. The candidates are all
-combinations of layers, spacing, window, points a pixel and precision below, with the light outside the window spread
-over the image or given back to the window, whichever is nearer to the truth.
+the one that the preset ``reference`` would give. Light beyond full scale counts as it is: a highlight of 1000 makes
+errors a thousand times those of white. The error is predicted from where in depth each octave of the scene's light
+lies, see :mod:`kornia_tidy.capture_error`; the cost by formula, see :mod:`kornia_tidy.render_cost`. The candidates are
+all combinations of layers, spacing, window, points a pixel and precision below, with the light outside the window
+spread over the image or given back to the window, whichever is nearer to the truth.
 
-Occlusion is no sum over layers, but it makes of a change of PSFs less than scatter does, so that stands for it. To this
-comes what scatter does not know: where one thing hides another, it matters where the layers lie.
+The prediction adds up what each economy makes by itself, times a safety factor: an estimate from above, which holds on
+the scenes of ``tests/adversarial_scenes.py``. It is no proof: the light of one octave is taken to lie at random.
+
+Occlusion is no sum over layers, but what changes of PSFs make of it is near what they make of scatter, of two kinds of
+light: the light itself, and what it lacks to the brightest around, as what is dark hides what is bright. To this comes
+what scatter does not know: where one thing hides another, it matters where the layers lie; outlines are as sharp as a
+PSF that is whole in its window; and what is seen by little of a PSF is a little too dark.
 """
 
 from __future__ import annotations
@@ -45,7 +51,7 @@ from kornia_tidy.scene.occlusion import EPSILON
 from kornia_tidy.scene.tiles import Labels
 from kornia_tidy.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 
-SAFETY = 1.4  # on 35 photographs measured errors were up to 1.2 times what the formula says
+SAFETY = 1.4  # on photographs and adversarial scenes measured errors were up to 1.2 times what the formula says
 WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
 POINT_SAFETY = 2.0  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus

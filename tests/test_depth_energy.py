@@ -49,6 +49,12 @@ class TestDepths(BaseTester):
         self.assert_close(products.sum((-2, -1)), whole[..., 0, 0], atol=1e-4, rtol=1e-4)
         assert float(torch.linalg.eigvalsh(products.sum(1)).min()) > -1e-5
 
+    def test_feature_large_images_are_taken_in_strips(self, monkeypatch):
+        light, defocus = torch.rand(2, 1, 90, 70), torch.rand(2, 1, 90, 70)
+        whole = Depths(defocus, -20, 20, "reflect").products(light)
+        monkeypatch.setattr("kornia_tidy.depth_energy._STRIP", 64)
+        self.assert_close(Depths(defocus, -20, 20, "reflect").products(light), whole, atol=1e-9, rtol=1e-5)
+
     def test_feature_shares_lie_where_the_light_is(self):
         """A texture at one depth in the dark of another: what is in reach counts for both, nothing for the third."""
         light, defocus = torch.zeros(1, 1, 256, 256), torch.zeros(1, 1, 256, 256)
