@@ -13,6 +13,7 @@ stay in place, the power of each octave is given to the depths where it is.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -121,6 +122,7 @@ class Depths:
         labels = self._labels(len(light))
         labels = torch.where(self._once(self._margin) > 0, labels, len(self.psi))
         labels = labels.flatten()
+        alone = self._largest(averages.square(), 1, labels, (1,))  # a single light stands in all octaves at once
         octaves = []
         for level in range(LEVELS + 1):
             squares = averages.square()
@@ -128,16 +130,16 @@ class Depths:
                 coarser = avg_pool2d(averages, 2)
                 squares, averages = avg_pool2d(squares, 2) - coarser.square(), coarser
             side = 2 ** min(level + 1, LEVELS)
-            octaves.append(self._largest(squares.clamp(min=0), side, labels))
+            octaves.append(torch.maximum(alone, self._largest(squares.clamp(min=0), side, labels)))
         return torch.stack(octaves, 1)
 
-    def _largest(self, squares: Tensor, side: int, labels: Tensor) -> Tensor:
+    def _largest(self, squares: Tensor, side: int, labels: Tensor, reaches: Sequence[int] = REACHES) -> Tensor:
         """Return the largest share of each bin over all reaches, (C, b), of the power in cells of so many pixels."""
         inside = avg_pool2d(self._once(0), side)
         total = (squares * inside).sum((0, 2, 3)).double()[:, None]
         count = len(self.psi)
         largest = torch.zeros(squares.shape[1], count, dtype=torch.float64)
-        for reach in REACHES:
+        for reach in reaches:
             own, cell = squares, side
             if reach > 1:
                 if side < _REACH_CELL:

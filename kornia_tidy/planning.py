@@ -54,7 +54,7 @@ from kornia_tidy.scene_light import CONTRAST, SceneLight, interpolation, spectru
 SAFETY = 1.4  # on photographs and adversarial scenes measured errors were up to 1.2 times what the formula says
 WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
-POINT_SAFETY = 2.0  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
+POINT_SAFETY = 1.6  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
 OCCLUSION = 1.3  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
 OCCLUSION_WINDOW = 1.3  # of a window likewise
 ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; measured up to 1.9e-3
