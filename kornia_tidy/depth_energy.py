@@ -24,7 +24,7 @@ LEVELS = 5  # octaves told apart: from 2 px to 32; slower ones stand together
 REACHES = (1, 3, 9)  # cells around, over which light is taken to spread: the largest sum counts
 _REACH_CELL = 8  # px; of octaves finer than this
 _STRIP = 1 << 18  # px; larger images are taken some rows at a time
-_OFFSET = 21  # px; of cells of any size, so that what begins at round pixels is cut by those of every level
+_OFFSET = 21  # px from a corner of a cell to the image's: edges at round pixels then lie inside cells of every level
 
 
 def octave_filters(size: int, levels: int = LEVELS) -> Tensor:
@@ -174,7 +174,7 @@ class Depths:
         labels = self._labels(len(light))[:, 0]
         inside = (labels[:1, None] < count).float()
         covered = avg_pool2d(inside, 2**LEVELS)[0]
-        drawn_out = self._border == "replicate"  # what is drawn out into streaks comes on top of the image
+        drawn_out = self._border == "replicate"  # streaks from the border add to the light of the image
         pixels = len(light) * (self._shape[0] * self._shape[1] if drawn_out else float(inside.sum()))
         rows = 2**LEVELS * max(1, _STRIP // (2**LEVELS * labels.shape[0] * labels.shape[-1]))
         products = []
@@ -183,7 +183,8 @@ class Depths:
                 _products_of_cells(*strip, count)
                 for strip in zip(plane.split(rows, 1), labels.split(rows, 1), strict=True)
             ]
-            levels, cells = sum(levels for levels, _ in strips), torch.cat([cells for _, cells in strips], 1)
+            levels = torch.stack([levels for levels, _ in strips]).sum(0)
+            cells = torch.cat([cells for _, cells in strips], 1)
             slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2).double()
             levels = torch.cat([-levels.diff(dim=0), (slow.T @ slow)[None] / 4**LEVELS])
             products.append(levels / pixels)

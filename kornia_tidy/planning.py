@@ -235,7 +235,7 @@ class PlannedScene:
         return 0.0 if own == theirs else ORDER_ERROR * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
 
     def _dark_error(self, fidelity: Fidelity) -> float:
-        """What it changes that white which is seen by little of a PSF does not stay white, where things hide others.
+        """Return the error of white that does not stay white, where things hide others.
 
         A layer seen by a share E of its PSF loses EPSILON / E of its light, and other layers are seen by other shares.
         """
@@ -262,7 +262,7 @@ class PlannedScene:
                 bisect_left(nodes, float(self._depths.psi[-1])) + 1,
             )
             nodes, psfs = nodes[around], psfs[around]
-            if stray_light == "outlines":  # of what hides, which no light goes around: of either window they are whole
+            if stray_light == "outlines":  # their PSFs are normalised in either window, veil or not
                 psfs = psfs / psfs.sum((-2, -1), keepdim=True)
             kept = _cropped(psfs, window)
             if stray_light != "veil":

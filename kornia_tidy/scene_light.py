@@ -162,7 +162,7 @@ class SceneLight:
         return cls(power, depths.psi, octaves[..., None] * depths.share)
 
     def mean_square(self, squares: Tensor) -> Iterator[float]:
-        """Yield the mean square that a change of PSFs makes of each kind of light.
+        """Yield the mean square error that a change of PSFs makes, for each kind of light.
 
         Changes at two depths are alike, or as unlike as those farther than ``ALIKE`` apart: whichever makes more.
 
