@@ -26,6 +26,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from kornia_tidy.camera_survey import CameraSurvey, PlannableCamera
 from kornia_tidy.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_ladder
@@ -57,7 +58,9 @@ FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by
 POINT_SAFETY = 1.6  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
 OCCLUSION = 1.3  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
 OCCLUSION_WINDOW = 1.3  # of a window likewise
-ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; measured up to 1.9e-3
+ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; on photographs up to 1.9e-3
+OUTLINE_ERROR = 2e-2  # the same for the square root of the share of pixels on outlines; on checkerboards up to 1.9e-2
+_OUTLINE = 1.0  # rad between neighbours: an outline, not a slope
 _ENOUGH = 0.05  # of the tolerance: more wavelengths than leave this gain nothing
 
 
@@ -232,7 +235,13 @@ class PlannedScene:
         if not self._occlusion or fidelity.layers == "nearest":
             return 0.0  # nearest layers are much further off anyway
         own, theirs = self._rendered(fidelity), self._rendered(self.reference)
-        return 0.0 if own == theirs else ORDER_ERROR * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
+        if own == theirs:
+            return 0.0
+        if "outlines" not in self._known:
+            nearest, farthest = (max_pool2d(sign * self._defocus, 3, 1, 1) for sign in (1, -1))
+            self._known["outlines"] = float((nearest + farthest > _OUTLINE).double().mean())
+        each = max(ORDER_ERROR, OUTLINE_ERROR * self._known["outlines"] ** 0.5)
+        return each * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
 
     def _dark_error(self, fidelity: Fidelity) -> float:
         """Return the error of white that does not stay white, where things hide others.
