@@ -18,7 +18,7 @@ from kornia_tidy.optics.fewer_wavelengths import fewer_wavelengths
 from kornia_tidy.optics.psf_bank import PSFBank
 from kornia_tidy.optics.pupil import Pupil
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
-from kornia_tidy.render_cost import BankGeometry, window_side
+from kornia_tidy.render_cost import BankGeometry
 from kornia_tidy.scene.convolution import largest_window
 
 _TOLERANCE = 0.3  # of pixels: differences of PSFs need not be known better than to some per cent
@@ -88,10 +88,10 @@ class CameraSurvey:
         self._optics = optics
         self._nodes: dict[tuple[str, float], tuple[float, ...]] = {}
         self._references: dict[int, Fidelity] = {}
-        self._layers: tuple[Tensor, Tensor] | None = None
+        self._layers: dict[int, tuple[Tensor, Tensor]] = {}
         self._wide: dict[int, Tensor] = {}
-        self._pixels: dict[float, Tensor] = {}
-        self._colours: dict[int | None, Tensor] = {}
+        self._pixels: dict[tuple[float, int], Tensor] = {}
+        self._colours: dict[tuple[int | None, int], Tensor] = {}
 
     def geometry(self, fidelity: Fidelity) -> BankGeometry:
         """Return what the cost of the PSFs depends on."""
@@ -126,19 +126,19 @@ class CameraSurvey:
             self._references[limit] = replace(REFERENCE, window=window)
         return self._references[limit]
 
-    def layer_survey(self) -> tuple[Tensor, Tensor]:
-        """Return the Chebyshev nodes that carry the PSFs of every defocus, and those PSFs."""
-        if self._layers is None:
+    def layer_survey(self, window: int) -> tuple[Tensor, Tensor]:
+        """Return the Chebyshev nodes that carry the PSFs of every defocus, and those PSFs, in no wider a window."""
+        window = min(window, _LAYERS_WINDOW)
+        if window not in self._layers:
             spans = [
                 guarded(self.nodes(each), TAPS[each.layers] // 2) if each.layers in TAPS else self.nodes(each)
                 for each in (REFERENCE, *layer_kinds())
             ]
             lo, hi = min(nodes[0] for nodes in spans), max(nodes[-1] for nodes in spans)
             nodes = chebyshev_nodes(lo, hi, nodes_needed((hi - lo) / 2, self._geometry.bandwidth))
-            window = self._smallest(_LAYERS_WINDOW)
             psfs = self._bank(tuple(nodes.tolist()), window, _TOLERANCE, torch.float32).psfs.cpu()
-            self._layers = nodes, psfs
-        return self._layers
+            self._layers[window] = nodes, psfs
+        return self._layers[window]
 
     def window_survey(self, window: int) -> tuple[tuple[float, ...], Tensor]:
         """Return some defocus over the range, and the PSFs there."""
@@ -147,18 +147,19 @@ class CameraSurvey:
             self._wide[window] = self._bank(nodes, window, _TOLERANCE, torch.float32).psfs.cpu()
         return nodes, self._wide[window]
 
-    def pixel_changes(self, tolerance: float) -> tuple[tuple[float, ...], Tensor]:
+    def pixel_changes(self, tolerance: float, window: int) -> tuple[tuple[float, ...], Tensor]:
         """Return some defocus, and what fewer points a pixel change in PSFs there, where most of their light is.
 
         PSFs in focus change most, and those of the shortest wavelength: none is left out.
         """
-        nodes, window = self._spread_and_focus(), self._smallest(_PIXEL_WINDOW)
+        nodes, window = self._spread_and_focus(), min(window, _PIXEL_WINDOW)
         for each in (tolerance, REFERENCE.pixel_tolerance):
-            if each not in self._pixels:
-                self._pixels[each] = self._bank(nodes, window, each, torch.float64, wavelengths=None).psfs.cpu()
-        return nodes, self._pixels[tolerance] - self._pixels[REFERENCE.pixel_tolerance]
+            if (each, window) not in self._pixels:
+                bank = self._bank(nodes, window, each, torch.float64, wavelengths=None)
+                self._pixels[each, window] = bank.psfs.cpu()
+        return nodes, self._pixels[tolerance, window] - self._pixels[REFERENCE.pixel_tolerance, window]
 
-    def wavelength_changes(self, count: int) -> tuple[tuple[float, ...], list[Tensor]]:
+    def wavelength_changes(self, count: int, window: int) -> tuple[tuple[float, ...], list[Tensor]]:
         r"""Return some defocus, and what fewer wavelengths change in PSFs there, where most of their light is.
 
         With a basis, channel c captures :math:`h_c * L_c + \sum_b h_{cb} * (L_b - L_c)`, where the PSF of what is white
@@ -168,18 +169,19 @@ class CameraSurvey:
             The nodes, and a list of (D, C, P, P): the changes of :math:`h_c`, and with a basis those of
             :math:`h_{cb}` for the channel b after c, then for the one after that.
         """
+        window = min(window, _COLOUR_WINDOW)
         for each in (count, None):
-            if each not in self._colours:
-                self._colours[each] = self._planes(self.merged(each))
-        changes = self._colours[count] - self._colours[None]
+            if (each, window) not in self._colours:
+                self._colours[each, window] = self._planes(self.merged(each), window)
+        changes = self._colours[count, window] - self._colours[None, window]
         own = torch.arange(self.channels)
         colours = [changes[:, own, (own + k) % self.channels] for k in range(1, changes.shape[2])]
         return self._spread_and_focus(), [changes.sum(2), *colours]
 
     @torch.no_grad()
-    def _planes(self, spectrum: Spectrum) -> Tensor:
+    def _planes(self, spectrum: Spectrum, window: int) -> Tensor:
         """Return PSFs of each channel and reflectance, (D, C, B, P, P), wavelength by wavelength."""
-        raw = REFERENCE.replace(window=self._smallest(_COLOUR_WINDOW), pixel_tolerance=1e-3, stray_light="discard")
+        raw = REFERENCE.replace(window=window, pixel_tolerance=1e-3, stray_light="discard")
         lens, nodes = self._optics.with_fidelity(raw), self._spread_and_focus()
         planes = torch.zeros((), dtype=torch.float64)
         for wavelength, shares in zip(spectrum.wavelengths, zip(*spectrum.plane_weights, strict=True), strict=True):
@@ -187,10 +189,6 @@ class CameraSurvey:
             psfs = lens.psf_bank(1, torch.float64, nodes).psfs.cpu()
             planes = planes + psfs * torch.tensor(shares, dtype=torch.float64)[:, None, None]
         return planes.unflatten(1, (self.channels, -1))
-
-    def _smallest(self, window: int) -> int:
-        """The window, or that of the smallest reference if it is smaller."""
-        return min(window, *(window_side(reference) for reference in self._references.values()))
 
     def _spread(self, intervals: int) -> tuple[float, ...]:
         lo, hi = self.defocus_range

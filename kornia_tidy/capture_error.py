@@ -1,14 +1,29 @@
 r"""How far one capture of a scene is from another at a different fidelity, told without taking either.
 
-A pixel at defocus :math:`\psi` of two captures differs by the image convolved with the difference of two PSFs. Over an
-image with the power spectrum S that makes a mean square of
+Two captures differ, at a pixel whose defocus is :math:`\psi`, by the image convolved with the difference
+:math:`\Delta_\psi` of two PSFs. How much that is depends on where in depth the image has its light. So the light is
+told apart by octave j and by bin of defocus b, see :mod:`kornia_tidy.depth_energy`, and within an octave all of it is
+taken to have the spectrum :math:`\hat S_j` of the image as a whole, of sum one. Where pixels take light in (gather)
 
-.. math:: \mathrm{MSE} = \sum_\psi p(\psi) \sum_f S(f) \, |\Delta H_\psi(f)|^2
+.. math::
+    \mathrm{MSE} = \sum_{j, b} E_{jb} \sum_f \hat S_j(f) \, |\Delta_b(f)|^2
 
-Of layers, every PSF in it is a linear combination of a few: PSFs are band-limited in :math:`\psi`, so those at some
-sixty Chebyshev nodes carry all others, and layers and spacing only change the coefficients. What is left of the images
-is the matrix of the products of these with each other, one for each channel. What window and points a pixel change is
-looked at where it is: in PSFs a few radians apart, as its size hardly depends on :math:`\psi`.
+with the power :math:`E_{jb}` of the light within reach of the pixels at b. Where pixels spread their light (scatter),
+what those at b and b' spread adds up, or cancels:
+
+.. math::
+    \mathrm{MSE} = \sum_{j, b, b'} C_{jbb'} \sum_f \hat S_j(f) \, \mathrm{Re} \, \Delta_b(f) \overline{\Delta_{b'}(f)}
+
+with the products :math:`C_{jbb'}` of the light at b and at b'.
+
+Of layers, every :math:`\Delta_b` is a linear combination of a few PSFs: they are band-limited in :math:`\psi`, so those
+at some sixty Chebyshev nodes carry all others, and layers and spacing only change the coefficients. What is left of the
+images is the matrix of the products of these with each other, one for each channel and octave. What window, points a
+pixel and wavelengths change is known in size, at some depths: differences at two depths are then taken as alike or as
+unlike, whichever makes more.
+
+This is an estimate: an octave's light is taken to lie at random within it. The safety factors of
+:mod:`kornia_tidy.planning` stand for what that leaves out.
 """
 
 from __future__ import annotations
@@ -16,19 +31,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_tidy.optics.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
-from kornia_tidy.scene.convolution import next_fast_size, pad_border
-from kornia_tidy.scene.layers import layer_weights
+from kornia_tidy.scene.layers import assign_layers
+from kornia_tidy.scene_light import SceneLight, interpolation
 
-CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
-GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
-_BLOCK = 1024  # px; larger images are looked at block by block
-_BINS = 256  # of the histogram of defocus
-_REGIONS = 8  # of defocus, whose outlines scatter makes visible
+_NEGLIGIBLE = 1e-3  # of an octave's power: the frequencies that have least of it do not count
 
 
 def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
@@ -87,130 +97,6 @@ def nodes_needed(half_range: float, bandwidth: float) -> int:
     return math.ceil(order + 4 * order ** (1 / 3) + 6)
 
 
-def spectrum_size(window: int) -> int:
-    """Return the side of the grid that PSFs of a window are compared on."""
-    return next_fast_size(math.ceil(GRID_RATIO * window))
-
-
-def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
-    r"""Return the power spectrum of images, such that its sum times a filter's power is the mean square it leaves.
-
-    Args:
-        light: (B, C, H, W).
-        border: what lies beyond the image, see :mod:`kornia_tidy.scene.convolution`. Made-up light counts too.
-        size: side N of the frequency grid.
-
-    Returns:
-        (C, N, N // 2 + 1) float64 for the half spectrum. The mean of each image is left out, as white stays white; at
-        frequency zero stands what varies more slowly than the grid can tell.
-
-    Example:
-        >>> image = torch.rand(1, 1, 40, 40, dtype=torch.float64)
-        >>> power = power_spectrum(image, "circular", 40)
-        >>> bool(torch.isclose(power.sum(), image.var(correction=0)))
-        True
-    """
-    light = light.double()
-    varying = light - light.mean((-2, -1), keepdim=True)
-    if border == "replicate":  # edges drawn out into streaks are coarser than the image, mirrored or not: take either
-        drawn_out = pad_border(varying, int(size / GRID_RATIO) // 2, "replicate")
-        return torch.maximum(*(_power_of_blocks(plane, "reflect", size) for plane in (varying, drawn_out)))
-    power = _power_of_blocks(light if border == "zero" else varying, border, size)
-    if border == "zero":  # with the veil the mean is kept, but for what is missed in the dark around
-        mean_square = light.mean((-2, -1)).square().mean(0).cpu()
-        missed = mean_square * _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
-        power[:, 0, 0] = _power_of_blocks(varying, "reflect", size)[:, 0, 0] + missed
-    return power
-
-
-def _dark_square(shape: Sequence[int], radius: int) -> float:
-    """Return the mean square of the share of a pixel's surroundings that lies beyond the image."""
-    inside = []
-    for side in shape:
-        at = torch.arange(side, dtype=torch.float64)
-        inside.append(((at + radius).clamp(max=side - 1) - (at - radius).clamp(min=0) + 1) / (2 * radius + 1))
-    return float((1 - inside[0][:, None] * inside[1]).square().mean())
-
-
-def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
-    total, pixels = torch.zeros((), dtype=torch.float64), 0
-    for top in range(0, light.shape[-2], _BLOCK):
-        for left in range(0, light.shape[-1], _BLOCK):
-            block = light[..., top : top + _BLOCK, left : left + _BLOCK]
-            total = total + _covariance(_endless(block, border, size), size) * block[0, 0].numel()
-            pixels += block[0, 0].numel()
-    return _half_plane(torch.fft.rfft2(total / pixels).real / size**2, size)
-
-
-def coarser(power: Tensor, size: int) -> Tensor:
-    """Return a power spectrum on a smaller grid: its covariance at the shifts that the grid has.
-
-    Example:
-        >>> power = power_spectrum(torch.rand(1, 1, 40, 40, dtype=torch.float64), "circular", 20)
-        >>> coarser(power, 10).shape
-        torch.Size([1, 10, 6])
-    """
-    full = power.shape[-2]
-    halves = torch.full((full // 2 + 1,), 0.5, dtype=torch.float64)
-    halves[0] = 1
-    if full % 2 == 0:
-        halves[-1] = 1
-    covariance = torch.fft.irfft2(power * halves, s=(full, full))
-    lags = torch.fft.fftfreq(size, 1 / size).round().long()
-    return _half_plane(torch.fft.rfft2(covariance[:, lags[:, None], lags]).real * (full / size) ** 2, size)
-
-
-def natural_power(channels: int, size: int) -> Tensor:
-    """Return the power spectrum of a typical photograph: 1 / f**2, with the standard deviation ``CONTRAST``.
-
-    At frequency zero stands that of half the lowest frequency of the grid.
-
-    Source: Field, Relations between the statistics of natural images and the response properties of cortical cells,
-    J. Opt. Soc. Am. A 4(12), 2379 (1987).
-
-    Example:
-        >>> round(float(natural_power(1, 64).sum().sqrt()), 6) == CONTRAST
-        True
-    """
-    down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
-    squared = down[:, None] ** 2 + across**2
-    squared[0, 0] = (0.5 / size) ** 2
-    power = _half_plane(1 / squared[None], size)
-    return (power * (CONTRAST**2 / power.sum())).expand(channels, -1, -1)
-
-
-def region_power(light: Tensor, defocus: Tensor, border: str, size: int) -> Tensor:
-    """Return the summed power spectra of an image's regions of like defocus, each cut out on black.
-
-    Scatter blurs each region alone, so their outlines count, which gather does not see.
-
-    Args:
-        light: (B, C, H, W).
-        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-        border: as for :func:`power_spectrum`.
-        size: side N of the frequency grid.
-    """
-    levels = np.quantile(defocus.double().cpu().numpy(), np.arange(1, _REGIONS) / _REGIONS)
-    region = torch.bucketize(defocus, torch.as_tensor(levels).to(defocus).unique())
-    regions = (light * (region == index) for index in range(int(region.max()) + 1))
-    return torch.stack([power_spectrum(part, border, size) for part in regions]).sum(0)
-
-
-def defocus_histogram(defocus: Tensor, lo: float, hi: float) -> tuple[Tensor, Tensor]:
-    """Return the mean defocus of each bin that is not empty, and the share of the pixels in it, float64.
-
-    Example:
-        >>> defocus_histogram(torch.tensor([-30.0, 5.0, 5.0, 7.0]), -20, 20)
-        (tensor([-20.,   5.,   7.], dtype=torch.float64), tensor([0.2500, 0.5000, 0.2500], dtype=torch.float64))
-    """
-    psi = defocus.detach().double().flatten().cpu().clamp(lo, hi)
-    low, high = float(psi.min()), float(psi.max())
-    index = ((psi - low) * (_BINS / max(high - low, 1e-9))).long().clamp(max=_BINS - 1)
-    count = torch.bincount(index, minlength=_BINS).double()
-    mean = torch.bincount(index, psi, minlength=_BINS) / count.clamp(min=1)
-    return mean[count > 0], count[count > 0] / len(psi)
-
-
 def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: float) -> tuple[Tensor, Sequence[float]]:
     """Return which PSFs a pixel at some defocus is blurred with, by the layers between which it lies.
 
@@ -231,7 +117,11 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
     mode = "nearest" if layers == "nearest" else "linear"
     taken_from = fine_nodes(nodes) if layers in TAPS else tuple(nodes)
     at = torch.tensor(taken_from, dtype=torch.float64)
-    weights = layer_weights(psi.double().view(1, 1, 1, -1), at, mode)[0, :, 0].T
+    lower, fraction = (each.flatten() for each in assign_layers(psi.double().view(1, 1, 1, -1), at, mode))
+    weights = torch.zeros(len(psi), len(at), dtype=torch.float64)
+    row = torch.arange(len(psi))
+    weights[row, lower] = 1 - fraction
+    weights[row, (lower + 1).clamp(max=len(at) - 1)] += fraction
     if layers not in TAPS:
         return weights, nodes
     samples = guarded(nodes, TAPS[layers] // 2)
@@ -247,93 +137,61 @@ class LayerErrors:
     Args:
         nodes: Chebyshev nodes that carry the PSFs of the masks, see :func:`nodes_needed`.
         psfs: (n, C, P, P) PSFs there, not normalised.
-        psi: (b,) defocus in the scene, and
-        share: the share of the pixels at each.
-        power: see :func:`power_spectrum`; of any grid not smaller than ``spectrum_size(P)``.
+        light: of the scene.
     """
 
-    def __init__(self, nodes: Tensor, psfs: Tensor, psi: Tensor, share: Tensor, power: Tensor) -> None:
-        self._nodes, self._psi, self._share = nodes, psi, share
-        size = min(power.shape[-2], spectrum_size(psfs.shape[-1]))
-        power = coarser(power, size) if size < power.shape[-2] else power
-        self._products = torch.stack(
-            [_products(own, weight) for own, weight in zip(psfs.unbind(1), power, strict=True)]
-        )
+    def __init__(self, nodes: Tensor, psfs: Tensor, light: SceneLight) -> None:
+        self._nodes, self._light = nodes, light
+        shapes = light.shapes(psfs.shape[-1])
+        self._products = torch.stack([_products(own, shape) for own, shape in zip(psfs.unbind(1), shapes, strict=True)])
 
     def rows(self, nodes: Sequence[float], layers: str, band: float) -> Tensor:
         """Return the coefficients of what the scene's pixels are blurred with, (b, n)."""
-        weights, at = layer_coefficients(self._psi, nodes, layers, band)
+        weights, at = layer_coefficients(self._light.psi, nodes, layers, band)
         return weights @ chebyshev_weights(torch.tensor(at, dtype=torch.float64), self._nodes)
 
     def own_rows(self) -> Tensor:
         """Return the coefficients of a PSF of its own for each depth, (b, n)."""
-        return chebyshev_weights(self._psi, self._nodes)
+        return chebyshev_weights(self._light.psi, self._nodes)
 
     def __call__(self, ours: Tensor, theirs: Tensor) -> float:
         """Return the difference between captures of these coefficients, full scale 1."""
         difference = ours - theirs
-        squares = torch.einsum("cbi,bi,b->c", difference @ self._products, difference, self._share)
-        return math.sqrt(max(0.0, float(squares.mean())))
+        responses = difference @ self._products  # (C, octaves, b, n)
+        alone = (responses * difference).sum(-1)
+        squares = [
+            ((own @ difference.float()) * responses).sum((1, 2, 3)) if own.ndim == 4 else (own * alone).sum((1, 2))
+            for own in self._light.energies
+        ]
+        return math.sqrt(max(0.0, *(float(each.mean()) for each in squares)))
 
 
-def _products(psfs: Tensor, power: Tensor) -> Tensor:
-    size = power.shape[-2]
-    spectra = torch.view_as_real(torch.fft.rfft2(psfs.float(), s=(size, size)).flatten(1)).double()
-    return (spectra * power.flatten()[:, None]).flatten(1) @ spectra.flatten(1).mT
+def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
+    """Return the products of PSFs of one channel with each other in each octave, (octaves, n, n).
+
+    In float64: of layers close to each other all but a millionth cancels.
+    """
+    size = shapes.shape[-2]
+    spectra = torch.view_as_real(torch.fft.rfft2(psfs.double(), s=(size, size)).flatten(1))
+    products = []
+    for weight in shapes.flatten(1):
+        ordered = weight.sort(descending=True).values
+        counts = weight >= ordered[int((ordered.cumsum(0) < 1 - _NEGLIGIBLE).sum())]
+        own = spectra[:, counts]
+        products.append((own * weight[counts, None]).flatten(1) @ own.flatten(1).mT)
+    return torch.stack(products)
 
 
-def change_error(nodes: Sequence[float], changes: Tensor, psi: Tensor, share: Tensor, power: Tensor) -> float:
+def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> float:
     """Return the root mean square difference that changes of PSFs make on a scene.
 
     Args:
         nodes: ascending defocus in radians where the changes are known; in between they are as large as there.
         changes: (len(nodes), C, P, P).
-        psi: (b,) defocus in the scene, and
-        share: the share of the pixels at each.
-        power: see :func:`power_spectrum`; of any grid not smaller than ``spectrum_size(P)``.
-
-    Example:
-        >>> double = torch.zeros(1, 1, 1, 1) + 1.0  # what a PSF of twice the light adds
-        >>> image = torch.rand(1, 1, 9, 9, dtype=torch.float64)
-        >>> error = change_error((0.0,), double, torch.zeros(1), torch.ones(1), power_spectrum(image, "circular", 9))
-        >>> abs(error - float(image.std(correction=0))) < 1e-6
-        True
+        light: of the scene.
     """
-    size = min(power.shape[-2], spectrum_size(changes.shape[-1]))
-    power = coarser(power, size) if size < power.shape[-2] else power
-    squares = (_power(torch.fft.rfft2(changes, s=(size, size))) * power).sum((-2, -1)).mean(1).clamp(min=0).numpy()
-    return math.sqrt(float(np.interp(psi.numpy(), nodes, squares) @ share.numpy()))
-
-
-def _endless(block: Tensor, border: str, size: int) -> Tensor:
-    """Make a block periodic the way its border continues it: mirrored, repeated, or alone in the dark."""
-    height, width = block.shape[-2:]
-    if border == "zero":
-        return torch.nn.functional.pad(block, (0, size, 0, size)) * math.sqrt(
-            (height + size) * (width + size) / (height * width)
-        )
-    if border == "circular":
-        return block
-    return torch.nn.functional.pad(block, (0, max(0, width - 2), 0, max(0, height - 2)), mode="reflect")
-
-
-def _covariance(plane: Tensor, size: int) -> Tensor:
-    """Return the covariance of a periodic plane with itself at shifts up to half of ``size``, (C, size, size)."""
-    height, width = plane.shape[-2:]
-    power = _power(torch.fft.rfft2(plane)).mean(0) / (height * width)
-    lags = torch.fft.fftfreq(size, 1 / size).round().long()
-    rows = torch.fft.ifft(power, dim=-2)[:, lags % height]
-    return torch.fft.irfft(rows, n=width)[..., lags % width].cpu()
-
-
-def _power(spectrum: Tensor) -> Tensor:
-    return spectrum.real.square() + spectrum.imag.square()
-
-
-def _half_plane(power: Tensor, size: int) -> Tensor:
-    """Let columns that stand for two frequencies count twice."""
-    twice = torch.full((size // 2 + 1,), 2.0, dtype=torch.float64)
-    twice[0] = 1
-    if size % 2 == 0:
-        twice[-1] = 1
-    return power * twice
+    shapes = light.shapes(changes.shape[-1])
+    power = torch.fft.rfft2(changes, s=(shapes.shape[-2],) * 2).abs().square()
+    known = (power.double().transpose(0, 1).flatten(2) @ shapes.flatten(2).mT).clamp(min=0)  # (C, nodes, octaves)
+    squares = interpolation(light.grid, nodes) @ known
+    return math.sqrt(max(light.mean_square(squares.mT)))

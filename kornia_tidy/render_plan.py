@@ -15,7 +15,8 @@ class RenderPlan:
         fidelity: the setting, for ``optics.with_fidelity(plan.fidelity)``. Its window is fixed.
         reference: what the error is against: the preset, with the window of the masks as they are now.
         tolerance: error asked for.
-        predicted_error: root mean square of the noise-free linear capture against ``reference``, full scale 1.
+        predicted_error: root mean square of the noise-free linear capture against ``reference``, full scale 1: an
+            estimate from above, see :mod:`kornia_tidy.planning` for what it rests on.
         seconds: of one capture with its PSFs on one core, see :mod:`kornia_tidy.render_cost`.
         memory_bytes: peak of one capture without gradients, beyond the image.
         reference_seconds: what the reference would take.

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import math
-
 import pytest
 import scipy.ndimage
 import scipy.special
@@ -12,24 +10,26 @@ from hypothesis import strategies as st
 from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.camera_survey import CameraSurvey
 from kornia_tidy.capture_error import (
-    CONTRAST,
     LayerErrors,
     change_error,
     chebyshev_nodes,
     chebyshev_weights,
-    coarser,
-    defocus_histogram,
     layer_coefficients,
-    natural_power,
     nodes_needed,
-    power_spectrum,
-    region_power,
 )
+from kornia_tidy.depth_energy import Depths, octave_filters
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.scene.compositing import render
+from kornia_tidy.scene_light import CONTRAST, SceneLight, coarser, natural_power, power_spectrum
 from tests.base import BaseTester
 
-ZERO, ONE = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+FLAT = Depths(torch.zeros(1, 1, 4, 4), -20, 20, "reflect")
+
+
+def one_depth(power: torch.Tensor) -> SceneLight:
+    """Light of a power spectrum, all at one depth."""
+    octaves = (power[:, None] * octave_filters(power.shape[-2])).sum((-2, -1))
+    return SceneLight(power, FLAT.psi, octaves[..., None])
 
 
 class TestInterpolation(BaseTester):
@@ -94,7 +94,7 @@ class TestPower(BaseTester):
     def test_feature_large_images_are_read_in_blocks(self, monkeypatch):
         light = torch.rand(1, 1, 64, 48, dtype=torch.float64)
         whole = power_spectrum(light, "reflect", 7)
-        monkeypatch.setattr("kornia_tidy.capture_error._BLOCK", 32)
+        monkeypatch.setattr("kornia_tidy.scene_light._BLOCK", 32)
         self.assert_close(power_spectrum(light, "reflect", 7).sum(), whole.sum(), rtol=0.05, atol=0)
 
     def test_feature_a_typical_photograph_has_its_contrast_and_slope(self):
@@ -106,7 +106,8 @@ class TestPower(BaseTester):
     def test_feature_a_veil_leaves_the_mean_and_takes_what_varies(self, border):
         """What a veil of a tenth changes in an image: a tenth of its deviation from its mean, however slow."""
         light = torch.linspace(0, 1, 60, dtype=torch.float64).expand(1, 1, 60, 60)
-        error = change_error((0.0,), -0.1 * torch.ones(1, 1, 1, 1), ZERO, ONE, power_spectrum(light, border, 8))
+        light_there = one_depth(power_spectrum(light, border, 64))
+        error = change_error((0.0,), -0.1 * torch.ones(1, 1, 1, 1), light_there)
         assert error == pytest.approx(0.1 * float(light.std(correction=0)), rel=0.05)
 
     @pytest.mark.parametrize("sizes", [(20, 10), (21, 10), (21, 9), (15, 12)])
@@ -116,12 +117,13 @@ class TestPower(BaseTester):
         fine, coarse = (power_spectrum(light, "reflect", size) for size in sizes)
         self.assert_close(coarser(fine, sizes[1]), coarse, atol=1e-12, rtol=1e-9)
 
-    def test_feature_one_depth_has_no_outlines(self):
-        light = torch.rand(1, 3, 20, 20)
-        flat = region_power(light, torch.full((1, 1, 20, 20), 3.0), "reflect", 15)
-        self.assert_close(flat, power_spectrum(light, "reflect", 15), atol=1e-12, rtol=0)
+    def test_feature_one_depth_is_the_image_and_two_have_outlines(self):
+        """Of white light, which one depth leaves alone."""
         white = torch.ones(1, 1, 20, 20)
-        assert float(region_power(white, torch.rand(1, 1, 20, 20), "circular", 15).sum()) > 0.1
+        for defocus, least, most in ((torch.zeros(1, 1, 20, 20), -1e-6, 1e-6), (torch.rand(1, 1, 20, 20), 0.1, 1)):
+            depths = Depths(defocus, -20, 20, "circular")
+            (energies,) = SceneLight.seen(white, depths, "circular", 15, "scatter").energies
+            assert least < float(torch.einsum("cjbb->", energies)) < most
 
 
 class TestLayers(BaseTester):
@@ -146,16 +148,9 @@ class TestLayers(BaseTester):
         generator = torch.Generator().manual_seed(0)
         light = torch.rand(1, 1, 24, 24, dtype=torch.float64, generator=generator)
         psfs = torch.randn(2, 1, 3, 3, generator=generator)
-        errors = LayerErrors(torch.tensor([-1.0, 1.0]), psfs, ZERO, ONE, power_spectrum(light, "circular", 6))
+        errors = LayerErrors(torch.tensor([-1.0, 1.0]), psfs, one_depth(power_spectrum(light, "circular", 64)))
         ours, theirs = torch.tensor([[0.3, 0.7]]).double(), torch.tensor([[0.6, 0.4]]).double()
         kernel = torch.einsum("an,ncpq->pq", ours - theirs, psfs.double())
         varying = light[0, 0] - light.mean()
         expected = (scipy.ndimage.convolve(varying.numpy(), kernel.numpy(), mode="wrap") ** 2).mean() ** 0.5
-        assert errors(ours, theirs) == pytest.approx(expected, rel=1e-6)
-
-
-class TestHistogram(BaseTester):
-    def test_feature_isolated_depths_are_kept_exactly(self):
-        psi, share = defocus_histogram(torch.tensor([[0.1, 0.1], [7.3, math.inf]]), -20, 20)
-        self.assert_close(psi, torch.tensor([0.1, 7.3, 20.0]), atol=1e-6, rtol=0)
-        assert share.tolist() == [0.5, 0.25, 0.25]
+        assert errors(ours, theirs) == pytest.approx(expected, rel=0.05)  # a tenth of the shape is a photograph's
