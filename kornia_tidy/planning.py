@@ -21,6 +21,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import product, repeat
 from typing import Any
 
@@ -49,6 +50,7 @@ from kornia_tidy.render_cost import (
 from kornia_tidy.render_plan import RenderPlan
 from kornia_tidy.scene.convolution import pad_border
 from kornia_tidy.scene.occlusion import EPSILON
+from kornia_tidy.scene.stray_light import share_in_frame
 from kornia_tidy.scene.tiles import Labels
 from kornia_tidy.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 
@@ -209,6 +211,7 @@ class PlannedScene:
 
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
         share, of_window = (OCCLUSION, OCCLUSION_WINDOW) if self._occlusion else (1.0, 1.0)
+        share, of_window = (factor / self._share_in_frame for factor in (share, of_window))
         narrower = window_side(fidelity) < window_side(self.reference)
         ways = (fidelity.stray_light, *(["outlines"] if self._occlusion and narrower else []))
         window_error = of_window * max(self._window_error(window_side(fidelity), way) for way in ways)
@@ -220,6 +223,19 @@ class PlannedScene:
             ("wavelengths", SAFETY * share * self._wavelength_error(fidelity.wavelengths)),
             ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self._level),
         ]
+
+    @cached_property
+    def _share_in_frame(self) -> float:
+        """Return the least share of a PSF that falls into the image, averaged over its pixels, where that matters.
+
+        Occlusion divides by what a pixel sees. With the border ``"zero"`` that is the image alone: the PSFs of a tiny
+        image are renormalised to what little of them lies within it, and so are their errors.
+        """
+        if not self._occlusion or self._survey.border != "zero":
+            return 1.0
+        psfs = self._survey.window_survey(window_side(self.reference))[1]
+        shares = share_in_frame(psfs, self._defocus.shape[-2:]) / psfs.sum((-2, -1))
+        return min(1.0, float(shares.amin()))
 
     def _layer_rows(self, fidelity: Fidelity) -> Tensor:
         return self._layers.rows(self._survey.nodes(fidelity), fidelity.layers, self._survey.band)

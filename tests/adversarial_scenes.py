@@ -327,7 +327,7 @@ def report(outcomes: list[Outcome]) -> str:
     for (compositing, kind), own in sorted(rows.items()):
         measured = [each for each in own if each.measured > 0]
         worst = max((each.measured / each.case.tolerance for each in own), default=0.0)
-        honest = max((each.measured / each.predicted for each in measured), default=0.0)
+        honest = max((each.measured / each.predicted for each in measured if each.predicted), default=0.0)
         ratio = median(each.predicted / each.measured for each in measured) if measured else float("nan")
         beyond = sum(each.measured > each.case.tolerance for each in own)
         table.append(

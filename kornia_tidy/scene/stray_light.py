@@ -97,7 +97,24 @@ def normalised_share(veil: Tensor, psfs: Tensor, shape: Sequence[int], border: s
     if border != "zero":
         return veil
     stray = veil * share_within(*shape, psfs.shape[-1], veil.device).mean().to(veil.dtype)
+    held = share_in_frame(psfs, shape).to(veil.dtype)
+    return stray / (held + stray).clamp(min=torch.finfo(veil.dtype).tiny)
+
+
+def share_in_frame(psfs: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return how much of the light of PSFs falls into an image, averaged over the pixels that it comes from.
+
+    Args:
+        psfs: (..., P, P).
+        shape: height and width of the image.
+
+    Returns:
+        (...).
+
+    Example:
+        >>> share_in_frame(torch.full((3, 3), 1 / 9), (1, 1))
+        tensor(0.1111)
+    """
     offset = torch.arange(psfs.shape[-1], dtype=psfs.dtype, device=psfs.device) - psfs.shape[-1] // 2
     down, across = ((1 - offset.abs() / side).clamp(min=0) for side in shape)  # pixels whose neighbour there is inside
-    held = (psfs * (down[:, None] * across)).sum((-2, -1)).to(veil.dtype)
-    return stray / (held + stray).clamp(min=torch.finfo(veil.dtype).tiny)
+    return (psfs * (down[:, None] * across)).sum((-2, -1))
