@@ -35,7 +35,7 @@ test-portable: $(READY)
 	@$(BIN)/python -m tests.portable $(ARGS)
 
 sanitize: $(READY)
-	@$(BIN)/python -m tests.sanitize $(ARGS)
+	@$(BIN)/python -m tests.kernels.sanitize $(ARGS)
 
 # What fails is kept in outputs/mutations.
 mutations: $(READY)
@@ -46,6 +46,8 @@ lint: $(READY)
 	@$(BIN)/ruff format --check
 	@$(BIN)/codespell
 	@$(BIN)/ty check
+	@$(BIN)/lint-imports --no-cache
+	@$(BIN)/python docs/make_architecture.py --check
 
 # The usual options of pytest leave the benchmarks out.
 bench: $(READY)

@@ -35,10 +35,10 @@ import torch
 from matplotlib.figure import Figure
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum
-from kornia_tidy.optics import CubicMask, PhaseMasks, SpiralMask, ZernikeMask
-from kornia_tidy.optics.coded_lens import CodedLens
-from kornia_tidy.optics.fisher_information import crlb
-from kornia_tidy.optics.mask_design import design, restoration_error
+from kornia_tidy.mask_design.fisher_information import crlb
+from kornia_tidy.mask_design.objectives import design, restoration_error
+from kornia_tidy.masks import CubicMask, PhaseMasks, SpiralMask, ZernikeMask
+from kornia_tidy.psf.psf_model import CodedLens
 
 # Light that leaves the window is lost, not given back: a mask is not rewarded for throwing light far away.
 FIDELITY = Fidelity("design", pixel_tolerance=0.1, layer_spacing=1.0, window=33, stray_light="discard")

@@ -34,7 +34,7 @@ from matplotlib.figure import Figure
 from torch import nn
 
 from kornia_tidy import DwellTimes, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
-from kornia_tidy.optics.switching import BETWEEN
+from kornia_tidy.modulator.switching import BETWEEN
 
 UNSEEN = range(10_000, 10_008)  # seeds of random states that no training has seen
 

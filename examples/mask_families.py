@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import Fidelity, TiDyOptics
-from kornia_tidy.optics import CubicMask, FourierMask, PhaseMasks, PixelwiseMask, RadialMask, SpiralMask, ZernikeMask
+from kornia_tidy.masks import CubicMask, FourierMask, PhaseMasks, PixelwiseMask, RadialMask, SpiralMask, ZernikeMask
 
 # Light that leaves the window is lost, not given back: a PSF is not rewarded for throwing light far away.
 FIDELITY = Fidelity("families", pixel_tolerance=0.1, layer_spacing=5.0, window=23, stray_light="discard")

@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import PixelwiseMask, TiDyOptics, moving_capture
+from kornia_tidy.camera.motion import moment_times, scenes_by_homography
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.motion import moment_times, scenes_by_homography
 
 
 @torch.no_grad()

@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import PixelwiseMask
+from kornia_tidy.mask_design.non_convexity import autocorrelation_witness, extreme_points
 from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.witness import autocorrelation_witness, extreme_points
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[int, Tensor]:

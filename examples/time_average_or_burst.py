@@ -29,8 +29,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import SensorNoise, Switching, TiDyOptics, burst
+from kornia_tidy.camera.burst import burst_shares
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.multi_shot import burst_shares
 
 EXPOSURE = 0.1  # s
 LADDER = torch.logspace(-6, 1, 29).tolist()  # of the Wiener filter's parameter, noise over signal

@@ -44,7 +44,7 @@ class Fidelity:
 
     Where the border continues the image, the stray light is wrong by what the light out there differs from the image's
     mean, at most by the share of stray light times the contrast. With ``"zero"`` only as much is spread as stays in the
-    image (:func:`kornia_tidy.scene.stray_light.share_within`), which is nothing for a window of
+    image (:func:`kornia_tidy.render.stray_light.share_within`), which is nothing for a window of
     ``2 * max(height, width) - 1`` pixels: then nothing is left out. Of the other choices, ``"renormalize"`` gives white
     right but for ``"zero"`` (3.3e-2 with the random mask), and ``"discard"`` darkens it by all that is lost (3.8e-2)
     but for ``"zero"`` (2.1e-3). With ``"valid"`` nobody knows what lies beyond the image; its mean stands for it.
@@ -62,12 +62,12 @@ class Fidelity:
             there. That of a whole PSF (L1, in its window) was at most an eighth of it with three points a pixel or
             more, which every published system has, a sixth with two and 0.3 of it with one. ``"balanced"`` stays
             below 0.1 %, ``"draft"`` below 3 % and ``"reference"`` below 1e-6, for masks of every family and 400 to
-            700 nm (``tests/optics/test_exact.py``). Only for exact propagation.
+            700 nm (``tests/psf/test_exact.py``). Only for exact propagation.
         layers: how a pixel takes its PSF from those computed: ``"nearest"``, ``"linear"``, ``"cubic"``, or
             ``"bandlimited"``, which is nearly exact while they lie closer than 2.8 rad (for 470 nm).
         layer_spacing: distance between the computed PSFs in radians of defocus.
         wavelengths: at most so many, where the camera's spectrum has more: neighbours then stand together for one, see
-            :func:`kornia_tidy.optics.fewer_wavelengths.fewer_wavelengths`. Default: all that the spectrum has.
+            :func:`kornia_tidy.psf.spectral_binning.fewer_wavelengths`. Default: all that the spectrum has.
         window: side of the PSFs in pixels, odd. Default: measured, by the next two.
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
         max_window: largest side of the PSF window in pixels.

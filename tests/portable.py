@@ -23,19 +23,23 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 KERNELS = (
-    "tests/scene/test_direct.py",
-    "tests/scene/test_occlusion_direct.py",
-    "tests/optics/test_mutual_intensity.py",
+    "tests/render/backends/test_direct.py",
+    "tests/render/backends/test_direct_occlusion.py",
+    "tests/psf/test_mutual_intensity.py",
 )
 RENDERING = (
-    "tests/scene",
+    "tests/render",
+    "tests/psf",
     "tests/optics",
-    "tests/test_tidy_optics.py",
-    "tests/test_motion.py",
-    "tests/test_multi_shot.py",
-    "tests/test_capture_error.py",
-    "tests/test_render_cost.py",
-    "tests/test_pipelines_captures.py",
+    "tests/masks",
+    "tests/modulator",
+    "tests/mask_design",
+    "tests/camera/test_tidy_optics.py",
+    "tests/camera/test_motion.py",
+    "tests/camera/test_burst.py",
+    "tests/planning/test_error_model.py",
+    "tests/render/test_cost_model.py",
+    "tests/camera/test_pipelines_captures.py",
     "tests/systems/test_presets.py",
 )
 TRANSFORMS = (  # and matrix products
@@ -45,9 +49,16 @@ TRANSFORMS = (  # and matrix products
     "tests/reconstruction/test_tikhonov_modules.py",
     "tests/reconstruction/test_periodic.py",
     "tests/reconstruction/test_refocused.py",
-    "tests/test_planning.py",
+    "tests/planning/test_planner.py",
 )
-NUMBERS = (*TRANSFORMS, "tests/reconstruction", "tests/sensor", "tests/training", "tests/test_pretrained.py")
+NUMBERS = (
+    *TRANSFORMS,
+    "tests/reconstruction",
+    "tests/sensor",
+    "tests/raw",
+    "tests/training",
+    "tests/inference/test_pretrained.py",
+)
 
 # What /proc/cpuinfo calls what code for these processors uses.
 AVX2 = frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"})
@@ -58,8 +69,8 @@ V2 = frozenset({"sse4_2", "ssse3", "popcnt", "cx16"})
 PROBE = """
 import hashlib, json, warnings
 import torch
-from kornia_tidy.compiled import compiled
-from kornia_tidy.scene.direct import SOURCE
+from kornia_tidy.kernels.build import compiled
+from kornia_tidy.render.backends.direct import SOURCE
 warnings.simplefilter("ignore")
 generator = torch.Generator().manual_seed(0)
 one, two = torch.rand(2, 96, 96, generator=generator, dtype=torch.float64)
@@ -137,7 +148,7 @@ def _c(name: str, compiler: str, *options: str, needs: frozenset[str] = frozense
 
 
 FACTORS = (
-    Factor("aten default", {"ATEN_CPU_CAPABILITY": "default"}, NUMBERS, ("tests/scene",), refuse=_not_aten("DEFAULT")),
+    Factor("aten default", {"ATEN_CPU_CAPABILITY": "default"}, NUMBERS, ("tests/render",), refuse=_not_aten("DEFAULT")),
     Factor("aten avx2", {"ATEN_CPU_CAPABILITY": "avx2"}, NUMBERS, (), AVX2, refuse=_not_aten("AVX2")),
     Factor("aten avx512", {"ATEN_CPU_CAPABILITY": "avx512"}, NUMBERS, (), AVX512, refuse=_not_aten("AVX512")),
     Factor("onemkl avx2", {"MKL_ENABLE_INSTRUCTIONS": "AVX2"}, TRANSFORMS, (), AVX2, refuse=_same_mkl),
@@ -147,10 +158,14 @@ FACTORS = (
     _c("c native gcc", "gcc"),
     _c("c native clang", "clang", quick=True),
     Factor(
-        "c no compiler", {"CC": "false"}, (*RENDERING, "tests/test_compiled.py"), ("tests/scene",), refuse=_compiled
+        "c no compiler",
+        {"CC": "false"},
+        (*RENDERING, "tests/kernels/test_build.py"),
+        ("tests/render",),
+        refuse=_compiled,
     ),
     Factor("threads 1", {"OMP_NUM_THREADS": "1"}, NUMBERS),
-    Factor("threads 2", {"OMP_NUM_THREADS": "2"}, NUMBERS, ("tests/scene",), refuse=_one_core),
+    Factor("threads 2", {"OMP_NUM_THREADS": "2"}, NUMBERS, ("tests/render",), refuse=_one_core),
 )
 
 

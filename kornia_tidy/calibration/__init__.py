@@ -1,25 +1,4 @@
-"""From captures of points of light to the PSFs of a camera, and to the mask that makes them."""
+"""Measuring a real camera: its noise from flat fields (``noise/``), its PSFs from captures of points (``psf/``).
 
-from kornia_tidy.calibration.dithering import ResolvedPSF, resolve_psf
-from kornia_tidy.calibration.exposures import capture_variance, merge_exposures
-from kornia_tidy.calibration.measured_psfs import MeasuredPSFs, PointReport, diffraction_cutoff, measure_psfs
-from kornia_tidy.calibration.phase_retrieval import MaskFit, fit_masks, retrieve_mask
-from kornia_tidy.calibration.point_images import PointImage, point_images
-from kornia_tidy.calibration.registration import register
-
-__all__ = [
-    "MaskFit",
-    "MeasuredPSFs",
-    "PointImage",
-    "PointReport",
-    "ResolvedPSF",
-    "capture_variance",
-    "diffraction_cutoff",
-    "fit_masks",
-    "measure_psfs",
-    "merge_exposures",
-    "point_images",
-    "register",
-    "resolve_psf",
-    "retrieve_mask",
-]
+Captures come in; a sensor's parameters, a PSF bank, or the mask that makes such PSFs go out.
+"""

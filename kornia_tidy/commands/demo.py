@@ -14,20 +14,21 @@ from kornia.geometry.transform import resize
 from torch import Tensor
 from tqdm import tqdm
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.commands.options import add_depth_options, middle_depths, read_scene, seed
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.figures import explain, require_matplotlib
 from kornia_tidy.figures.estimates import Estimate, draw_estimates
+from kornia_tidy.figures.explained import explain
+from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.files import write_bytes
-from kornia_tidy.optics.camera import ThinLensCamera
-from kornia_tidy.optics.modulator import DwellTimes
-from kornia_tidy.pretrained import load_pretrained
-from kornia_tidy.tidy_optics import TiDyOptics
-from kornia_tidy.training.tasks import metres, nearness, split_maps
-from kornia_tidy.training.trained import TrainedSystem
+from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.inference.tasks import metres, nearness, split_maps
+from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 DESCRIPTION = """\
 Photograph a scene with a camera whose five phase masks were learnt together with a network, and let the network

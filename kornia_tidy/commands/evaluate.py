@@ -13,10 +13,10 @@ from tqdm import tqdm
 from kornia_tidy.commands.options import seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_scene_options, given_settings
+from kornia_tidy.inference.tasks import MAPS
+from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, metric_range, table, write_table
-from kornia_tidy.training.tasks import MAPS
-from kornia_tidy.training.trained import load_trained
 
 DESCRIPTION = """\
 Let a trained camera and network see scenes they were not trained on. FOLDER gets

@@ -16,9 +16,10 @@ import torch
 
 import kornia_tidy
 from kornia_tidy.commands.report import tell
-from kornia_tidy.compiled import REALS, Compiler, build, cache_folder, find_compiler
-from kornia_tidy.optics import mutual_intensity
-from kornia_tidy.scene import direct, occlusion_direct
+from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
+from kornia_tidy.psf import mutual_intensity
+from kornia_tidy.render.backends import direct
+from kornia_tidy.render.backends import direct_occlusion as occlusion_direct
 
 DESCRIPTION = """\
 Tell what kornia_tidy runs on: versions of the packages it uses, processor and threads,

@@ -14,14 +14,14 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice
 from kornia_tidy.commands.report import tell
 from kornia_tidy.files import read_bytes
-from kornia_tidy.lab.frame_files import SUFFIXES, check_replaceable, read_slm_frames, write_slm_frames
-from kornia_tidy.lab.mask_files import read_dwell_shares, read_heights, write_heights
-from kornia_tidy.lab.placement import FLIPS, ROTATIONS, PanelPlacement
-from kornia_tidy.lab.printing import write_stl
-from kornia_tidy.lab.slm_frames import SLMFrames
-from kornia_tidy.lab.timing import frame_times
+from kornia_tidy.mask_export.frame_files import SUFFIXES, check_replaceable, read_slm_frames, write_slm_frames
+from kornia_tidy.mask_export.mask_files import read_dwell_shares, read_heights, write_heights
+from kornia_tidy.mask_export.placement import FLIPS, ROTATIONS, PanelPlacement
+from kornia_tidy.mask_export.printing import write_stl
+from kornia_tidy.mask_export.slm_frames import SLMFrames
+from kornia_tidy.mask_export.timing import frame_times
+from kornia_tidy.modulator.phase_panel import GreyLevels
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, constant_index
-from kornia_tidy.optics.phase_panel import GreyLevels
 
 MATERIALS = {
     "constant": constant_index(1.5),
@@ -35,7 +35,7 @@ DESCRIPTION = """\
 Phase masks, out of the library and back. MASKS is a file of heights in metres
 (.npy, K x rows x columns) or a camera's state_dict (.safetensors, masks.phase
 in radians at 530 nm). A state does not tell a constraint: masks with one, and
-families without a phase, are exported from Python (kornia_tidy.lab).
+families without a phase, are exported from Python (kornia_tidy.mask_export).
 """
 
 EXPORT = """\

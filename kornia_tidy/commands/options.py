@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.image_files import SUFFIXES
 from kornia_tidy.data.rgbd import Scene, read_rgbd
-from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 MOST_PROCESSES = 1024  # more would only bring a machine down
 MOST_MASKS = 1024  # PSFs of more take days

@@ -11,20 +11,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.commands.options import add_lens_options, check_output, make_lens, seed
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.fidelity import PRESETS, Fidelity
 from kornia_tidy.figures.depth import depth_at
 from kornia_tidy.figures.psf import PSFSheet, draw_psfs, ring_centres
 from kornia_tidy.figures.style import require_matplotlib
+from kornia_tidy.figures.system_survey import contrast_transfer
 from kornia_tidy.files import write_bytes
-from kornia_tidy.lab.mask_files import SUFFIXES, read_heights
-from kornia_tidy.optics.camera import ThinLensCamera
-from kornia_tidy.optics.phase_masks import PixelwiseMask
-from kornia_tidy.systems import SYSTEMS
-from kornia_tidy.systems.survey import contrast_transfer
-from kornia_tidy.tidy_optics import TiDyOptics
-from kornia_tidy.training.trained import load_trained
+from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.mask_export.mask_files import SUFFIXES, read_heights
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.systems.presets import SYSTEMS
 
 DESCRIPTION = """\
 Draw the point spread functions (PSFs) of a camera: a montage over depth and colour,

@@ -11,7 +11,7 @@ from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, op
 from kornia_tidy.commands.report import Stages, tell
 
 if TYPE_CHECKING:
-    from kornia_tidy.sensor.photon_transfer import PhotonTransfer
+    from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
 
 DESCRIPTION = """\
 Measure a camera's noise at one ISO setting, by photon transfer: how the variance of
@@ -35,7 +35,7 @@ examples:
     kornia-tidy raw calibrate-noise street.cr2 -o noise.json
 
 In Python:
-  from kornia_tidy.sensor.photon_transfer import read_json
+  from kornia_tidy.calibration.noise.photon_transfer import read_json
   sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
 """
 
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> None:
     output = Path(args.output)
     plot = None if args.plot is None else Path(args.plot or output.with_suffix(".png"))
     _check_outputs(output, plot, [*args.files, *args.dark])
-    from kornia_tidy.sensor.photon_transfer import photon_transfer, write_json  # noqa: PLC0415
+    from kornia_tidy.calibration.noise.photon_transfer import photon_transfer, write_json  # noqa: PLC0415
 
     stages = Stages()
     with stages("read"):
@@ -128,7 +128,7 @@ def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:
     """Refuse before any work what could not be written, or would replace a capture."""
     if plot is not None:
         from kornia_tidy.checks import check_choice  # noqa: PLC0415
-        from kornia_tidy.figures import require_matplotlib  # noqa: PLC0415
+        from kornia_tidy.figures.style import require_matplotlib  # noqa: PLC0415
 
         require_matplotlib()
         check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))

@@ -16,11 +16,11 @@ from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, op
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import SUFFIXES, read_image
 from kornia_tidy.files import check_file, replacing
-from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.sensor.noise import SensorNoise
 
 if TYPE_CHECKING:
-    from kornia_tidy.calibration.point_images import Tile
+    from kornia_tidy.calibration.psf.point_images import Tile
 
 DESCRIPTION = """\
 Measure the PSFs of a camera from pictures of a point of light at known distances.
@@ -98,7 +98,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Measure the PSFs and write them."""
-    from kornia_tidy.calibration.measured_psfs import measure_psfs  # noqa: PLC0415 (only who measures waits for it)
+    from kornia_tidy.calibration.psf.measured_psfs import measure_psfs  # noqa: PLC0415 (only who measures waits for it)
 
     places = _check_arguments(args)
     camera = make_lens(args, (0.99 * min(args.distances), 1.01 * max(args.distances)))
@@ -127,8 +127,8 @@ def run(args: argparse.Namespace) -> None:
     tell("wrote", f"{args.output}, PSFs sum to one: light outside their {args.window} x {args.window} px is not seen")
     fit = None
     if args.fit_mask is not None:
-        from kornia_tidy.calibration.phase_retrieval import retrieve_mask  # noqa: PLC0415
-        from kornia_tidy.lab.mask_files import write_heights  # noqa: PLC0415
+        from kornia_tidy.calibration.psf.phase_retrieval import retrieve_mask  # noqa: PLC0415
+        from kornia_tidy.mask_export.mask_files import write_heights  # noqa: PLC0415
 
         with stages("mask"):
             fit = retrieve_mask(measured.bank, camera, _spectrum(channels), args.mask_size)
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> None:
         write_heights(args.fit_mask, fit.lens.masks.heights().detach())
         tell("wrote", args.fit_mask)
     if args.picture is not None:
-        from kornia_tidy.calibration.figure import draw_measured  # noqa: PLC0415
+        from kornia_tidy.figures.measured_psfs import draw_measured  # noqa: PLC0415
 
         with replacing(args.picture) as temporary:
             draw_measured(measured, fit).savefig(temporary, dpi=150, format="png")
@@ -177,7 +177,7 @@ def _check_arguments(args: argparse.Namespace) -> int:
 
 def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
     """Read one place after the other, of which only the light about the points is kept."""
-    from kornia_tidy.calibration.point_images import point_images  # noqa: PLC0415
+    from kornia_tidy.calibration.psf.point_images import point_images  # noqa: PLC0415
 
     sensor = SensorNoise.physical(args.full_well, args.read_noise)
     exposures = torch.tensor(args.exposures)
@@ -213,7 +213,7 @@ def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tile | None]:
 
 def _cutoff(camera: ThinLensCamera, channels: int) -> list[float]:
     """Return the highest frequency that the lens passes, at the shortest wavelength a channel may see."""
-    from kornia_tidy.calibration.measured_psfs import diffraction_cutoff  # noqa: PLC0415
+    from kornia_tidy.calibration.psf.measured_psfs import diffraction_cutoff  # noqa: PLC0415
 
     shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)
     return [min(2.0, diffraction_cutoff(camera, wave)) for wave in shortest]

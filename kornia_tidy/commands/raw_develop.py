@@ -13,17 +13,18 @@ from torch import Tensor
 from kornia_tidy.commands.raw_options import add_dump_options, for_each_file, open_raw
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import write_image
-from kornia_tidy.sensor.demosaic import METHODS
-from kornia_tidy.sensor.develop import (
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.color import ADAPTATIONS, ASSUMED_CAMERA
+from kornia_tidy.raw.demosaic import METHODS
+from kornia_tidy.raw.develop import (
     HIGHLIGHTS,
     WHITE_BALANCES,
     balance_factors,
     default_method,
+    develop,
     encode,
     matrix_origin,
 )
-from kornia_tidy.sensor.raw_color import ADAPTATIONS, ASSUMED_CAMERA
-from kornia_tidy.sensor.raw_file import RawCapture
 
 DESCRIPTION = """\
 Make a picture of each raw file: black and white levels, white balance,
@@ -49,8 +50,8 @@ examples:
 
 The first one in Python:
   from kornia_tidy.data.image_files import write_image
-  from kornia_tidy.sensor.raw_file import RawCapture
-  write_image("pictures/shot.png", RawCapture.open("shots/shot.dng").to_rgb(), bits=16)
+  from kornia_tidy.raw.capture import RawCapture
+  write_image("pictures/shot.png", develop(RawCapture.open("shots/shot.dng")), bits=16)
 
 Exit status 2 if any file failed; the others are developed all the same.
 """
@@ -120,7 +121,8 @@ def run(args: argparse.Namespace) -> None:
         with stages("decode"):
             raw = open_raw(path, args)
         with stages("develop"), torch.no_grad():
-            image = raw.to_rgb(
+            image = develop(
+                raw,
                 args.demosaic,
                 white_balance=white_balance,
                 highlights=args.highlights,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.commands.raw_options import add_dump_options, for_each_file, open_raw
 from kornia_tidy.commands.report import tell
-from kornia_tidy.sensor.raw_file import RawCapture, RawInfo
+from kornia_tidy.raw.capture import RawCapture, RawInfo
 
 DESCRIPTION = """\
 Say what raw files hold: camera, lens and exposure; size and filter array of the

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.raw.capture import RawCapture
 
 DUMP_OPTIONS = ("size", "pattern", "black", "white", "dtype", "byte_order")
 

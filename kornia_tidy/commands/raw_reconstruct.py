@@ -25,14 +25,16 @@ from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, ope
 from kornia_tidy.commands.report import tell
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
-from kornia_tidy.figures import draw_depth, require_matplotlib
+from kornia_tidy.figures.depth import draw_depth
+from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.files import parse_json, read_bytes, remove_leftovers, write_bytes
-from kornia_tidy.pretrained import FOLDER, PRETRAINED
-from kornia_tidy.sensor.raw_file import RawCapture
-from kornia_tidy.training.tasks import MAPS
+from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED
+from kornia_tidy.inference.tasks import MAPS
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.develop import develop
 
 if TYPE_CHECKING:
-    from kornia_tidy.training.light_head import LightHead, Reconstruction
+    from kornia_tidy.inference.light_head import LightHead, Reconstruction
 
 DESCRIPTION = """\
 Let a trained network look at captures of any size, tile by tile within a memory
@@ -116,8 +118,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Reconstruct captures."""
-    from kornia_tidy.training.light_head import LightHead, reconstruct_light  # noqa: PLC0415
-    from kornia_tidy.training.trained import load_trained  # noqa: PLC0415
+    from kornia_tidy.inference.light_head import LightHead, reconstruct_light  # noqa: PLC0415
+    from kornia_tidy.inference.trained import load_trained  # noqa: PLC0415
 
     parse_white_balance(args.white_balance)
     weights = head_file(args.head)
@@ -195,7 +197,7 @@ def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[T
         picture = read_image(path)
         return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}
     raw: RawCapture = open_raw(path, args)
-    light = raw.to_rgb(white_balance=parse_white_balance(args.white_balance), encoded=False, upright=False)
+    light = develop(raw, white_balance=parse_white_balance(args.white_balance), encoded=False, upright=False)
     bare = replace(raw, counts=torch.empty(0))  # which way it is turned, and not the counts
     return light, bare.upright, vars(raw.info)
 

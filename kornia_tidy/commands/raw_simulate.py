@@ -18,11 +18,12 @@ from kornia_tidy.commands.options import (
 from kornia_tidy.commands.raw_options import check_outputs
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.scene.compositing import COMPOSITING
+from kornia_tidy.raw.simulation import simulate_scene
+from kornia_tidy.render.compositing import COMPOSITING
 
 if TYPE_CHECKING:
+    from kornia_tidy.raw.capture import RawCapture
     from kornia_tidy.sensor.noise import SensorNoise
-    from kornia_tidy.sensor.raw_file import RawCapture
 
 DESCRIPTION = """\
 Simulate the raw file that a camera behind coded optics would write: a scene, which is
@@ -42,7 +43,7 @@ examples:
     kornia-tidy raw simulate --image rgb.png --depth depth.pfm --pattern GBRG \\
         --bits 14 --full-well 30000 --read-noise 3 -o coded.dng
 
-In Python: RawCapture.from_scene(image, depth, TiDyOptics(sensor=None), camera, noise)
+In Python: simulate_scene(image, depth, TiDyOptics(sensor=None), camera, noise)
 """
 
 FULL_WELL, READ_NOISE = 10500.0, 2.4  # electrons: a small industrial sensor of 3.45 um pixels
@@ -104,10 +105,9 @@ def run(args: argparse.Namespace) -> None:
     _check_output(output, args)
     import torch  # noqa: PLC0415
 
-    from kornia_tidy.optics.phase_masks import PixelwiseMask  # noqa: PLC0415
-    from kornia_tidy.sensor.dng_file import write_dng  # noqa: PLC0415
-    from kornia_tidy.sensor.raw_file import RawCapture  # noqa: PLC0415
-    from kornia_tidy.tidy_optics import TiDyOptics  # noqa: PLC0415
+    from kornia_tidy.camera.tidy_optics import TiDyOptics  # noqa: PLC0415
+    from kornia_tidy.masks.pixelwise import PixelwiseMask  # noqa: PLC0415
+    from kornia_tidy.raw.dng_file import write_dng  # noqa: PLC0415
 
     stages = Stages()
     with stages("read"):
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> None:
         tell("PSFs", light_in_words(bank, optics))
         color = args.color or ("camera" if args.like else "channels")
         with stages("capture"):
-            raw = RawCapture.from_scene(
+            raw = simulate_scene(
                 image,
                 scene.depth,
                 optics,
@@ -152,8 +152,8 @@ def _sensor(args: argparse.Namespace) -> RawCapture:
     """The camera of a file, or one in words."""
     import torch  # noqa: PLC0415
 
-    from kornia_tidy.sensor.raw_color import srgb_from_xyz  # noqa: PLC0415
-    from kornia_tidy.sensor.raw_file import RawCapture  # noqa: PLC0415
+    from kornia_tidy.raw.capture import RawCapture  # noqa: PLC0415
+    from kornia_tidy.raw.color import srgb_from_xyz  # noqa: PLC0415
 
     if args.like is not None:
         for name in ("pattern", "bits", "black"):
@@ -172,8 +172,8 @@ def _sensor(args: argparse.Namespace) -> RawCapture:
 
 
 def _noise(args: argparse.Namespace) -> SensorNoise:
+    from kornia_tidy.calibration.noise.photon_transfer import read_json  # noqa: PLC0415
     from kornia_tidy.sensor.noise import SensorNoise  # noqa: PLC0415
-    from kornia_tidy.sensor.photon_transfer import read_json  # noqa: PLC0415
 
     if args.noise is None:
         return SensorNoise.physical(

@@ -12,19 +12,19 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_positive
+from kornia_tidy.coded_datasets.layout import BESIDE, Layout
+from kornia_tidy.coded_datasets.render_scenes import render_scenes, shard_items_within
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
 from kornia_tidy.files import read_bytes
-from kornia_tidy.rendering.layout import BESIDE, Layout
-from kornia_tidy.rendering.render_scenes import render_scenes, shard_items_within
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.trained import build_optics, load_trained
 from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.systems import SYSTEMS
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.systems.presets import SYSTEMS
 from kornia_tidy.training.data_sets import SPLITS, make_scenes
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.trained import build_optics, load_trained
 
 OF_SCENES = ("data", "root", "size", "scenes", "validation_scenes", "depth_range", "seed")
 OF_CAMERA = (
@@ -63,7 +63,7 @@ examples:
     torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy.cli render ... -o captures
 
 In Python, in a data loader:
-  from kornia_tidy.rendering import CodedCaptures
+  from kornia_tidy.coded_datasets.captures import CodedCaptures
   CodedCaptures("captures")[0]        # {"coded", "image", "depth", "mask", "index", "name"}
 """
 

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.optics.psf_bank import PSFBank
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.psf.psf_bank import PSFBank
 
 
 class Stages:

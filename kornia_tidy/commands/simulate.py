@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from kornia_tidy.camera.tidy_optics import COLOR_SPACES, TiDyOptics
 from kornia_tidy.commands.options import (
     add_camera_options,
     add_depth_options,
@@ -20,10 +21,9 @@ from kornia_tidy.commands.options import (
 from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.optics.phase_masks import PixelwiseMask
-from kornia_tidy.scene.compositing import COMPOSITING
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.tidy_optics import COLOR_SPACES, TiDyOptics
 
 DESCRIPTION = """\
 Simulate what a camera captures whose K phase masks are shown one after another

@@ -13,16 +13,17 @@ from kornia.geometry.transform import resize
 from torch import Tensor
 from tqdm import tqdm
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.commands.options import add_depth_options, check_output, middle_depths, read_scene, seed
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.figures import require_matplotlib
+from kornia_tidy.figures.style import require_matplotlib
+from kornia_tidy.figures.system_survey import survey
+from kornia_tidy.figures.systems import Portrait, draw_systems
 from kornia_tidy.files import write_bytes
-from kornia_tidy.systems import SYSTEMS, System, published_system
-from kornia_tidy.systems.figure import Portrait, draw_systems
-from kornia_tidy.systems.survey import survey
-from kornia_tidy.tidy_optics import TiDyOptics
-from kornia_tidy.training.tasks import metres
+from kornia_tidy.inference.tasks import metres
+from kornia_tidy.systems.presets import SYSTEMS, published_system
+from kornia_tidy.systems.system import System
 
 DESCRIPTION = """\
 List nine published optical systems and draw them side by side into one picture:

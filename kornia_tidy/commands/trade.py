@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice
 from kornia_tidy.commands.options import (
     add_camera_options,
@@ -25,11 +26,10 @@ from kornia_tidy.commands.report import scene_in_words, tell
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.figures import require_matplotlib
+from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.files import write_bytes
-from kornia_tidy.optics.phase_masks import PixelwiseMask
-from kornia_tidy.scene.convolution import largest_window
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.render.borders import largest_window
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.costs import DEVICES
 from kornia_tidy.tradeoff.figure import draw_trade

@@ -18,7 +18,7 @@ from kornia_tidy.data.metadata import with_text
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
-from kornia_tidy.units import tell_once
+from kornia_tidy.optics.units import tell_once
 
 UNKNOWN = 65535  # the largest number of 16 bits: how many data sets mark what no sensor saw
 NEAR_DISPARITY = 5.0  # pixels of disparity are more than this, metres of a room less

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from kornia_tidy.camera.dataset_transform import item_generator
 from kornia_tidy.data.scene_dataset import Transform, UnreadableItemError, item_index
-from kornia_tidy.dataset_transform import item_generator
 
 
 class Patches(Dataset[Any]):
@@ -34,7 +34,7 @@ class Patches(Dataset[Any]):
         - Every tensor of the sample that is as high and wide as the image is cut with it.
 
     Example:
-        >>> from kornia_tidy.data import DeadLeaves
+        >>> from kornia_tidy.data.dead_leaves import DeadLeaves
         >>> patches = Patches(DeadLeaves(3, 40, 60, num_leaves=50), size=32, count=5)
         >>> len(patches), patches[4]["image"].shape, patches[4]["mask"].shape
         (5, torch.Size([3, 32, 32]), torch.Size([1, 32, 32]))

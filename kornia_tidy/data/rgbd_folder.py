@@ -39,7 +39,8 @@ class RGBDFolder(SceneDataset):
 
     Example:
         >>> import tempfile, torch
-        >>> from kornia_tidy.data import write_depth, write_image
+        >>> from kornia_tidy.data.depth_files import write_depth
+        >>> from kornia_tidy.data.image_files import write_image
         >>> folder = tempfile.TemporaryDirectory()
         >>> for name in ("lamp", "chair"):
         ...     write_image(f"{folder.name}/{name}.png", torch.rand(3, 4, 6))
@@ -93,7 +94,8 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
 
     Example:
         >>> import tempfile, torch
-        >>> from kornia_tidy.data import write_depth, write_image
+        >>> from kornia_tidy.data.depth_files import write_depth
+        >>> from kornia_tidy.data.image_files import write_image
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_image(f"{folder}/lamp.png", torch.rand(3, 4, 6))
         ...     write_depth(f"{folder}/lamp_depth.png", torch.full((1, 4, 6), 1.25), scale=0.001)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.figures.style import DEPTH_COLORS, quiet, require_matplotlib
-from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.figures.depth import depth_at, depth_bar, metres
 from kornia_tidy.figures.style import (
     ACCENT,
@@ -22,11 +23,10 @@ from kornia_tidy.figures.style import (
     quiet,
     require_matplotlib,
 )
-from kornia_tidy.optics.camera import ThinLensCamera
-from kornia_tidy.optics.modulator import DwellTimes
-from kornia_tidy.optics.phase_masks import central_square
-from kornia_tidy.optics.psf_bank import PSFBank
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.masks.base import central_square
+from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.psf_bank import PSFBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +54,7 @@ def explain(
 
     Raises:
         ImportError: if matplotlib is missing.
-        TypeError: if the camera is not a :class:`~kornia_tidy.optics.camera.ThinLensCamera`, which knows metres.
+        TypeError: if the camera is not a :class:`~kornia_tidy.optics.thin_lens.ThinLensCamera`, which knows metres.
 
     Convention:
         - Each PSF is scaled to its own brightest value and drawn with the square root of its light.

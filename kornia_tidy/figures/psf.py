@@ -137,7 +137,7 @@ def _middle(sheet: PSFSheet) -> str:
 
 
 def ring_centres(frequencies: int) -> list[float]:
-    """Return the middle of each ring of :func:`kornia_tidy.systems.survey.contrast_transfer`, in cycles a pixel.
+    """Return the middle of each ring of :func:`kornia_tidy.figures.system_survey.contrast_transfer`, in cycles a pixel.
 
     Example:
         >>> ring_centres(2)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.following import is_value_unknown
-from kornia_tidy.units import check_head_image, layout_remedy
+from kornia_tidy.optics.units import check_head_image, layout_remedy
+from kornia_tidy.runtime.tracing import is_value_unknown
 
 
 class ReconstructionHead(nn.Module, ABC):

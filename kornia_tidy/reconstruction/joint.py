@@ -36,7 +36,7 @@ class JointHead(nn.Module):
 
     Example:
         >>> import torch
-        >>> from kornia_tidy.reconstruction import AttentionUNet
+        >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
         >>> head = JointHead(AttentionUNet(out_channels=4, width=4)).eval()
         >>> estimate = head(torch.rand(1, 3, 32, 48))
         >>> estimate.depth.shape, estimate.image.shape

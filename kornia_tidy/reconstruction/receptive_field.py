@@ -25,7 +25,8 @@ def total_stride(head: nn.Module) -> int:
     It is the ``stride`` of the :class:`ReconstructionHead` in it, and 1 where there is none.
 
     Example:
-        >>> from kornia_tidy.reconstruction import AttentionUNet, JointHead
+        >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
+        >>> from kornia_tidy.reconstruction.joint import JointHead
         >>> total_stride(JointHead(AttentionUNet(out_channels=4, width=2)))
         16
     """

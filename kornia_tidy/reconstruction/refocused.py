@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
-from kornia_tidy.scene.convolution import from_spectrum, next_fast_size, pad_border, to_spectrum
+from kornia_tidy.render.borders import from_spectrum, next_fast_size, pad_border, to_spectrum
 
 WEIGHT = 0.3  # of the prior in inverse filters, in units of a PSF's energy squared
 
@@ -76,7 +76,7 @@ class Refocused(ReconstructionHead):
     over the whole picture.
 
     Example:
-        >>> from kornia_tidy.reconstruction import AttentionUNet
+        >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
         >>> head = Refocused(AttentionUNet(3 + 4, out_channels=1, width=4), layers=4).eval()
         >>> head.look_through(PSFBank.from_measured(torch.rand(4, 1, 5, 5), torch.arange(4.0)))
         >>> head(torch.rand(2, 3, 16, 20)).shape

@@ -27,7 +27,7 @@ class Residual(nn.Module):
     estimating the residual of an image; zero to begin with, as Goyal et al. (2017), section 5.1.
 
     Example:
-        >>> from kornia_tidy.reconstruction import AttentionUNet
+        >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
         >>> head = Residual(AttentionUNet(out_channels=4, width=4)).eval()
         >>> capture = torch.rand(1, 3, 20, 30)
         >>> depth, image = head(capture).split([1, 3], 1)

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_float_tensor, check_positive
-from kornia_tidy.optics.psf_bank import PSFBank
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
-from kornia_tidy.scene.convolution import next_fast_size
+from kornia_tidy.render.borders import next_fast_size
 
 BORDERS = ("smooth", "circular")
 
@@ -90,7 +90,7 @@ def tikhonov_layers(
     .. math:: \arg\min_{x_k} \lVert \sum_k h_k * x_k - y \rVert^2 + \gamma \sum_k \lVert x_k \rVert^2, \qquad
               X_k = \frac{\bar{H}_k Y}{\gamma + \sum_j |H_j|^2}
 
-    The model is :func:`kornia_tidy.scene.scatter`. All layers are solved jointly: at each frequency the normal matrix
+    The model is :func:`kornia_tidy.render.scatter`. All layers are solved jointly: at each frequency the normal matrix
     is the identity and one outer product, which Sherman and Morrison's formula inverts, so nothing of size D x D is
     built. Each layer is given of every frequency the share that its PSF passes, compared with the others.
 

@@ -14,18 +14,16 @@ import torch
 from torch import nn
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.optics.camera import ThinLensCamera
+from kornia_tidy.masks.base import PhaseMasks
+from kornia_tidy.masks.fresnel import FresnelLens
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.masks.radial import RadialMask
+from kornia_tidy.masks.spiral import SpiralMask
+from kornia_tidy.masks.zernike import ZernikeMask
+from kornia_tidy.modulator.modulator import DiffractionEfficiency
 from kornia_tidy.optics.materials import NOA61, PMMA, cauchy_through
-from kornia_tidy.optics.modulator import DiffractionEfficiency
-from kornia_tidy.optics.phase_masks import (
-    FresnelLens,
-    PhaseMasks,
-    PixelwiseMask,
-    RadialMask,
-    SpiralMask,
-    ZernikeMask,
-)
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.systems.system import RGB, System
 
 # ---------------------------------------------------------------------- the PhaseCam3D family

@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from kornia_tidy.masks.base import MASK_SPAN, PhaseMasks
+from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.camera import ThinLensCamera
-from kornia_tidy.optics.modulator import DwellTimes
-from kornia_tidy.optics.phase_masks import MASK_SPAN, PhaseMasks
 from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.sensor.noise import SensorNoise
 
 RGB = Spectrum.rgb()
@@ -42,7 +42,7 @@ class System:
         smooth_iris: the iris is a disc with a smooth edge. False: the published grid of whole pixels.
 
     Example:
-        >>> from kornia_tidy.systems import published_system
+        >>> from kornia_tidy.systems.presets import published_system
         >>> system = published_system("ikoma2021")
         >>> round(system.camera().f_number, 1), system.compositing
         (6.3, 'occlusion')

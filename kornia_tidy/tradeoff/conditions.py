@@ -14,33 +14,26 @@ import torch
 from torch import Tensor
 
 import kornia_tidy
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 
 MEASURED_CODE = (
     "**/*.c",
     "**/*.h",
-    "camera_*.py",
-    "candidates.py",
-    "capture_error.py",
+    "camera/tidy_optics.py",
     "checks.py",
-    "compiled.py",
-    "depth_energy.py",
     "fidelity.py",
-    "following.py",
-    "occlusion_cost.py",
+    "kernels/**/*.py",
+    "masks/**/*.py",
+    "modulator/**/*.py",
     "optics/**/*.py",
-    "planning.py",
-    "render_cost.py",
-    "render_plan.py",
-    "scene/**/*.py",
-    "scene_light.py",
+    "planning/**/*.py",
+    "psf/**/*.py",
+    "render/**/*.py",
+    "runtime/**/*.py",
     "sensor/*.py",
-    "threads.py",
-    "tidy_optics.py",
     "tradeoff/costs.py",
     "tradeoff/ladder.py",
     "tradeoff/measure.py",
-    "units.py",
 )
 
 

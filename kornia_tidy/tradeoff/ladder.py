@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice
 from kornia_tidy.fidelity import LAYERS, PRESETS, Fidelity
-from kornia_tidy.optics.psf_bank import STRAY_LIGHT
-from kornia_tidy.planning import Planner
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.planning.planner import Planner
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 
 Value = str | float | int | None
 PRESET, PLAN = "preset", "plan"  # stand where a knob's name would

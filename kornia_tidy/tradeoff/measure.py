@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.scene.convolution import largest_window
-from kornia_tidy.tidy_optics import TiDyOptics
+from kornia_tidy.render.borders import largest_window
 from kornia_tidy.tradeoff.costs import peak_bytes, seconds
 from kornia_tidy.tradeoff.ladder import PRESET, Setting, Value
 

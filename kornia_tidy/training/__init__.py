@@ -1,10 +1,6 @@
-"""Training optics and network together: settings, data, checkpoints, and the Lightning module that joins them.
+"""Training optics and network together: data, checkpoints, and the Lightning module that joins them.
 
-Lightning is an extra (``pip install 'kornia-tidy[train]'``) and is imported by ``module``, ``data_module``,
-``callbacks``, ``checkpoint`` and ``run`` only; what is needed to use a trained system is free of it.
+The settings of a run come in, checkpoints of a trained system go out. Read ``run.py`` first. Lightning is an extra
+(``pip install 'kornia-tidy[train]'``), imported by ``module``, ``data_module``, ``callbacks``, ``checkpoint`` and
+``run`` only.
 """
-
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.trained import TrainedSystem, load_trained
-
-__all__ = ["TrainedSystem", "TrainingSettings", "load_trained"]

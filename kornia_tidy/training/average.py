@@ -7,7 +7,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera_settings import EXTRA_STATE
+from kornia_tidy.psf.camera_settings import EXTRA_STATE
 
 
 class MovingAverage(nn.Module):

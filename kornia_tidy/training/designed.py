@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 from tqdm import tqdm
 
-from kornia_tidy.optics.coded_lens import CodedLens
-from kornia_tidy.optics.mask_design import design, restoration_error
+from kornia_tidy.mask_design.objectives import design, restoration_error
+from kornia_tidy.psf.psf_model import CodedLens
 
 LEAST_SIGMA = 1e-3  # of full scale; without noise every blur can be undone, and there is nothing to design
 SCENE_SPREAD = 0.2  # standard deviation of a scene's light, of full scale
@@ -29,8 +29,8 @@ def design_masks(lens: CodedLens, steps: int, sigma: float = 0.01, *, progress: 
         progress: show a progress bar.
 
     Returns:
-        The :func:`~kornia_tidy.optics.mask_design.restoration_error` before each step, averaged over the colours, in
-        the largest window that the fidelity allows.
+        The :func:`~kornia_tidy.mask_design.objectives.restoration_error` before each step, averaged over the colours,
+        in the largest window that the fidelity allows.
 
     Raises:
         ValueError: if the steps are not positive.

@@ -9,25 +9,17 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera_settings import EXTRA_STATE
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.inference.settings import SCHEDULES, TrainingSettings, differences
+from kornia_tidy.inference.tasks import LOSSES, MAPS, Loss, centre_crop, nearness, split_maps, task_loss
+from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, look_through
+from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
-from kornia_tidy.tidy_optics import TiDyOptics
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
-from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
-from kornia_tidy.training.tasks import (
-    LOSSES,
-    MAPS,
-    Loss,
-    centre_crop,
-    nearness,
-    split_maps,
-    task_loss,
-)
-from kornia_tidy.training.trained import build_head, build_optics, check_weights, describe, fix_window, look_through
 
 
 class Seen(NamedTuple):
@@ -67,7 +59,7 @@ class TidyTraining(pl.LightningModule):
     Args:
         optics: the camera. Masks in training keep its PSF window, which checkpoints tell.
         head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint.
-        task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is learnt as :func:`~kornia_tidy.training.tasks.nearness`.
+        task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is learnt as :func:`~kornia_tidy.inference.tasks.nearness`.
         loss: of a map, its truth and its validity; the same for all maps.
         lr: learning rate of the network, and of what the optics may learn besides masks.
         lr_metres: learning rate of the masks, in metres of height.

@@ -9,8 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.image_files import write_image
-from kornia_tidy.tidy_optics import TiDyOptics
 
 SCALE, GAP = 4, 2  # pixels of a picture for one of a mask or PSF; between pictures
 DEPTHS, SCENES = 7, 4  # shown

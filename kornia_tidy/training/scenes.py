@@ -178,7 +178,7 @@ class SceneLoader(DataLoader):
         world: number of processes that share the scenes.
 
     Example:
-        >>> from kornia_tidy.data import DeadLeaves
+        >>> from kornia_tidy.data.dead_leaves import DeadLeaves
         >>> loader = SceneLoader(DeadLeaves(4, 32, 32), batch=2)
         >>> batch = next(iter(loader))
         >>> batch["image"].shape, loader.state_dict()

@@ -23,7 +23,8 @@ import numpy as np
 import rawpy
 import torch
 
-from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.develop import develop
 from tests.base import DATA
 
 LARGEST = DATA / "raw/imageio+test_images/Blackmagic.dng"
@@ -44,7 +45,7 @@ def by_rawpy(path: str, algorithm: str) -> np.ndarray:
 
 
 def by_us(path: str, algorithm: str) -> torch.Tensor:
-    return RawCapture.open(path).to_rgb(f"libraw_{algorithm}", encoded=False)
+    return develop(RawCapture.open(path), f"libraw_{algorithm}", encoded=False)
 
 
 def start() -> None:

@@ -23,11 +23,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from kornia_tidy.scene import occlusion_tiling, tiling
-from kornia_tidy.scene.compositing import render
-from kornia_tidy.scene.convolution import next_fast_size
+from kornia_tidy.render.backends import tiled as tiling
+from kornia_tidy.render.backends import tiled_occlusion as occlusion_tiling
+from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.compositing import render
 from tests.base import DATA
-from tests.scene.scenes import Bank
+from tests.render.scenes import Bank
 
 ROUNDS = 7
 

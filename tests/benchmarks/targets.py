@@ -19,8 +19,8 @@ from torch.nn.functional import interpolate, pad
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.optics.spectrum import camera_spectrum
-from kornia_tidy.scene.compositing import render
-from kornia_tidy.scene.convolution import next_fast_size
+from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.compositing import render
 from kornia_tidy.tradeoff.costs import peak_bytes
 from tests.benchmarks.rendering_against_peers import (
     RENDERERS,
@@ -31,7 +31,7 @@ from tests.benchmarks.rendering_against_peers import (
     make_bank,
     tiled_occlusion,
 )
-from tests.scene.scenes import Bank
+from tests.render.scenes import Bank
 
 MASKS, LAYERS, WINDOW = 5, 21, 23
 Row = tuple[str, str, str, float, str]  # number, what, against what, ratio, target

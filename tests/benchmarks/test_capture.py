@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.optics import AliasingWarning
+from kornia_tidy.psf import AliasingWarning
 
 
 @pytest.fixture(params=["paper", "draft", "balanced"])

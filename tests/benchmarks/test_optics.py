@@ -6,21 +6,10 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.optics import (
-    CubicMask,
-    FourierMask,
-    GreyLevels,
-    PixelCrosstalk,
-    RadialMask,
-    SpatialLightModulator,
-    SpiralMask,
-    Switching,
-    ZernikeMask,
-    autocorrelation_witness,
-    camera_spectrum,
-    circular_aperture,
-    polygon_aperture,
-)
+from kornia_tidy.mask_design import autocorrelation_witness
+from kornia_tidy.masks import CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
+from kornia_tidy.modulator import GreyLevels, PixelCrosstalk, SpatialLightModulator, Switching
+from kornia_tidy.optics import camera_spectrum, circular_aperture, polygon_aperture
 
 
 class TestOptics:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from kornia_tidy import PSFBank
-from kornia_tidy.scene import assign_layers, render
-from kornia_tidy.scene.layers import LAYER_MODES
+from kornia_tidy.render import assign_layers, render
+from kornia_tidy.render.layers import LAYER_MODES
 
 
 def run(bench, size, device, compositing="gather", layers=21, mode="linear", window=23, gradients=False):

@@ -7,10 +7,11 @@ import os
 import pytest
 import torch
 
-from kornia_tidy import cli, compiled
+from kornia_tidy import cli
 from kornia_tidy.commands import info
+from kornia_tidy.kernels import build as compiled
 from tests.base import BaseTester
-from tests.test_compiled import forget
+from tests.kernels.test_build import forget
 
 
 class TestInfo(BaseTester):

@@ -10,8 +10,9 @@ from safetensors.torch import load_file, save_file
 
 from kornia_tidy import LearnableDwellTimes, PixelwiseMask, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.lab import PanelPlacement, SLMFrames, read_slm_frames
-from kornia_tidy.optics import NOA61, GreyLevels
+from kornia_tidy.mask_export import PanelPlacement, SLMFrames, read_slm_frames
+from kornia_tidy.modulator import GreyLevels
+from kornia_tidy.optics import NOA61
 from tests.base import BaseTester
 
 

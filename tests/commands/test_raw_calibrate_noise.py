@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kornia_tidy.calibration.noise.photon_transfer import read_json
 from kornia_tidy.cli import main
-from kornia_tidy.sensor.dng_file import write_dng
-from kornia_tidy.sensor.photon_transfer import read_json
-from kornia_tidy.sensor.raw_file import RawInfo
+from kornia_tidy.raw.capture import RawInfo
+from kornia_tidy.raw.dng_file import write_dng
 from tests.base import BaseTester
-from tests.sensor.flats import flats
+from tests.calibration.noise.flats import flats
 
 INFO = RawInfo("Acme", "One", iso=800.0)
 

@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask, PSFBank, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.calibration import MeasuredPSFs
+from kornia_tidy.calibration.psf import MeasuredPSFs
 from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import write_image
-from kornia_tidy.optics.initial_masks import fisher_mask
+from kornia_tidy.masks.initial_heights import fisher_mask
 from tests.base import BaseTester
-from tests.calibration.captures import exposed, on_pixels, planes, point_light
+from tests.calibration.psf.captures import exposed, on_pixels, planes, point_light
 
 WINDOW, SIDE, CAMERA = 15, 62, ThinLensCamera()
 NOISE = ["--full-well", "10500", "--read-noise", "2.4", "--window", str(WINDOW)]

@@ -10,10 +10,11 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.commands import raw_develop
 from kornia_tidy.data.image_files import read_image
-from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.develop import develop
 from tests.base import BaseTester
-from tests.sensor.c330 import ramp
-from tests.sensor.dng import dng, patched
+from tests.raw.c330 import ramp
+from tests.raw.dng import dng, patched
 
 
 @pytest.fixture
@@ -47,15 +48,19 @@ class TestRawDevelop(BaseTester):
         stored = cv2.imread(str(tmp_path / "a.tif"), cv2.IMREAD_UNCHANGED)
         assert stored.dtype == np.uint16
         raw = RawCapture.open(files[0])
-        self.assert_close(read_image(tmp_path / "a.tif"), raw.to_rgb(encoded=False).clamp(0, 1), atol=1 / 65535)
+        self.assert_close(read_image(tmp_path / "a.tif"), develop(raw, encoded=False).clamp(0, 1), atol=1 / 65535)
         preview = read_image(tmp_path / "a.jpg")
-        assert (preview - raw.to_rgb().clamp(0, 1)).mean().abs() < 0.02  # JPEG of noise, encoded
+        assert (preview - develop(raw).clamp(0, 1)).mean().abs() < 0.02  # JPEG of noise, encoded
 
     def test_feature_options_reach_the_picture(self, files, tmp_path):
         options = "--demosaic half --white-balance 2 1 1.5 --highlights keep --adaptation CAT16 --no-preview"
         assert main(["raw", "develop", files[2], "-o", str(tmp_path), *options.split()]) == 0
-        expected = RawCapture.open(files[2]).to_rgb(
-            "half", white_balance=torch.tensor([2.0, 1.0, 1.5]), highlights="keep", adaptation="CAT16"
+        expected = develop(
+            RawCapture.open(files[2]),
+            "half",
+            white_balance=torch.tensor([2.0, 1.0, 1.5]),
+            highlights="keep",
+            adaptation="CAT16",
         )
         self.assert_close(read_image(tmp_path / "c.png"), expected.clamp(0, 1), atol=1 / 65535)
         assert not (tmp_path / "c.jpg").exists()

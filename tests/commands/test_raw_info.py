@@ -7,7 +7,7 @@ import pytest
 
 from kornia_tidy.cli import main
 from tests.base import BaseTester, shared
-from tests.sensor.dng import dng
+from tests.raw.dng import dng
 
 
 @pytest.fixture

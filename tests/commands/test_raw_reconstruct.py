@@ -19,15 +19,16 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.commands import raw_reconstruct
 from kornia_tidy.data import read_depth, read_image
-from kornia_tidy.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.sensor.dng_file import encode_dng
-from kornia_tidy.sensor.raw_file import RawCapture
-from kornia_tidy.sensor.raw_simulation import simulate_raw
-from kornia_tidy.training.light_head import LightHead, reconstruct_light
+from kornia_tidy.inference.light_head import LightHead, reconstruct_light
+from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.state_file import write_state
+from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.develop import develop
+from kornia_tidy.raw.dng_file import encode_dng
+from kornia_tidy.raw.simulation import simulate_raw
 from kornia_tidy.training.module import TidyTraining
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.state_file import write_state
-from kornia_tidy.training.trained import load_trained
 from tests.base import BaseTester, shared
 
 FILES = 8  # in the batch that gets a signal
@@ -190,7 +191,7 @@ class TestRawReconstruct(BaseTester):
         (tmp_path / "a.dng").write_bytes(raw_file())
         assert reconstruct([str(tmp_path / "a.dng")], "edof-0", tmp_path) == 0
         assert json.loads((tmp_path / "a.json").read_text())["head"] == "edof-0"
-        light = RawCapture.open(tmp_path / "a.dng").to_rgb(encoded=False, upright=False)
+        light = develop(RawCapture.open(tmp_path / "a.dng"), encoded=False, upright=False)
         image, _ = reconstruct_light(LightHead(load_pretrained("edof-0")), light)
         assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-6
         with pytest.raises(SystemExit):

@@ -14,11 +14,13 @@ import torch
 from kornia_tidy import SensorNoise
 from kornia_tidy.data import read_image
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.pretrained import load_pretrained
+from kornia_tidy.inference.light_head import LightHead
+from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.develop import develop
+from kornia_tidy.raw.dng_file import write_dng
+from kornia_tidy.raw.simulation import simulate_scene
 from kornia_tidy.reconstruction import receptive_field
-from kornia_tidy.sensor.dng_file import write_dng
-from kornia_tidy.sensor.raw_file import RawCapture
-from kornia_tidy.training.light_head import LightHead
 from tests.base import BaseTester
 
 ROWS, COLUMNS = 4000, 6000
@@ -36,7 +38,7 @@ def capture(tmp_path):
     optics.sensor = None
     image, depth = dead_leaves(SIDE, SIDE, depth_range=optics.camera.depth_range, num_leaves=250, seed=1)
     camera = replace(RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095), camera_to_srgb=torch.eye(3))
-    raw = RawCapture.from_scene(image, depth, optics, camera, SensorNoise.physical(10500, 2.4))
+    raw = simulate_scene(image, depth, optics, camera, SensorNoise.physical(10500, 2.4))
     path = tmp_path / "large.dng"
     write_dng(path, replace(raw, counts=raw.counts.repeat(1, ROWS // SIDE, COLUMNS // SIDE)))
     return path
@@ -69,7 +71,7 @@ class TestLargeCapture(BaseTester):
         assert shown == sorted(shown)
 
         head = LightHead(load_pretrained("edof-5"))
-        light = RawCapture.open(capture).to_rgb(encoded=False, upright=False)
+        light = develop(RawCapture.open(capture), encoded=False, upright=False)
         written = read_image(capture.with_suffix(".png"))
         assert written.shape == (3, ROWS, COLUMNS)
         margin = -(-receptive_field(head) // 16) * 16

@@ -6,13 +6,15 @@ import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
 from kornia_tidy.cli import main
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.data.rgbd import read_rgbd
-from kornia_tidy.sensor.photon_transfer import PhotonTransfer, TransferLine, write_json
-from kornia_tidy.sensor.raw_file import RawCapture
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.develop import develop
+from kornia_tidy.raw.simulation import simulate_scene
 from tests.base import BaseTester
 
 SCENE = ["raw", "simulate", "--image", "image.png", "--depth", "depth.pfm", "--fidelity", "draft", "--masks", "1"]
@@ -38,7 +40,7 @@ class TestRawSimulate(BaseTester):
         back = RawCapture.open("out.dng")
         image, depth, _ = read_rgbd("image.png", "depth.pfm")
         optics = TiDyOptics(PixelwiseMask(1, generator=seeded(0)), sensor=None, fidelity="draft")
-        raw = RawCapture.from_scene(
+        raw = simulate_scene(
             image,
             depth,
             optics,
@@ -58,7 +60,7 @@ class TestRawSimulate(BaseTester):
         self.assert_close(raw.camera_to_srgb, torch.eye(3), atol=1e-4, rtol=0)
         self.assert_close(raw.white_balance, torch.ones(4), atol=1e-5, rtol=0)
         light = raw.planes()[[0, 1, 3]]
-        self.assert_close(raw.to_rgb("half", encoded=False)[[0, 2]], light[[0, 2]].clamp(max=1), atol=1e-3, rtol=0)
+        self.assert_close(develop(raw, "half", encoded=False)[[0, 2]], light[[0, 2]].clamp(max=1), atol=1e-3, rtol=0)
 
     def test_feature_like_a_file_with_a_calibration(self, scene):
         assert main([*SCENE, "-o", "first.dng", "--pattern", "BGGR", "--bits", "10", "--black", "50"]) == 0

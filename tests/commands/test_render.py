@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
+from kornia_tidy.coded_datasets import CodedCaptures
 from kornia_tidy.data import write_depth, write_image
-from kornia_tidy.rendering import CodedCaptures
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.state_file import write_state
-from kornia_tidy.training.trained import build_head, build_optics
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.state_file import write_state
+from kornia_tidy.inference.trained import build_head, build_optics
 from tests.base import BaseTester
-from tests.rendering.samples import contents
+from tests.coded_datasets.samples import contents
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["--size", "40", "--scenes", "3", "--fidelity", "draft", "--border", "replicate", "--depth-range", "0.4", "4"]

@@ -10,8 +10,8 @@ from kornia_tidy.cli import main
 from kornia_tidy.commands.systems import table
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.inference.tasks import metres
 from kornia_tidy.systems import SYSTEMS
-from kornia_tidy.training.tasks import metres
 from tests.base import BaseTester, shared
 
 

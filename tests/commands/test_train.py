@@ -10,8 +10,8 @@ import torch
 
 from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import read_image
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.trained import load_trained
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.trained import load_trained
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset, Subset
 from kornia_tidy import TiDyOptics
 from kornia_tidy.data import DeadLeaves, Patches, UnreadableItemError, central_crop, crop, random_crop
 from tests.base import BaseTester
-from tests.pipeline_samples import FAST
+from tests.camera.pipeline_samples import FAST
 
 
 def numbered(height, width):

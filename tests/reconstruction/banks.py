@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from kornia_tidy import PSFBank
-from kornia_tidy.scene import render
+from kornia_tidy.render import render
 
 
 def make_psfs(layers=3, channels=2, size=5, *, peak=0.6, device="cpu", dtype=torch.float64):

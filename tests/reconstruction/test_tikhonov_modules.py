@@ -10,7 +10,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import nn
 
 from kornia_tidy import PSFBank, SensorNoise, TiDyOptics
-from kornia_tidy.optics.phase_masks.cubic import CubicMask
+from kornia_tidy.masks.cubic import CubicMask
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers, tikhonov, tikhonov_layers
 from tests.base import BaseTester

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
+from kornia_tidy.inference.heads import PlainHead
 from kornia_tidy.reconstruction import (
     AttentionUNet,
     JointHead,
@@ -24,7 +25,6 @@ from kornia_tidy.reconstruction import (
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import maps_of, total_stride
 from kornia_tidy.reconstruction.tile_grid import TileGrid
-from kornia_tidy.training.heads import PlainHead
 from tests.base import BaseTester
 
 

@@ -12,12 +12,13 @@ import torch
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.optics import AliasingWarning, CubicMask, RadialMask, ZernikeMask
-from kornia_tidy.optics.fisher_information import crlb
+from kornia_tidy.figures.system_survey import contrast_transfer
+from kornia_tidy.inference.tasks import metres
+from kornia_tidy.mask_design.fisher_information import crlb
+from kornia_tidy.masks import CubicMask, RadialMask, ZernikeMask
+from kornia_tidy.psf import AliasingWarning
 from kornia_tidy.systems import SYSTEMS, published_system
 from kornia_tidy.systems.presets import cubic_in_zernikes
-from kornia_tidy.systems.survey import contrast_transfer
-from kornia_tidy.training.tasks import metres
 from tests.base import BaseTester, shared
 from tests.scenes import load_scene
 

@@ -90,16 +90,16 @@ class TestConditions(BaseTester):
         assert code_hash() == before
         hashes = {before}
         for name in (
-            "scene/layers.py",
-            "scene/direct.c",
-            "scene/occlusion_direct.c",
-            "optics/mutual_intensity.c",
-            "vectors.h",
-            "compiled.py",
-            "optics/phase_masks/base.py",
+            "render/layers.py",
+            "kernels/direct.c",
+            "kernels/occlusion.c",
+            "kernels/mutual_intensity.c",
+            "kernels/vectors.h",
+            "kernels/build.py",
+            "masks/base.py",
             "sensor/noise.py",
-            "planning.py",
-            "capture_error.py",
+            "planning/planner.py",
+            "planning/error_model.py",
             "tradeoff/ladder.py",
         ):
             (copy / name).write_text("")
@@ -108,10 +108,10 @@ class TestConditions(BaseTester):
 
     def test_feature_all_that_a_measurement_imports_is_in_the_hash(self):
         """But for what draws, writes or names, and for other ways to take pictures, which no row comes from."""
-        script = "import sys, kornia_tidy.tradeoff.measure, kornia_tidy.planning; print(*sys.modules)"
+        script = "import sys, kornia_tidy.tradeoff.measure, kornia_tidy.planning.planner; print(*sys.modules)"
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, text=True)
         root = Path(kornia_tidy.__file__).parent
-        elsewhere = {"dataset_transform", "files", "motion", "multi_shot", "tensor_files", "__init__"}
+        elsewhere = {"camera/dataset_transform", "files", "camera/motion", "camera/burst", "tensor_files", "__init__"}
         elsewhere |= {"tradeoff/conditions", "tradeoff/figure", "tradeoff/files", "tradeoff/__init__"}
         names = {
             name.partition(".")[2].replace(".", "/") for name in done.stdout.split() if name.startswith("kornia_tidy.")

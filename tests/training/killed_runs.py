@@ -21,10 +21,11 @@ from typing import Any
 import torch
 from torch import nn
 
-from kornia_tidy.training import callbacks, heads, run
+from kornia_tidy.inference import heads
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.training import callbacks, run
 from kornia_tidy.training.module import TidyTraining
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.state_file import read_state
 from tests.forks import fork, wait
 
 SETTINGS = TrainingSettings(

@@ -6,9 +6,9 @@ from torch import nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.training.scenes import Broken, SceneLoader
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.trained import build_optics, check_weights, load_trained, load_weights
 from tests.base import BaseTester
 
 pl = pytest.importorskip("lightning.pytorch")

@@ -11,12 +11,12 @@ import torch
 from torch import nn
 
 from kornia_tidy import DefocusRange, ThinLensCamera
+from kornia_tidy.inference.heads import make_head
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.state_file import read_state, write_state
+from kornia_tidy.inference.tasks import LOSSES, centre_crop, metres, nearness, split_maps, task_loss
 from kornia_tidy.training.average import MovingAverage
-from kornia_tidy.training.heads import make_head
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
-from kornia_tidy.training.settings import TrainingSettings
-from kornia_tidy.training.state_file import read_state, write_state
-from kornia_tidy.training.tasks import LOSSES, centre_crop, metres, nearness, split_maps, task_loss
 from tests.base import BaseTester
 
 

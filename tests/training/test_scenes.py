@@ -9,12 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.data import Dataset
 
-from kornia_tidy.training.scenes import (
-    Broken,
-    EpochBatches,
-    RepeatableScenes,
-    SceneLoader,
-)
+from kornia_tidy.training.scenes import Broken, EpochBatches, RepeatableScenes, SceneLoader
 from tests.base import BaseTester
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")

@@ -1,0 +1,28 @@
+"""From captures of points of light to the PSFs of a camera, and to the mask that makes them.
+
+Raw captures of a point at several depths come in; a PSF bank or fitted masks go out. Read ``measured_psfs.py`` first.
+"""
+
+from kornia_tidy.calibration.psf.dithering import ResolvedPSF, resolve_psf
+from kornia_tidy.calibration.psf.exposures import capture_variance, merge_exposures
+from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs, PointReport, diffraction_cutoff, measure_psfs
+from kornia_tidy.calibration.psf.phase_retrieval import MaskFit, fit_masks, retrieve_mask
+from kornia_tidy.calibration.psf.point_images import PointImage, point_images
+from kornia_tidy.calibration.psf.registration import register
+
+__all__ = [
+    "MaskFit",
+    "MeasuredPSFs",
+    "PointImage",
+    "PointReport",
+    "ResolvedPSF",
+    "capture_variance",
+    "diffraction_cutoff",
+    "fit_masks",
+    "measure_psfs",
+    "merge_exposures",
+    "point_images",
+    "register",
+    "resolve_psf",
+    "retrieve_mask",
+]

@@ -1,0 +1,199 @@
+"""Points of light in a picture: where they are, and the light around them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from kornia_tidy.checks import check_float_tensor, check_positive
+from kornia_tidy.psf.psf_bank import enclosing_window
+
+
+def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]:
+    """Return the pixels about which the light of the brightest points lies, brightest first.
+
+    Args:
+        image: (H, W) linear light.
+        count: how many points to look for.
+        window: side in pixels of the square that a point's light fills; the next point lies outside.
+
+    Returns:
+        Row and column of each.
+
+    Raises:
+        ValueError: if the picture is smaller than the window, or has no room for that many points.
+
+    Example:
+        >>> image = torch.zeros(32, 48)
+        >>> image[10, 12], image[20, 40] = 1.0, 2.0
+        >>> find_points(image, 2, 9)
+        [(20, 40), (10, 12)]
+    """
+    check_float_tensor("image", image, 2, "(H, W)")
+    check_positive("count", count)
+    height, width = image.shape
+    if window > min(height, width):
+        raise ValueError(f"a window of {window} pixels does not fit into a picture of {height}x{width}")
+    value = image.double() - image.double().median()
+    # Half the window's light is enough to see, and where a blunt box would be flat two passes of it have a peak.
+    box = max(1, window // 4) * 2 + 1
+    smooth = value[None, None]
+    for _ in range(2):
+        smooth = avg_pool2d(smooth, box, 1, box // 2)
+    light = smooth[0, 0].clone()
+    found = []
+    for _ in range(count):
+        place = int(light.argmax())
+        row, column = divmod(place, width)
+        if not bool(light[row, column].isfinite()):
+            raise ValueError(f"a picture of {height}x{width} has no room for {count} points of {window} pixels")
+        found.append((row, column))
+        light[max(0, row - window) : row + window + 1, max(0, column - window) : column + window + 1] = -torch.inf
+    return found
+
+
+def annulus_background(image: Tensor, centre: tuple[float, float], inner: float, outer: float) -> Tensor:
+    """Return the light around a point that is not its own: the mean of a ring, without what stands out from it.
+
+    Values further than three standard deviations from the median, itself estimated by the median deviation, are left
+    out. (The median alone would be a whole step of the converter where the background is even.)
+
+    Args:
+        image: (C, H, W) linear light.
+        centre: row and column of the ring's centre.
+        inner: its inner radius in pixels.
+        outer: its outer radius in pixels.
+
+    Returns:
+        (C,) of what lies in the picture.
+
+    Raises:
+        ValueError: if fewer than 32 pixels do.
+
+    Example:
+        >>> image = torch.full((1, 32, 32), 0.1)
+        >>> image[0, 16, 16], image[0, 4, 16] = 1.0, 0.7
+        >>> annulus_background(image, (16, 16), 10, 14)
+        tensor([0.1000])
+    """
+    rows = torch.arange(image.shape[-2], dtype=torch.float64, device=image.device) - centre[0]
+    columns = torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - centre[1]
+    radius = torch.hypot(rows[:, None], columns)
+    ring = image[:, (radius >= inner) & (radius <= outer)]
+    if ring.shape[1] < 32:
+        raise ValueError(
+            f"the background needs 32 pixels between {inner:g} and {outer:g} px of a point at row {centre[0]:.0f}, "
+            f"column {centre[1]:.0f}, the picture of {image.shape[-2]}x{image.shape[-1]} has {ring.shape[1]}"
+        )
+    deviation = (ring - ring.median(1, keepdim=True).values).abs()
+    kept = deviation <= 3 * 1.4826 * deviation.median(1, keepdim=True).values
+    return (ring * kept).sum(1) / kept.sum(1)
+
+
+def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:
+    r"""Return the centre of mass of the light in a window that follows it: first moments, all channels together.
+
+    .. math:: c = \sum_p p \, y_p \Big/ \sum_p y_p
+
+    Args:
+        image: (C, H, W), background taken off; a part of it may be negative.
+        start: row and column near it.
+        window: side in pixels, odd.
+
+    Returns:
+        Row and column.
+
+    Raises:
+        ValueError: if the window leaves the picture or holds no light.
+
+    Convention:
+        - Moments say where the light is, not where the chief ray is. Defocus behind an aperture that is alike on all
+          sides does not move them, a mask does; so do the borders of the window where much light crosses them.
+
+    Example:
+        >>> image = torch.zeros(1, 9, 9)
+        >>> image[0, 4, 4], image[0, 4, 5] = 3.0, 1.0
+        >>> centre_of_light(image, (4, 4), 5)
+        (4.0, 4.25)
+    """
+    light = image.double().sum(0)
+    row, column = start
+    for _ in range(10):
+        part = cut_out(light, (row, column), window)
+        total = part.sum()
+        if not bool(total > 0):
+            raise ValueError(f"there is no light in the {window}x{window} pixels about row {row}, column {column}")
+        steps = torch.arange(window, dtype=torch.float64, device=light.device) - window // 2
+        centre = float(row + (part.sum(1) @ steps) / total), float(column + (part.sum(0) @ steps) / total)
+        nearest = round(centre[0]), round(centre[1])
+        if nearest == (row, column):
+            break
+        row, column = nearest
+    return centre
+
+
+def centre_of_symmetry(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:
+    """Return the centre of light that looks alike from both sides: first moments under a Gaussian that moves along.
+
+    The Gaussian is as wide as the light, so that the noise of a wide window does not count, and unlike a window of
+    whole pixels it is centred on the light itself in the end.
+
+    Args:
+        image: (C, H, W), background taken off.
+        start: row and column near it.
+        window: side in pixels, odd, that holds the light.
+
+    Returns:
+        Row and column.
+
+    Raises:
+        ValueError: if the window leaves the picture or holds no light.
+
+    Source: Bernstein and Jarvis, The Astronomical Journal 123, 583 (2002), for moments weighted by what fits them.
+
+    Example:
+        >>> x = torch.arange(33.0)
+        >>> light = torch.exp(-((x[:, None] - 16.2) ** 2 + (x - 15.7) ** 2) / 8)[None]
+        >>> [round(c, 4) for c in centre_of_symmetry(light, (16, 16), 25)]
+        [16.2, 15.7]
+    """
+    coarse = centre_of_light(image, start, window)
+    nearest = round(coarse[0]), round(coarse[1])
+    light = cut_out(image, nearest, window).double().sum(0)
+    half = enclosing_window((light / light.sum())[None], 0.5) or window
+    steps = torch.arange(window, dtype=torch.float64, device=light.device) - window // 2
+    row, column = coarse[0] - nearest[0], coarse[1] - nearest[1]
+    width = max(1.0, half / 2)
+    for _ in range(50):
+        down, right = (torch.exp(-((steps - at) ** 2) / (2 * width**2)) for at in (row, column))
+        weighted = light * down[:, None] * right
+        total = weighted.sum()
+        # Of light as wide as the Gaussian these moments are half way to its centre.
+        move_down = 2 * float((weighted.sum(1) @ (steps - row)) / total)
+        move_right = 2 * float((weighted.sum(0) @ (steps - column)) / total)
+        row, column = row + move_down, column + move_right
+        if max(abs(move_down), abs(move_right)) < 1e-6:
+            break
+    return nearest[0] + row, nearest[1] + column
+
+
+def cut_out(image: Tensor, centre: tuple[int, int], side: int) -> Tensor:
+    """Return a square of a picture about a pixel, (..., side, side); the pixel becomes that at ``side // 2``.
+
+    Raises:
+        ValueError: if it leaves the picture.
+
+    Example:
+        >>> cut_out(torch.arange(25).view(5, 5), (2, 3), 3)
+        tensor([[ 7,  8,  9],
+                [12, 13, 14],
+                [17, 18, 19]])
+    """
+    top, left = centre[0] - side // 2, centre[1] - side // 2
+    height, width = image.shape[-2:]
+    if min(top, left) < 0 or top + side > height or left + side > width:
+        raise ValueError(
+            f"the {side}x{side} pixels about row {centre[0]}, column {centre[1]} leave the picture of {height}x{width}"
+        )
+    return image[..., top : top + side, left : left + side]

@@ -1,0 +1,17 @@
+"""The whole camera: an image and its depth come in, a coded capture goes out, and gradients reach the masks.
+
+Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burst.py``), scenes that move during the
+exposure (``motion.py``) and the transform of a data set (``dataset_transform.py``).
+"""
+
+from kornia_tidy.camera.burst import burst
+from kornia_tidy.camera.dataset_transform import DatasetTransform
+from kornia_tidy.camera.motion import moving_capture
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+
+__all__ = [
+    "DatasetTransform",
+    "TiDyOptics",
+    "burst",
+    "moving_capture",
+]

@@ -1,0 +1,125 @@
+"""Multi-shot: each mask read out by itself, to be compared with one exposure that averages them over time."""
+
+from __future__ import annotations
+
+import copy
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.sensor.noise import SensorNoise
+
+
+def burst_shares(shares: Tensor, dead_time: float, exposure: float) -> Tensor:
+    r"""Return the share of a time interval in which each shot of a burst collects light.
+
+    .. math:: s_k \left( 1 - (K - 1) \, t_d / T \right)
+
+    Args:
+        shares: dwell share :math:`s_k` of each mask, (K,), summing to one.
+        dead_time: :math:`t_d` between shots in seconds.
+        exposure: the interval T in seconds, from the start of the first shot to the end of the last.
+
+    Returns:
+        (K,). What they lack to one is lost: :math:`(K - 1) t_d / T`.
+
+    Raises:
+        ValueError: if the dead time is negative, or the burst has no time left to collect light.
+
+    Example:
+        >>> burst_shares(torch.full((5,), 0.2), dead_time=5e-3, exposure=0.1)
+        tensor([0.1600, 0.1600, 0.1600, 0.1600, 0.1600])
+    """
+    lost = (len(shares) - 1) * dead_time
+    if not 0 <= lost < exposure:
+        raise ValueError(
+            f"{len(shares) - 1} pauses of dead_time = {dead_time * 1e3:g} ms must be shorter than the exposure of "
+            f"{exposure * 1e3:g} ms, got {lost * 1e3:g} ms"
+        )
+    return shares * (1 - lost / exposure)
+
+
+def burst(
+    optics: TiDyOptics,
+    image: Tensor,
+    depth: Tensor,
+    dead_time: float = 0.0,
+    exposure: float = 0.1,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Take one picture through each mask instead of one through all: the same scene, camera and interval.
+
+    Each shot has its share of the interval, less the dead time before the next, and shot, dark and read noise and a
+    converter of its own. One exposure of ``optics`` in the same interval loses no light and reads out once.
+
+    Args:
+        optics: the camera. Its modulator gives masks and dwell shares; what it shows between masks is hidden here, and
+            light that passes beside the mask at all times is in every shot.
+        image: (B, C, H, W) or (C, H, W), in the camera's colour space.
+        depth: (B, 1, H, W) or (1, H, W).
+        dead_time: seconds between shots in which no light is collected: readout or switching, whichever is longer.
+        exposure: seconds from the start of the first shot to the end of the last.
+        generator: source of the noise. Default: the global generator.
+
+    Returns:
+        Linear light in the units of one full exposure: (B, K, C, H, W), or (K, C, H, W) for an unbatched image. Without
+        noise the sum over K is the averaged exposure times 1 - (K - 1) dead_time / exposure.
+
+    Raises:
+        ValueError: if the burst has no time left to collect light, or image and depth do not fit.
+
+    Convention:
+        - Not encoded: shots are added and weighted in linear light. ``optics.decode`` and ``encode`` convert.
+        - Each shot may fill the whole full well: a burst holds K times the light that one exposure can.
+        - ``stray_light="renormalize"`` scales the PSFs of each mask, not their average, to a sum of one; then the sum
+          over K has the light of the averaged exposure but not its exact PSF. ``"discard"`` and ``"veil"`` keep both.
+        - Memory and readouts are K times those of one exposure; ``burst(...).sum(1)`` stores one picture with K times
+          the variance of the read noise.
+
+    Source: Shah et al., TiDy-PSFs (ICCV 2023), supplement, section 2.
+
+    Example:
+        >>> from kornia_tidy import PixelwiseMask
+        >>> optics = TiDyOptics(PixelwiseMask(2))
+        >>> burst(optics, torch.rand(3, 80, 80), torch.ones(1, 80, 80), dead_time=10e-3).shape
+        torch.Size([2, 3, 80, 80])
+    """
+    image, depth, batched = optics._checked(image, depth)
+    optics = optics._now(image)  # all shots see the masks of one moment
+    light = optics.decode(image)
+    shots = []
+    for k, share in enumerate(burst_shares(_dwell_shares(optics, light.dtype), dead_time, exposure)):
+        one = linear_through_moment(optics, k)
+        one.check_inputs = optics.check_inputs and k == 0  # say once what is wrong
+        shot = one(light, depth) * share.to(light)
+        optics._clamped = one._clamped  # every shot sees the same depths
+        shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
+    stack = torch.stack(shots, 1)
+    return stack if batched else stack[0]
+
+
+def _dwell_shares(optics: TiDyOptics, image_dtype: torch.dtype) -> Tensor:
+    """Return the dwell shares of the masks: a modulator's first K moments, without what lies between."""
+    dtype = torch.float64 if optics.fidelity.double or image_dtype == torch.float64 else torch.float32
+    shown = optics.timeline(dtype).durations[: optics.masks.phase.shape[0]]
+    if not bool(shown.sum() > 0):
+        raise ValueError("a burst needs masks that are shown for a time, but switching takes the whole exposure")
+    return shown / shown.sum()
+
+
+def linear_through_moment(optics: TiDyOptics, moment: int) -> TiDyOptics:
+    """Return the camera with one moment of its exposure shown all the time, in linear light and without noise."""
+    one = optics.through_moment(moment)
+    one.sensor, one.color_space = None, "linear"
+    return one
+
+
+def _sensor_for(sensor: nn.Module, share: Tensor) -> nn.Module:
+    """Return the sensor of one shot: dark signal gathers in the shot's time only."""
+    if not getattr(sensor, "dark", 0):
+        return sensor
+    one = copy.copy(cast("SensorNoise", sensor))
+    one.dark *= float(share.detach())
+    return one

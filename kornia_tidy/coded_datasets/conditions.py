@@ -1,0 +1,123 @@
+"""Everything that made a rendered data set, as plain values: another run may only go on with the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+import kornia_tidy
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.coded_datasets.layout import Layout
+from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.psf.camera_settings import EXTRA_STATE
+
+CONDITIONS, FORMAT = "render.json", "kornia_tidy captures 1"
+
+
+def conditions(
+    optics: TiDyOptics, count: int, layout: Layout, seed: int, made_from: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what captures follow from, as values that JSON holds.
+
+    Args:
+        optics: the camera.
+        count: number of scenes.
+        layout: the files.
+        seed: of the noise.
+        made_from: what made camera and scenes, in the words of the caller.
+
+    Convention:
+        - Masks are heights in metres at nine digits, which tell float32 exactly; ``state_sha256`` is of every weight
+          and of the aperture.
+        - Infinity is written as ``"inf"``, for which JSON has no number.
+    """
+    camera = {
+        **{name: _part(getattr(optics, name)) for name in ("camera", "masks", "modulator", "sensor")},
+        "spectrum": asdict(optics.spectrum),
+        "fidelity": asdict(optics.fidelity),
+        **{name: getattr(optics, name) for name in ("window", "compositing", "color_space", "border")},
+        "state_sha256": _digest(optics),
+        "heights_m": [[[float(f"{h:.9g}") for h in row] for row in mask] for mask in optics.masks.heights().tolist()],
+    }
+    versions = {"kornia_tidy": kornia_tidy.__version__, "torch": torch.__version__}
+    about = {"format": FORMAT, "versions": versions, "captures": count, "noise_seed": seed, "files": asdict(layout)}
+    return _plain({**about, "made_from": dict(made_from), **camera})
+
+
+def claim(folder: Path, own: Mapping[str, Any]) -> None:
+    """Make a folder that of captures made so, or find that it is.
+
+    Raises:
+        ValueError: if it holds anything else; what differs is named.
+    """
+    path = folder / CONDITIONS
+    others = any(not other.name.startswith(".") for other in folder.iterdir())
+    if not path.exists():  # looked for last: a process that has just begun here writes it before anything else
+        if others:
+            raise ValueError(f"{folder} holds files that are no captures: choose another folder")
+        lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in own.items())
+        write_bytes(path, f"{{\n{lines}\n}}\n".encode())
+        return
+    try:
+        there = _flat(read_json(path))
+    except AttributeError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    here = _flat(own)
+    if other := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
+        told = [_told(name, there.get(name), here.get(name)) for name in other]
+        raise ValueError(f"{folder} holds captures made otherwise (there / now): {'; '.join(told)}")
+
+
+def _part(module: nn.Module | None) -> dict[str, Any] | None:
+    """A part of the camera in words, and its numbers to the last digit."""
+    if module is None:
+        return None
+    numbers = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, (int, float, tuple)) and not name.startswith("_") and name != "training"
+    }
+    return {"is": repr(module), **numbers}
+
+
+def _digest(optics: TiDyOptics) -> str:
+    digest = hashlib.sha256()
+    for name, value in {**optics.state_dict(), "aperture": optics.pupil.amplitude}.items():
+        if name.endswith(EXTRA_STATE):  # settings, which are written beside it in words
+            continue
+        digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON gives it back."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value if isinstance(value, (str, bool, int, float, type(None))) else str(value)
+
+
+def _flat(values: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    return {
+        name: entry
+        for key, value in values.items()
+        for name, entry in (
+            _flat(value, f"{place}{key}.") if isinstance(value, Mapping) else {f"{place}{key}": value}
+        ).items()
+    }
+
+
+def _told(name: str, there: Any, here: Any) -> str:
+    text = f"{name} ({there} / {here})"
+    return text if len(text) < 120 else name

@@ -1,0 +1,121 @@
+"""A trained system on real captures: linear light in, an encoded picture and depth in metres out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
+from kornia_tidy.inference.tasks import MAPS, metres, split_maps
+from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.tiled import reconstruct_tiled
+
+
+class Reconstruction(NamedTuple):
+    """What a system makes of a capture; None is what it was not trained for."""
+
+    image: Tensor | None
+    """(3, H, W) in [0, 1], all in focus, encoded as sRGB."""
+    depth: Tensor | None
+    """(1, H, W) in metres, may be infinite."""
+
+
+class LightHead(nn.Module):
+    """The network of a trained system, for linear light: what it learnt to see is made of it, pixel by pixel.
+
+    Networks learn from captures in their camera's colour space: encoded ones for ``"srgb"``, linear light for
+    ``"linear"``, and for ``"paper"`` what the simulated sensor takes for light, so light itself.
+
+    Args:
+        system: a camera and its network, see :func:`~kornia_tidy.inference.trained.load_trained`.
+
+    Shape:
+        - light: (B, 3, H, W) or (B, 1, H, W), linear; black is 0, saturation 1, clipped there as a sensor does.
+        - output: the maps of the task, in the order of :data:`~kornia_tidy.inference.tasks.MAPS`: the image encoded as
+          sRGB, depth as nearness.
+
+    Raises:
+        TypeError: if the camera does not know metres.
+    """
+
+    def __init__(self, system: TrainedSystem) -> None:
+        super().__init__()
+        if not isinstance(system.optics.camera, ThinLensCamera):
+            raise TypeError(f"depth in metres needs a ThinLensCamera, got {type(system.optics.camera).__name__}")
+        self.head = system.head
+        self.task = system.settings.task
+        self.camera = system.optics.camera
+        self.encoded = system.optics.color_space == "srgb"
+        self.eval()
+
+    def forward(self, light: Tensor) -> tuple[Tensor, ...]:
+        """Return the maps."""
+        light = light.clamp(0, 1).expand(-1, 3, -1, -1)
+        maps = split_maps(self.task, self.head(linear_rgb_to_rgb(light) if self.encoded else light))
+        if "image" in maps and not self.encoded:
+            maps["image"] = linear_rgb_to_rgb(maps["image"].clamp(0, 1))
+        return tuple(maps.values())
+
+
+def reconstruct_light(
+    head: LightHead,
+    light: Tensor,
+    *,
+    memory_budget: int = 512 << 20,
+    progress: Callable[[int, int], object] | None = None,
+) -> Reconstruction:
+    """Return image and depth of a capture of any size.
+
+    Args:
+        head: a trained network.
+        light: (3, H, W) or (1, H, W), linear light of the camera it was trained for, in the sensor's orientation (that
+            of its PSFs); black is 0, saturation 1.
+        memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+        progress: see there.
+
+    Raises:
+        TypeError: if the light is not a floating-point tensor.
+        ValueError: if it is of another shape, or the network cannot be tiled within the memory.
+    """
+    check_float_tensor("light", light, 3, "(3, H, W) or (1, H, W)")
+    if light.shape[0] not in {1, 3} or 0 in light.shape:
+        raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
+    colours = light.expand(3, -1, -1)[None]
+    maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
+    named = {name: part[0].float() for name, part in zip(MAPS[head.task], maps, strict=True)}
+    image, near = named.get("image"), named.get("depth")
+    if image is not None:
+        image.clamp_(0, 1)
+    return Reconstruction(image, None if near is None else metres(head.camera, near))
+
+
+def reconstruct_opencv(
+    head: LightHead, picture: NDArray[Any], *, linear: bool = False, memory_budget: int = 512 << 20
+) -> tuple[NDArray[Any] | None, NDArray[np.float32] | None]:
+    """Return image and depth of a capture as OpenCV holds it.
+
+    Args:
+        head: a trained network.
+        picture: (H, W, 3) in BGR or (H, W), uint8 or uint16.
+        linear: it holds linear light; else it is encoded as sRGB, as pictures are.
+        memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+
+    Returns:
+        The image, (H, W, 3) in BGR, encoded as sRGB, of the picture's type; the depth, (H, W) float32 in metres. None
+        is what the network was not trained for.
+    """
+    light = from_opencv(picture)
+    if not linear:
+        light = rgb_to_linear_rgb(light.expand(3, -1, -1))
+    image, depth = reconstruct_light(head, light, memory_budget=memory_budget)
+    return (
+        None if image is None else to_opencv(image, picture.dtype),
+        None if depth is None else depth[0].numpy(),
+    )

@@ -1,0 +1,227 @@
+"""From settings to camera and network, and from a checkpoint back to both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.inference.heads import make_head
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.inference.tasks import channels_of
+from kornia_tidy.masks.base import PhaseMasks
+from kornia_tidy.masks.fresnel import FresnelLens
+from kornia_tidy.masks.initial_heights import initial_heights
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.reconstruction.refocused import Refocused
+from kornia_tidy.reconstruction.residual import Residual
+from kornia_tidy.sensor.noise import SensorNoise
+
+
+class TrainedSystem(NamedTuple):
+    """A camera and the network that reads its captures."""
+
+    optics: TiDyOptics
+    head: nn.Module
+    settings: TrainingSettings
+    step: int
+    """Steps of the optimiser that it was trained for."""
+
+
+def build_optics(settings: TrainingSettings) -> TiDyOptics:
+    """Return the camera that settings describe, its masks as they are before training, its PSF window fixed.
+
+    Example:
+        >>> build_optics(TrainingSettings(masks=2, window=23)).window
+        23
+    """
+    optics = TiDyOptics(
+        _masks(settings),
+        settings.camera(),
+        sensor=SensorNoise(settings.sigma),
+        fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
+        compositing=settings.compositing,
+        color_space=settings.color_space,
+        border=settings.border,
+    )
+    return fix_window(optics)
+
+
+def _masks(settings: TrainingSettings) -> PhaseMasks:
+    """Return the masks before training."""
+    if not settings.masks:
+        return FresnelLens()
+    noise = torch.Generator().manual_seed(settings.seed)
+    if settings.start == "noise":
+        return PixelwiseMask(settings.masks, generator=noise)
+    return PixelwiseMask(initial=initial_heights(settings.start, noise)[: settings.masks])
+
+
+def fix_window(optics: TiDyOptics) -> TiDyOptics:
+    """Fix a camera's PSF window where it is, in place: that of masks as they were before training is for all of it."""
+    optics.fidelity = optics.fidelity.replace(window=optics.window)
+    return optics
+
+
+def build_head(settings: TrainingSettings) -> nn.Module:
+    """Return the network that settings describe, its weights drawn from the global generator."""
+    head = make_head(settings.head, channels_of(settings.task), settings.width, 3 + settings.refocus)
+    if settings.refocus:
+        head = Refocused(head, layers=settings.refocus)
+    return Residual(head) if settings.residual else head
+
+
+def look_through(head: nn.Module, optics: TiDyOptics) -> None:
+    """Give a network the PSFs of its camera as they are now, if it refocuses captures: evenly over all defocus.
+
+    They are those of green light. See :class:`~kornia_tidy.reconstruction.Refocused`.
+    """
+    for module in head.modules():
+        if isinstance(module, Refocused):
+            lo, hi = optics.camera.defocus_range
+            nodes = torch.linspace(lo, hi, module.layers, dtype=torch.float64).tolist()
+            module.look_through(optics.psf_bank(1, defocus=nodes))
+
+
+def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
+    """Return camera and network of a checkpoint; of the network the moving average, where it has one.
+
+    Args:
+        path: a checkpoint that ``kornia-tidy train`` wrote.
+
+    Returns:
+        The system in eval mode, on the CPU. The sensor keeps its noise.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is no checkpoint, or weights and settings do not fit; the difference is named.
+    """
+    state = read_state(path)
+    _check_parts(state, path)
+    if state["settings"] is None:
+        raise ValueError(
+            f"{path} does not say how its camera and network were made, as they were given as objects: make them anew "
+            f"and use load_weights"
+        )
+    try:
+        settings = TrainingSettings.from_dict(state["settings"])
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    _check_sizes(state, settings, str(path))
+    optics, head = build_optics(settings), build_head(settings)
+    load_weights(state, optics, head, str(path))
+    with torch.no_grad():
+        look_through(head, optics)
+    return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]))
+
+
+def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
+    """Refuse a state whose parts are not those of a checkpoint."""
+    weights, step = state.get("state_dict"), state.get("global_step")
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise ValueError(f"cannot read {path}: it is a checkpoint without weights, or is damaged")
+    if not isinstance(step, int) or "settings" not in state:
+        raise ValueError(f"cannot read {path}: it is a checkpoint without step or settings, or is damaged")
+
+
+def _check_sizes(state: Mapping[str, Any], settings: TrainingSettings, name: str) -> None:
+    """Refuse settings of another camera or network than the weights are of, before any memory is taken for these."""
+    masks = state["state_dict"].get("optics.masks.phase")
+    if masks is not None and settings.masks and len(masks) != settings.masks:
+        raise ValueError(f"{name} does not fit: it holds {len(masks)} masks, and its settings tell of {settings.masks}")
+    try:
+        with torch.device("meta"):  # shapes without memory
+            head = build_head(settings)
+    except RuntimeError as error:
+        raise ValueError(f"cannot read {name}: no network can be made by its settings: {error}") from error
+    prefix = _head_prefix(state["state_dict"])
+    check_weights(head, below(state["state_dict"], prefix), f"{name}, {prefix.removesuffix('.')}")
+
+
+def load_weights(
+    checkpoint: str | os.PathLike[str] | Mapping[str, Any],
+    optics: nn.Module | None = None,
+    head: nn.Module | None = None,
+    name: str | None = None,
+) -> None:
+    """Load a checkpoint's weights into a camera, a network, or both; of the network the moving average if there is one.
+
+    Args:
+        checkpoint: a path, or a state that was read.
+        optics: the camera. None: its weights are left.
+        head: the network. None: its weights are left.
+        name: how messages call the checkpoint.
+
+    Raises:
+        ValueError: if a weight is missing, unknown or of another shape, or the camera is another one; nothing is loaded
+            then.
+    """
+    state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
+    name = name or str(checkpoint)
+    weights: dict[str, Tensor] = state["state_dict"]
+    parts = [(optics, "optics."), (head, _head_prefix(weights))]
+    wanted = [(part, below(weights, prefix), prefix) for part, prefix in parts if part is not None]
+    for part, own, prefix in wanted:
+        check_weights(part, own, f"{name}, {prefix.removesuffix('.')}")
+    for part, own, _ in wanted:
+        part.load_state_dict(own)
+
+
+def _head_prefix(weights: Mapping[str, Tensor]) -> str:
+    """Where in a checkpoint the network is: of the moving average, if there is one."""
+    return "average.network." if any(key.startswith("average.") for key in weights) else "head."
+
+
+def below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Return the weights whose names begin with a prefix, without it."""
+    return {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
+
+
+def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -> None:
+    """Raise ``ValueError`` unless weights fit a module and are finite, naming what does not.
+
+    Example:
+        >>> check_weights(nn.Linear(2, 1), {"weight": torch.ones(1, 3)}, "a.safetensors")
+        Traceback (most recent call last):
+        ...
+        ValueError: a.safetensors does not fit: missing bias; weight is (1, 3), wanted (1, 2)
+    """
+    # A camera checks its settings itself.
+    weights, own = (
+        {key: value for key, value in state.items() if not key.endswith(EXTRA_STATE)}
+        for state in (weights, module.state_dict())
+    )
+    missing, unknown = [key for key in own if key not in weights], [key for key in weights if key not in own]
+    faults = [f"{word} {_some(keys)}" for word, keys in (("missing", missing), ("unknown", unknown)) if keys]
+    faults += [
+        f"{key} is {tuple(weights[key].shape)}, wanted {tuple(value.shape)}"
+        for key, value in own.items()
+        if key in weights and weights[key].shape != value.shape
+    ]
+    faults += [
+        f"{key} holds NaN or infinity"
+        for key, value in weights.items()
+        if value.is_floating_point() and not bool(value.isfinite().all())
+    ]
+    if faults:
+        raise ValueError(f"{name} does not fit: {'; '.join(faults[:4])}{' ...' if len(faults) > 4 else ''}")
+
+
+def describe(optics: TiDyOptics, head: nn.Module) -> dict[str, str]:
+    """Return in words what no weight tells: which lens, sensor and network these are."""
+    parts = {name: repr(getattr(optics, name)) for name in ("camera", "sensor")}
+    parts |= {"fidelity": repr(optics.fidelity.replace(window=optics.window))}
+    parts |= {name: str(getattr(optics, name)) for name in ("compositing", "color_space", "border")}
+    parts |= {name: type(getattr(optics, name)).__name__ for name in ("masks", "modulator")}
+    return {**parts, "head": type(head).__name__}
+
+
+def _some(keys: list[str]) -> str:
+    return ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")

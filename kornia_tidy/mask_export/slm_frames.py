@@ -1,0 +1,122 @@
+"""From heights to the grey levels of a modulator's panel, and back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.masks.base import PhaseMasks, metres_to_radians
+from kornia_tidy.modulator.phase_panel import GreyLevels, nearest_level
+from kornia_tidy.optics.materials import Material, constant_index
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+
+_TURN = 2 * math.pi
+
+
+@dataclass(frozen=True, eq=False)
+class SLMFrames:
+    r"""What a panel shows for K masks: a grey level for each mask pixel, and what is needed to read heights from it.
+
+    At the working wavelength λ a height h wants the phase :math:`\phi = 2 \pi h (n(\lambda) - 1) / \lambda`; the panel
+    shows the level whose phase :math:`\phi_g` is nearest modulo 2π, and :math:`\phi \approx \phi_g + 2 \pi t` with t
+    whole turns that light at λ does not see.
+
+    Args:
+        grey: g, (K, rows, columns) int64.
+        turns: t, likewise.
+        level_phases: :math:`\phi_g`, (2^b,) radians at the working wavelength, float64.
+        wavelength: λ in metres.
+        radians_per_metre: :math:`2 \pi (n(\lambda) - 1) / \lambda`.
+
+    Example:
+        >>> frames = SLMFrames.of(torch.tensor([[[0.0, 265e-9, 1.06e-6]]]).double(), GreyLevels(8))
+        >>> frames.grey.tolist(), frames.turns.tolist()
+        ([[[0, 64, 0]]], [[[0, 0, 1]]])
+        >>> (frames.heights() * 1e9).round().tolist(), (frames.heights_shown() * 1e9).round().tolist()
+        ([[[0.0, 265.0, 1060.0]]], [[[0.0, 265.0, 0.0]]])
+    """
+
+    grey: Tensor
+    turns: Tensor
+    level_phases: Tensor
+    wavelength: float
+    radians_per_metre: float
+
+    @classmethod
+    def of(
+        cls,
+        masks: PhaseMasks | Tensor,
+        panel: GreyLevels,
+        wavelength: float = REFERENCE_WAVELENGTH,
+        material: Material | None = None,
+    ) -> SLMFrames:
+        """Return the frames of masks.
+
+        Args:
+            masks: phase masks of any family, or heights in metres (K, rows, columns).
+            panel: its levels. Their phases are taken at ``wavelength``, where panels are calibrated, not at 530 nm.
+            wavelength: the working wavelength in metres, at which the frames have the phase of the masks.
+            material: what heights are made of. Default: that of the masks; index 1.5 for bare heights.
+
+        Raises:
+            TypeError: if heights are not a floating-point tensor.
+            ValueError: if they are not finite maps, or the material's index at the wavelength is not known.
+        """
+        if isinstance(masks, PhaseMasks):
+            material = masks.material if material is None else material
+            heights = masks.phase.detach().cpu().double() / metres_to_radians(masks.material)
+        else:
+            heights = checked_heights(masks)
+        per_metre = metres_to_radians(constant_index(1.5) if material is None else material, wavelength)
+        wanted = heights * per_metre
+        grey = nearest_level(wanted, panel.levels)
+        turns = ((wanted - panel.levels[grey]) / _TURN).round().long()
+        return cls(grey, turns, panel.levels.clone(), wavelength, per_metre)
+
+    @property
+    def bits(self) -> int:
+        """Bits of a grey level."""
+        return (len(self.level_phases) - 1).bit_length()
+
+    @property
+    def background(self) -> int:
+        """Level of a panel pixel that shows no mask: the one nearest to phase 0."""
+        return int(nearest_level(torch.zeros(1, dtype=torch.float64), self.level_phases))
+
+    def heights(self) -> Tensor:
+        """Return the heights the frames were made for, to within :meth:`largest_error`: (K, rows, columns) float64."""
+        return (self.level_phases[self.grey] + _TURN * self.turns.double()) / self.radians_per_metre
+
+    def heights_shown(self) -> Tensor:
+        """Return the heights that the panel shows, without the turns: what light of other wavelengths sees too."""
+        return self.level_phases[self.grey] / self.radians_per_metre
+
+    def largest_error(self) -> float:
+        """Return the largest phase between a wanted height and its level in radians at the working wavelength.
+
+        Half of the widest gap between levels, modulo 2π: π / 2^b for a range of 2π.
+
+        Example:
+            >>> frames = SLMFrames.of(torch.zeros(1, 3, 3), GreyLevels(3, phase_range=math.pi))
+            >>> round(frames.largest_error() / math.pi, 4)  # levels from 0 to 7/8 pi: what is beyond is far from both
+            0.5625
+        """
+        around = self.level_phases.remainder(_TURN).sort().values
+        return float(torch.cat([around, around[:1] + _TURN]).diff().max()) / 2
+
+
+def checked_heights(heights: Tensor) -> Tensor:
+    """Return heights as float64 of three axes, on the CPU.
+
+    Raises:
+        TypeError: if they are not a floating-point tensor.
+        ValueError: if they have another shape or are not finite.
+    """
+    check_float_tensor("heights", heights, 3, "(K, rows, columns)")
+    if not heights.numel() or not bool(torch.isfinite(heights).all()):
+        raise ValueError(f"heights must be finite metres, at least one, got a map of shape {tuple(heights.shape)}")
+    return heights.detach().cpu().double()

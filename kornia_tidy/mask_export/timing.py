@@ -1,0 +1,81 @@
+"""When each frame is shown: the timing sheet of one exposure."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.modulator.switching import Switching
+
+
+class FrameTime(NamedTuple):
+    """One line of a timing sheet; times in seconds."""
+
+    frame: int
+    """Index of the frame, from 0."""
+    start: float
+    """When it stands, after the shutter opened."""
+    dwell: float
+    """How long it stands."""
+    weight: float
+    """Share of the exposure in which it stands."""
+    swap: float
+    """How long the panel takes from it to the next; 0 for the last, unless frames repeat."""
+
+
+def frame_times(
+    shares: Sequence[float], exposure: float, switching_time: float = 0.0, cyclic: bool = False
+) -> list[FrameTime]:
+    """Return when each frame of an exposure is shown, as :class:`~kornia_tidy.modulator.switching.Switching` counts.
+
+    The shutter opens as the first frame stands. Swaps fall into the exposure: frames share what they leave.
+
+    Args:
+        shares: relative dwell time of each frame.
+        exposure: in seconds.
+        switching_time: of each swap in seconds.
+        cyclic: whether the swap back to the first frame falls into the exposure too.
+
+    Raises:
+        ValueError: if the shares are negative or all zero, or the swaps take longer than the exposure.
+
+    Example:
+        >>> [round(line.start, 4) for line in frame_times((1, 1, 2), 0.1, switching_time=10e-3)]
+        [0.0, 0.03, 0.06]
+    """
+    modulator = Switching(switching_time, exposure, "linear", DwellTimes(shares), cyclic, samples=1)
+    weights = modulator(torch.zeros(len(shares), 1, 1, dtype=torch.float64))[1][: len(shares)].tolist()
+    back = switching_time if cyclic and len(shares) > 1 else 0.0
+    swaps = [switching_time] * (len(shares) - 1) + [back]
+    lines, start = [], 0.0
+    for frame, (weight, swap) in enumerate(zip(weights, swaps, strict=True)):
+        lines.append(FrameTime(frame, start, weight * exposure, weight, swap))
+        start += weight * exposure + swap
+    return lines
+
+
+def timing_sheet(lines: Sequence[FrameTime], files: Sequence[str]) -> str:
+    """Return the sheet as CSV, times in milliseconds to a nanosecond.
+
+    Args:
+        lines: from :func:`frame_times`.
+        files: name of each frame's file.
+
+    Example:
+        >>> print(timing_sheet(frame_times((1,), 0.1), ["frame_000.png"]))
+        frame,file,start_ms,dwell_ms,weight,swap_ms
+        0,frame_000.png,0.000000,100.000000,1.000000000,0.000000
+        <BLANKLINE>
+    """
+    text = io.StringIO()
+    sheet = csv.writer(text, lineterminator="\n")
+    sheet.writerow(("frame", "file", "start_ms", "dwell_ms", "weight", "swap_ms"))
+    for line, file in zip(lines, files, strict=True):
+        times = (f"{1e3 * seconds:.6f}" for seconds in (line.start, line.dwell))
+        sheet.writerow((line.frame, file, *times, f"{line.weight:.9f}", f"{1e3 * line.swap:.6f}"))
+    return text.getvalue()

@@ -1,0 +1,58 @@
+"""The cubic mask: the classic of extended depth of field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.masks.base import PhaseMasks, Size, mask_axes
+from kornia_tidy.optics.materials import Material
+
+
+class CubicMask(PhaseMasks):
+    r"""Masks of cubic phase, whose transfer function hardly changes with defocus: :math:`\alpha (x^3 + y^3)`.
+
+    Args:
+        strength: :math:`\alpha` in radians at 530 nm where an axis meets the pupil's edge; one number for each mask.
+        size: pixels N along a side, or (rows, columns).
+        material: refractive index of the element. Default: 1.5 at every wavelength.
+        constraint: see :class:`PhaseMasks`.
+        max_height: in metres, see :class:`PhaseMasks`.
+
+    Shape:
+        - ``strength``: learnable parameter (K,), radians at 530 nm. Its shape is 0.40 rad rms over the pupil.
+        - ``phase``: (K, N, N).
+
+    Raises:
+        ValueError: if there is no strength, or one is not finite.
+
+    Source: Dowski and Cathey, Applied Optics 34(11) 1859 (1995).
+
+    Example:
+        >>> CubicMask([20.0, -20.0]).phase[:, 11, 21].detach()  # on the x axis, at the edge
+        tensor([ 20., -20.])
+    """
+
+    shape: Tensor
+
+    def __init__(
+        self,
+        strength: float | Sequence[float] | Tensor = 20.0,
+        size: Size = 23,
+        material: Material | None = None,
+        constraint: str = "none",
+        max_height: float | None = None,
+    ) -> None:
+        super().__init__(material, constraint, max_height)
+        values = torch.as_tensor(strength, dtype=torch.get_default_dtype()).detach().clone().reshape(-1)
+        if not (len(values) and bool(torch.isfinite(values).all())):
+            raise ValueError(f"strength must be one finite number of radians for each mask, got {strength}")
+        y, x = mask_axes(size)
+        self.register_buffer("shape", (x**3 + y**3).to(values), persistent=False)
+        self.strength = nn.Parameter(values)
+
+    def free_phase(self) -> Tensor:
+        """Return the cubics, (K, N, N) radians."""
+        return self.strength[:, None, None] * self.shape

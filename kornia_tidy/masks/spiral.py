@@ -1,0 +1,82 @@
+"""Spiral masks: rings that each wind the phase around the axis, so that the PSF turns with defocus."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.masks.base import NOISE_RMS, PhaseMasks, Size, initial_values, mask_axes, spread
+from kornia_tidy.optics.materials import Material
+
+
+class SpiralMask(PhaseMasks):
+    r"""Masks of L rings of equal area, each with its own orbital angular momentum.
+
+    .. math:: \varphi(\rho, \theta) = \ell_z\, \theta + \beta_z \qquad \sqrt{(z-1)/L} \le \rho < \sqrt{z/L}
+
+    With charges :math:`\ell_z = z` and without offsets these are Prasad's spiral zones: defocus is the same as a turn
+    of the mask, and the PSF turns rigidly by :math:`\psi / L`. It stands for the family that Liu et al. call orbital
+    angular momentum, whose own formula is not this one's source.
+
+    Args:
+        num_masks: number K of masks shown one after the other during the exposure.
+        size: pixels N along a side, or (rows, columns). The outermost ring is 1 / (2L) of a radius wide and needs
+            pixels well below that: 7 rings ask for some 128.
+        num_zones: number L of rings.
+        initial: ``"noise"`` (charges 1 to L and random offsets), or ``"rotating"`` (charges 1 to L, no offsets).
+        material: refractive index of the element. Default: 1.5 at every wavelength.
+        generator: source of the noise.
+        constraint: see :class:`PhaseMasks`; ``"wrapped"`` makes it the diffractive element that it is in practice.
+        max_height: in metres, see :class:`PhaseMasks`.
+
+    Shape:
+        - ``charges``: learnable parameter (K, L), radians at 530 nm for each radian of azimuth. Whole numbers close a
+          ring without a seam (at 530 nm); the seam lies at -x.
+        - ``offsets``: learnable parameter (K, L), radians at 530 nm.
+        - ``phase``: (K, N, N).
+
+    Raises:
+        ValueError: if ``num_zones`` is not positive, or ``initial`` is unknown.
+
+    Convention:
+        - The azimuth runs from +x towards +y, which is down in an image. The PSF turns the other way, from +y towards
+          +x (anticlockwise as seen), as the scene comes nearer.
+
+    Source: Prasad, Optics Letters 38(4) 585 (2013), for the zones; Liu et al., Optics Express 30(20) 36973 (2022), for
+    orbital angular momentum in a learnt mask.
+
+    Example:
+        >>> SpiralMask(1, 128, initial="rotating").charges.tolist()
+        [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]]
+    """
+
+    zone: Tensor
+    azimuth: Tensor
+
+    def __init__(
+        self,
+        num_masks: int = 5,
+        size: Size = 128,
+        num_zones: int = 7,
+        initial: str = "noise",
+        material: Material | None = None,
+        generator: torch.Generator | None = None,
+        constraint: str = "none",
+        max_height: float | None = None,
+    ) -> None:
+        super().__init__(material, constraint, max_height)
+        check_positive("num_masks", num_masks)
+        check_positive("num_zones", num_zones)
+        check_choice("initial", initial, ("noise", "rotating"))
+        y, x = mask_axes(size)
+        zone = ((y**2 + x**2) * num_zones).floor().clamp(max=num_zones - 1)  # beyond the edge the last ring goes on
+        self.register_buffer("zone", zone.long(), persistent=False)
+        self.register_buffer("azimuth", torch.atan2(y, x).to(torch.get_default_dtype()), persistent=False)
+        offsets = "flat" if initial == "rotating" else initial
+        self.charges = nn.Parameter(torch.arange(1.0, num_zones + 1).repeat(num_masks, 1))
+        self.offsets = nn.Parameter(initial_values(offsets, num_masks, (num_zones,), NOISE_RMS, generator))
+
+    def free_phase(self) -> Tensor:
+        """Return the rings, (K, N, N) radians."""
+        return torch.addcmul(spread(self.offsets, self.zone), spread(self.charges, self.zone), self.azimuth)

@@ -1,0 +1,158 @@
+"""Zernike masks: sums of the polynomials that are orthonormal on the pupil's disc."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_positive
+from kornia_tidy.masks.base import NOISE_RMS, PhaseMasks, Size, initial_values, mask_axes
+from kornia_tidy.optics.materials import Material
+
+
+class ZernikeMask(PhaseMasks):
+    r"""Masks that are sums of Zernike polynomials: :math:`\varphi_k = \sum_j c_{kj} Z_j`.
+
+    Args:
+        num_masks: number K of masks shown one after the other during the exposure.
+        size: pixels N along a side, or (rows, columns).
+        num_modes: number M of polynomials, in the order of OSA/ANSI from piston on: 55 are all of radial order 9 and
+            lower (PhaseCam3D), 350 all but the last of order 25 and lower (Sitzmann et al.).
+        initial: ``"noise"`` (normal coefficients, 2.05 rad rms over the pupil in all), ``"flat"``, or coefficients as
+            a (K, M) or (M,) tensor.
+        material: refractive index of the element. Default: 1.5 at every wavelength.
+        generator: source of the noise.
+        constraint: see :class:`PhaseMasks`.
+        max_height: in metres, see :class:`PhaseMasks`.
+
+    Shape:
+        - ``coefficients``: learnable parameter (K, M), radians rms over the pupil at 530 nm.
+        - ``phase``: (K, N, N).
+
+    Convention:
+        - See :func:`zernike_polynomials`. Beyond the pupil's edge a mask keeps the phase it has at the edge, so that
+          pixels which a smooth iris cuts through have a sensible one.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019); Sitzmann et al., ACM Trans. Graph. 37(4) 114 (2018).
+
+    Example:
+        >>> masks = ZernikeMask(num_masks=2, initial=torch.eye(55)[[0, 4]])  # piston and defocus
+        >>> masks.phase.shape, round(masks.phase[1, 11, 11].item(), 3)
+        (torch.Size([2, 23, 23]), -1.732)
+    """
+
+    polynomials: Tensor
+    order: Tensor
+
+    def __init__(
+        self,
+        num_masks: int = 5,
+        size: Size = 23,
+        num_modes: int = 55,
+        initial: str | Tensor = "noise",
+        material: Material | None = None,
+        generator: torch.Generator | None = None,
+        constraint: str = "none",
+        max_height: float | None = None,
+    ) -> None:
+        super().__init__(material, constraint, max_height)
+        y, x = mask_axes(size)
+        self.odd_sides = len(y) % 2 == 1  # both are, or neither: the middle row and column lie on the axes
+        # Every polynomial is even or odd along each axis: a quarter of the mask is all that needs to be held.
+        y, x = y[len(y) // 2 :], x[len(x) // 2 :]
+        inward = torch.hypot(y, x).clamp(min=1)
+        polynomials = zernike_polynomials(num_modes, y / inward, x / inward).to(torch.get_default_dtype())
+        parities = [_parity(index) for index in range(num_modes)]
+        order = sorted(range(num_modes), key=parities.__getitem__)
+        self.group_sizes = [parities.count(kind) for kind in ((0, 0), (0, 1), (1, 0), (1, 1))]
+        self.register_buffer("polynomials", polynomials[order].flatten(1), persistent=False)
+        self.register_buffer("order", torch.tensor(order), persistent=False)
+        self.quarter = (len(y), len(x))
+        rms = NOISE_RMS / math.sqrt(num_modes)
+        self.coefficients = nn.Parameter(initial_values(initial, num_masks, (num_modes,), rms, generator))
+
+    def free_phase(self) -> Tensor:
+        """Return the sum of the polynomials, (K, N, N) radians."""
+        groups = zip(
+            self.coefficients[:, self.order].split(self.group_sizes, 1),
+            self.polynomials.split(self.group_sizes),
+            strict=True,
+        )
+        sums = [(strengths @ shapes).unflatten(1, self.quarter) for strengths, shapes in groups]
+        halves = [self._mirrored(even, odd, -1) for even, odd in (sums[:2], sums[2:])]
+        return self._mirrored(halves[0], halves[1], -2)
+
+    def _mirrored(self, even: Tensor, odd: Tensor, axis: int) -> Tensor:
+        """Both sides of an axis, from what is even and odd about it on its positive side."""
+        middle = int(self.odd_sides)
+        negative = (even - odd).narrow(axis, middle, even.shape[axis] - middle).flip(axis)
+        return torch.cat([negative, even + odd], axis)
+
+
+def _parity(index: int) -> tuple[int, int]:
+    """Return whether a polynomial is odd (1) or even (0) along y and along x."""
+    n = (math.isqrt(8 * index + 1) - 1) // 2
+    m = 2 * index - n * (n + 2)
+    return int(m < 0), (m + (m < 0)) % 2
+
+
+def zernike_polynomials(num_modes: int, y: Tensor, x: Tensor) -> Tensor:
+    r"""Return Zernike polynomials in the order of OSA/ANSI, orthonormal on the unit disc.
+
+    .. math::
+        Z_n^m = \sqrt{(2 - \delta_{m0})(n + 1)}\; R_n^{|m|}(\rho)
+        \begin{cases} \cos m\theta & m \ge 0 \\ \sin |m|\theta & m < 0 \end{cases}, \qquad j = \frac{n(n+2) + m}{2}
+
+    Args:
+        num_modes: number M of polynomials.
+        y: coordinates in pupil radii, (..., N, 1) or of the shape of the grid.
+        x: the same along the other axis.
+
+    Returns:
+        (M, ...) float64, each of mean square one over the disc (Noll's normalisation).
+
+    Raises:
+        ValueError: if ``num_modes`` is not positive.
+
+    Convention:
+        - The azimuth runs from +x towards +y, which is down in an image: :math:`Z_1 = 2y`, :math:`Z_2 = 2x`.
+
+    Source: Thibos et al., J. Refract. Surg. 18, S652 (2002), for order and norm; the radial polynomials by the
+    recurrence :math:`R_n^m = \rho (R_{n-1}^{|m-1|} + R_{n-1}^{m+1}) - R_{n-2}^m` of Honarvar Shakibaei and Paramesran,
+    Optics Letters 38(14) 2487 (2013), which needs no factorials and is stable at every order.
+
+    Example:
+        >>> zernike_polynomials(5, torch.tensor(0.0), torch.tensor(1.0)).round(decimals=4)
+        tensor([1.0000, 0.0000, 2.0000, 0.0000, 1.7321], dtype=torch.float64)
+    """
+    check_positive("num_modes", num_modes)
+    y, x = torch.broadcast_tensors(y.double(), x.double())
+    radius, azimuth = torch.hypot(y, x), torch.atan2(y, x)
+    modes = []
+    for n, radial in _radial_polynomials(radius):
+        for m in range(-n, n + 1, 2):
+            norm = math.sqrt((n + 1) * (2 if m else 1))
+            wave = torch.cos(m * azimuth) if m >= 0 else torch.sin(-m * azimuth)
+            modes.append(norm * radial[abs(m)] * wave)
+            if len(modes) == num_modes:
+                return torch.stack(modes)
+    raise AssertionError  # the orders never end
+
+
+def _radial_polynomials(radius: Tensor) -> Iterator[tuple[int, dict[int, Tensor]]]:
+    """Yield the orders n with their polynomials R_n^m by m."""
+    zero = torch.zeros_like(radius)
+    before: dict[int, Tensor] = {}
+    last: dict[int, Tensor] = {0: torch.ones_like(radius)}
+    n = 0
+    while True:
+        yield n, last
+        n += 1
+        new = {
+            m: radius * (last.get(abs(m - 1), zero) + last.get(m + 1, zero)) - before.get(m, zero)
+            for m in range(n % 2, n + 1, 2)
+        }
+        before, last = last, new

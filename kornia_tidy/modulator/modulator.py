@@ -1,0 +1,316 @@
+"""The modulator: which states it shows during one exposure, when, and for what share of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_part, described
+
+
+class Timeline(NamedTuple):
+    r"""What a modulator shows during one exposure: moments that follow one another, and in each of them its states.
+
+    Light that leaves through two states at once, such as what a grating diffracts and what passes it undiffracted, is
+    of one moment: it sees the same scene. So a state may be there in many moments, and a moment may have many states.
+
+    Args:
+        states: (S, N, N) radians.
+        durations: (M,) share of the exposure that each moment takes, summing to one. The first K moments are those of
+            the K masks, in their order; what lies between masks follows.
+        mixture: (M, S) share of a moment's light that each state has, each row summing to one. None: M = S, and each
+            moment has a state of its own.
+        middles: (M,) the middle of each moment in [0, 1], from the start of the exposure to its end. None: they follow
+            one another in their order, without a gap.
+
+    Example:
+        >>> shown = DiffractionEfficiency(0.75).timeline(torch.zeros(2, 23, 23))
+        >>> shown.durations, shown.mixture
+        (tensor([0.5000, 0.5000]), tensor([[0.7500, 0.0000, 0.2500],
+                [0.0000, 0.7500, 0.2500]]))
+        >>> shown.weights, shown.moment_times(), shown.state_times()
+        (tensor([0.3750, 0.3750, 0.2500]), tensor([0.2500, 0.7500]), tensor([0.2500, 0.7500, 0.5000]))
+    """
+
+    states: Tensor
+    durations: Tensor
+    mixture: Tensor | None = None
+    middles: Tensor | None = None
+
+    @property
+    def weights(self) -> Tensor:
+        """Share of the exposure's light that each state has, (S,)."""
+        return self.durations if self.mixture is None else (self.durations[:, None] * self.mixture).sum(0)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Timeline:
+        """Return the timeline with a function applied to each of its tensors."""
+        mixture, middles = (None if part is None else function(part) for part in (self.mixture, self.middles))
+        return Timeline(function(self.states), function(self.durations), mixture, middles)
+
+    def moment(self, index: int) -> tuple[Tensor, Tensor]:
+        """Return the states of one moment, and their weights, which sum to one."""
+        if self.mixture is None:
+            return self.states[index : index + 1], torch.ones_like(self.durations[:1])
+        there = self.mixture[index].nonzero()[:, 0]
+        return self.states[there], self.mixture[index, there]
+
+    def moment_times(self) -> Tensor:
+        """Return the middle of each moment as a share of the exposure, (M,)."""
+        return self.durations.cumsum(0) - self.durations / 2 if self.middles is None else self.middles
+
+    def state_times(self) -> Tensor:
+        """Return the mean time of the light of each state as a share of the exposure, (S,): 1/2 where it has none."""
+        times = self.moment_times()
+        if self.mixture is None:
+            return times
+        light = self.durations[:, None] * self.mixture
+        return torch.where(self.weights > 0, (light * times[:, None]).sum(0) / self.weights, 0.5)
+
+    def beside_flat(self, share: float) -> Self:
+        """Return the exposure with this share of its light, at every moment, in a flat state instead, the last."""
+        mixture = torch.eye(len(self.states)).to(self.durations) if self.mixture is None else self.mixture
+        flat = torch.full_like(self.durations, share)[:, None]
+        states = torch.cat([self.states, torch.zeros_like(self.states[:1])])
+        return self._replace(states=states, mixture=torch.cat([mixture * (1 - share), flat], 1))
+
+
+def timeline_of(modulator: nn.Module, phase: Tensor) -> Timeline:
+    """Return what any modulator shows of masks (K, N, N): states that follow one another where it does not say when."""
+    return modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
+
+
+class Modulator(nn.Module):
+    """A modulator that knows when it shows what. A subclass says so in :meth:`timeline`.
+
+    Shape:
+        - input: phase (K, N, N) radians.
+        - output: states (S, N, N) radians and weights (S,), which sum to one.
+    """
+
+    def timeline(self, phase: Tensor) -> Timeline:
+        """Return what is shown of these masks, and when.
+
+        Args:
+            phase: (K, N, N) radians.
+        """
+        raise NotImplementedError
+
+    def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states shown and their weights."""
+        shown = self.timeline(phase)
+        return shown.states, shown.weights
+
+
+class DwellTimes(Modulator):
+    """An ideal modulator: it shows each mask for its share of the exposure and switches in no time.
+
+    Args:
+        shares: relative dwell time of each mask; scaled to sum to one. Default: equal.
+
+    Shape:
+        - input: phase (K, N, N) radians.
+        - output: states (S, N, N) radians and weights (S,), which sum to one. Here S = K.
+
+    Raises:
+        ValueError: if a share is negative or not finite, all are zero, or their number is not that of the masks.
+
+    Source: Shah et al., TiDy-PSFs (ICCV 2023), section 4.
+
+    Example:
+        >>> import torch
+        >>> states, weights = DwellTimes((3, 1))(torch.zeros(2, 23, 23))
+        >>> weights
+        tensor([0.7500, 0.2500])
+    """
+
+    def __init__(self, shares: Sequence[float] | None = None) -> None:
+        super().__init__()
+        _check_numbers(shares)
+        if shares is not None and not (sum(shares) > 0 and all(0 <= s < math.inf for s in shares)):
+            raise ValueError(f"dwell shares must be finite, not negative and not all zero, got {tuple(shares)}")
+        self.shares = None if shares is None else tuple(s / sum(shares) for s in shares)
+
+    def timeline(self, phase: Tensor) -> Timeline:
+        """Return what is shown of these masks, and when: one after another."""
+        masks = phase.shape[0]
+        if self.shares is None:
+            return Timeline(phase, phase.new_full((masks,), 1 / masks))
+        _check_count(len(self.shares), masks)
+        return Timeline(phase, phase.new_tensor(self.shares))
+
+    def extra_repr(self) -> str:
+        """Describe the exposure in a person's words."""
+        return "equal dwell times" if self.shares is None else f"dwell shares {tuple(round(s, 4) for s in self.shares)}"
+
+
+class LearnableDwellTimes(Modulator):
+    r"""Dwell times that are learnt with the masks, :math:`w_k = e^{a_k} / \sum_j e^{a_j}`: positive, summing to one.
+
+    Args:
+        shares: relative dwell times to start from, one for each mask, all positive.
+
+    Shape:
+        - ``logits``: learnable parameter (K,).
+        - input: phase (K, N, N) radians; output: states (K, N, N) and weights (K,).
+
+    Raises:
+        ValueError: if a share is not positive and finite, or their number is not that of the masks.
+
+    Example:
+        >>> import torch
+        >>> states, weights = LearnableDwellTimes((3, 1))(torch.zeros(2, 23, 23))
+        >>> weights
+        tensor([0.7500, 0.2500], grad_fn=<SoftmaxBackward0>)
+    """
+
+    def __init__(self, shares: Sequence[float]) -> None:
+        super().__init__()
+        _check_numbers(shares)
+        if not shares or not all(0 < s < math.inf for s in shares):
+            raise ValueError(f"dwell shares to learn must be positive and finite, got {tuple(shares)}")
+        self.logits = nn.Parameter(torch.tensor([math.log(s) for s in shares]))
+
+    def timeline(self, phase: Tensor) -> Timeline:
+        """Return what is shown of these masks, and when: one after another."""
+        _check_count(len(self.logits), phase.shape[0])
+        return Timeline(phase, self.logits.to(phase).softmax(0))
+
+    def extra_repr(self) -> str:
+        """Describe the exposure in a person's words."""
+        return f"learnable dwell shares {tuple(round(s, 4) for s in self.logits.detach().softmax(0).tolist())}"
+
+
+class DiffractionEfficiency(Modulator):
+    """A fixed diffractive element: a share of the light sees the masks, the rest passes as if they were flat.
+
+    What a real element does not send where its design says is added as intensity, as a state of its own that is there
+    all the time. Several masks have equal dwell times; for others make it a part of a :class:`SpatialLightModulator`.
+
+    Args:
+        efficiency: share of the light that sees the masks, above 0 and at most 1.
+
+    Shape:
+        - input: phase (K, N, N) radians; output: states (K + 1, N, N), the last flat, and weights (K + 1,).
+
+    Raises:
+        ValueError: if the efficiency is out of range.
+
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), who take 0.7.
+
+    Example:
+        >>> import torch
+        >>> states, weights = DiffractionEfficiency(0.7)(torch.rand(1, 23, 23))
+        >>> states.shape, weights
+        (torch.Size([2, 23, 23]), tensor([0.7000, 0.3000]))
+    """
+
+    def __init__(self, efficiency: float) -> None:
+        super().__init__()
+        if not 0 < efficiency <= 1:
+            raise ValueError(f"efficiency must be above 0 and at most 1, got {efficiency}")
+        self.efficiency = efficiency
+
+    def timeline(self, phase: Tensor) -> Timeline:
+        """Return what is shown of these masks, and when: one after another, and the flat state all the time."""
+        return DwellTimes().timeline(phase).beside_flat(1 - self.efficiency)
+
+    def extra_repr(self) -> str:
+        """Describe the element in a person's words."""
+        return f"{self.efficiency:.0%} of the light sees the mask"
+
+
+class SpatialLightModulator(Modulator):
+    """A modulator made of parts: what its panel does to each mask, and how it passes from one to the next.
+
+    Args:
+        parts: modules, each taking what the one before gives: those that turn masks (K, N, N) into masks as the panel
+            shows them, such as :class:`~kornia_tidy.modulator.phase_panel.GreyLevels` and
+            :class:`~kornia_tidy.modulator.phase_panel.PixelCrosstalk`, and one that gives states and weights, such as
+            :class:`DwellTimes` or :class:`~kornia_tidy.modulator.switching.Switching`. What turns masks and stands
+            after that one turns all that is shown. A :class:`DiffractionEfficiency` may stand anywhere, and alone means
+            equal dwell times, as no part at all does.
+        fill_factor: share of the area of each pixel that modulates: a square in its middle. Light through the gaps
+            between the squares passes with phase zero; see :func:`~kornia_tidy.psf.exact.exact_psf_bank`.
+
+    Shape:
+        - input: phase (K, N, N) radians; output: states (S, N, N) radians and weights (S,).
+
+    Raises:
+        ValueError: if the fill factor is not in (0, 1].
+        TypeError: if no part gives states and weights, or more than one does.
+
+    Convention:
+        - Light that misses the masks misses the panel: what a :class:`DiffractionEfficiency` leaves is flat wherever
+          that part stands.
+        - Any module that maps phase to states and weights is a modulator; without a ``fill_factor``, it has no gaps.
+
+    Example:
+        >>> from kornia_tidy.modulator.phase_panel import GreyLevels
+        >>> from kornia_tidy.modulator.switching import Switching
+        >>> modulator = SpatialLightModulator(GreyLevels(8), Switching(4e-3), fill_factor=0.93)
+        >>> states, weights = modulator(torch.rand(5, 23, 23))
+        >>> states.shape, round(float(weights.sum()), 6)
+        (torch.Size([9, 23, 23]), 1.0)
+    """
+
+    def __init__(self, *parts: nn.Module, fill_factor: float = 1.0) -> None:
+        super().__init__()
+        if not 0 < fill_factor <= 1:
+            raise ValueError(f"fill_factor must be above 0 and at most 1, got {fill_factor}")
+        for part in parts:
+            check_part("each part of a modulator", part, nn.Module, "a module such as GreyLevels(8) or DwellTimes()")
+        self.parts = nn.Sequential(*(parts or (DwellTimes(),)))
+        self.fill_factor = fill_factor
+
+    def timeline(self, phase: Tensor) -> Timeline:
+        """Return what is shown of these masks, and when."""
+        shown: Tensor | Timeline = phase
+        splits = [part for part in self.parts if isinstance(part, DiffractionEfficiency)]
+        for part in self.parts:
+            if part not in splits:
+                shown = self._next(part, shown)
+        if isinstance(shown, Tensor):
+            if not splits:
+                raise TypeError(
+                    "a part of a modulator must give states and weights, as DwellTimes and Switching do, got "
+                    f"{self._names()}"
+                )
+            shown = DwellTimes().timeline(shown)
+        for part in splits:
+            shown = shown.beside_flat(1 - part.efficiency)
+        return shown
+
+    def _next(self, part: nn.Module, shown: Tensor | Timeline) -> Tensor | Timeline:
+        """Return what a part makes of what the parts before it show."""
+        if isinstance(shown, Tensor):
+            if isinstance(part, Modulator):
+                return part.timeline(shown)
+            panel = part(shown)
+            return Timeline(*panel) if isinstance(panel, tuple) else panel
+        if isinstance(part, Modulator) or not isinstance(states := part(shown.states), Tensor):
+            raise TypeError(
+                f"one part of a modulator may give states and weights, as DwellTimes or Switching do, got "
+                f"{self._names()}: give dwell times as Switching(..., dwell=...)"
+            )
+        return shown._replace(states=states)
+
+    def _names(self) -> list[str]:
+        return [type(part).__name__ for part in self.parts]
+
+    def extra_repr(self) -> str:
+        """Describe the panel in a person's words."""
+        return f"fill factor {self.fill_factor:g}"
+
+
+def _check_numbers(shares: object) -> None:
+    if shares is not None and not (isinstance(shares, Sequence) and all(isinstance(s, int | float) for s in shares)):
+        raise TypeError(f"dwell shares must be a number for each mask, such as (3, 1), got {described(shares)}")
+
+
+def _check_count(shares: int, masks: int) -> None:
+    if shares != masks:
+        raise ValueError(f"there are {shares} dwell shares for {masks} masks")

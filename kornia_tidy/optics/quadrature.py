@@ -1,0 +1,53 @@
+"""Gauss-Legendre quadrature: points and weights for integrals over one cell, and how many of them are needed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def gauss_legendre_order(half_range: float, tolerance: float) -> int:
+    r"""Return how many Gauss-Legendre points integrate :math:`e^{i b t}` over [-1, 1] for every |b| <= half_range.
+
+    Args:
+        half_range: largest phase b in radians from the middle of the interval to its edge.
+        tolerance: largest error allowed to the mean over the interval.
+
+    Example:
+        >>> gauss_legendre_order(1.2, 1e-3), gauss_legendre_order(6.0, 1e-7)
+        (3, 9)
+    """
+    if not math.isfinite(half_range):  # no order is enough
+        raise ValueError(f"a phase across an interval must be finite radians, got {half_range}")
+    b = np.linspace(0, half_range, 33)
+    exact = np.sinc(b / np.pi)
+    order = 1
+    while True:
+        nodes, weights = np.polynomial.legendre.leggauss(order)
+        if np.abs(np.cos(b[:, None] * nodes) @ weights / 2 - exact).max() <= tolerance:
+            return order
+        order += 1 if order < 32 else order // 8
+
+
+def gauss_legendre(order: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Return nodes on [-1/2, 1/2] and weights that sum to one, (order,) float64 each.
+
+    Example:
+        >>> gauss_legendre(1)
+        (tensor([0.], dtype=torch.float64), tensor([1.], dtype=torch.float64))
+    """
+    nodes, weights = torch.tensor(_gauss_legendre(order), dtype=torch.float64, device=device)
+    return nodes, weights
+
+
+def _gauss_legendre(order: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    return tuple((nodes / 2).tolist()), tuple((weights / 2).tolist())
+
+
+# What torch.compiler.assume_constant_result does, without the compiler it imports (2 s): NumPy is not traced through.
+for _function in (gauss_legendre_order, _gauss_legendre):
+    setattr(_function, "_dynamo_marked_constant", True)  # noqa: B010 (a function has no such attribute to a checker)

@@ -1,0 +1,385 @@
+"""Depth to defocus: where a scene point comes to focus, written as phase at the edge of the pupil."""
+
+from __future__ import annotations
+
+import math
+from typing import overload
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_depth, check_metres, check_number, check_part, check_positive
+from kornia_tidy.optics.materials import Material
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+
+FASTEST = 0.5  # f-number of a numerical aperture of 1: no lens in air opens wider
+# Lengths in metres, from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
+FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
+
+
+def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: float | Tensor) -> Tensor:
+    r"""Return the defocus phase at the pupil edge of a thin lens.
+
+    .. math:: \psi(z) = \frac{\pi R^2}{\lambda_0} \left( \frac{1}{z} - \frac{1}{z_f} \right)
+
+    Args:
+        depth: distance to the scene in metres, any shape; ``inf`` is allowed and exact.
+        aperture_radius: pupil radius R in metres.
+        focus_distance: distance z_f in metres that is imaged sharply; may be ``inf``.
+
+    Returns:
+        Defocus in radians at 530 nm, same shape and dtype as ``depth``.
+
+    Convention:
+        - Positive is nearer than focus. At another wavelength multiply by 530 nm / wavelength.
+        - The phase over the pupil is defocus * rho**2, with rho = 1 at the edge.
+        - Depths are not checked here: :meth:`ThinLensCamera.defocus` does.
+
+    Source: Goodman, Introduction to Fourier Optics, section 6.4.
+
+    Example:
+        >>> import torch
+        >>> thin_lens_defocus(torch.tensor([0.2975, float("inf")]), 1.4175e-3, 0.595).round(decimals=2)
+        tensor([ 20.0200, -20.0200])
+    """
+    scale = math.pi * aperture_radius**2 / REFERENCE_WAVELENGTH
+    # Inverse depth: infinity is a plain zero.
+    return (scale * (_at_least_float32(depth).reciprocal() - 1 / _at_least_float32(focus_distance))).to(depth.dtype)
+
+
+def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
+    """Return the nearest and farthest depth of a range, or raise."""
+    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
+        raise TypeError(f"depth_range must be two numbers, (near, far) in metres, got {value!r}")
+    near, far = value
+    if not 0 < near < far:
+        raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {(near, far)}")
+    return near, far
+
+
+def _number(value: float | Tensor) -> float:
+    return float(value.detach()) if isinstance(value, Tensor) else float(value)
+
+
+@overload
+def _at_least_float32(value: Tensor) -> Tensor: ...
+@overload
+def _at_least_float32(value: float | Tensor) -> float | Tensor: ...
+def _at_least_float32(value: float | Tensor) -> float | Tensor:
+    """Half precision would move the focus by a thousandth, which is up to a twentieth of a radian."""
+    return value.to(torch.promote_types(value.dtype, torch.float32)) if isinstance(value, Tensor) else value
+
+
+class ThinLensCamera(nn.Module):
+    r"""A thin lens in front of a sensor: turns metric depth into defocus, and says how finely the sensor samples.
+
+    Args:
+        focal_length: in metres.
+        aperture_diameter: diameter of the pupil in metres.
+        focus_distance: distance imaged sharply, in metres; ``inf`` is allowed. A float stays fixed; a tensor becomes
+            a learnable parameter (and a capture no longer compiles to a single graph, as its sampling follows it).
+        pixel_pitch: distance between the sensor's pixels in metres.
+        depth_range: nearest and farthest depth in metres that the PSFs are prepared for. Default: from half the focus
+            distance to infinity, which is symmetric in defocus.
+        lens_material: glass of a lens of a single element, whose focus then differs from colour to colour; the focal
+            length is that at 530 nm. Default: a lens corrected for colour.
+
+    Shape:
+        - ``defocus(depth)``: any shape to the same shape.
+
+    Raises:
+        ValueError: if a length is not one in metres (focal length 0.01 mm to 10 m, pixels 0.1 um to 1 mm), the lens is
+            faster than f/0.5, or the focus distance is not beyond the focal length.
+        TypeError: if an argument is of another type.
+
+    Convention:
+        - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus.
+        - The PSF is sampled with the image distance s' = 1 / (1/f - 1/z_f), not with the focal length.
+
+    Source: Goodman, Introduction to Fourier Optics, sections 5.1 and 6.4; the default lens spans the range of
+    Shah et al., TiDy-PSFs (ICCV 2023): psi from -20 at infinity to +20 at 0.2975 m.
+
+    Example:
+        >>> import torch
+        >>> camera = ThinLensCamera()
+        >>> camera.defocus(torch.tensor([0.298, 0.595, float("inf")])).round(decimals=2)
+        tensor([ 19.9500,  -0.0000, -20.0200])
+        >>> round(camera.f_number, 1), round(float(camera.image_distance), 5)
+        (17.6, 0.05459)
+    """
+
+    def __init__(
+        self,
+        focal_length: float = 50e-3,
+        aperture_diameter: float = 2.835e-3,
+        focus_distance: float | Tensor = 0.595,
+        pixel_pitch: float = 8e-6,
+        depth_range: tuple[float, float] | None = None,
+        lens_material: Material | None = None,
+    ) -> None:
+        super().__init__()
+        check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+        check_metres("aperture_diameter", aperture_diameter, *DIAMETERS, "2.8 mm is 2.8e-3")
+        check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
+        check_number("focus_distance", focus_distance, "metres")
+        if focal_length < FASTEST * aperture_diameter * (1 - 1e-9):
+            raise ValueError(
+                f"aperture_diameter must be at most {focal_length / FASTEST:g} m, which is f/{FASTEST}, for a focal "
+                f"length of {focal_length:g} m, got {aperture_diameter:g} (2.8 mm is 2.8e-3)"
+            )
+        if lens_material is not None:
+            check_part("lens_material", lens_material, Material, "a material such as kornia_tidy.optics.PMMA")
+        focus = _number(focus_distance)
+        if not focus > focal_length:
+            raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
+        self.focal_length = focal_length
+        self.aperture_diameter = aperture_diameter
+        self.pixel_pitch = pixel_pitch
+        self.lens_material = lens_material
+        self.focus_distance: float | Tensor = focus
+        if isinstance(focus_distance, Tensor):
+            del self.focus_distance  # a parameter may not shadow an attribute
+            self.focus_distance = nn.Parameter(focus_distance.detach().clone())
+        if depth_range is None and math.isinf(focus):
+            raise ValueError("a camera focused at infinity needs depth_range=(near, far) in metres, got None")
+        near, far = _depth_range(depth_range) if depth_range is not None else (focus / 2, math.inf)
+        self.depth_range = (near, far)
+        scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
+        # Kept as numbers: the nodes of a PSF bank stay where they are while a learnable focus moves.
+        self.defocus_range = (scale * (1 / far - 1 / focus), scale * (1 / near - 1 / focus))
+
+    @property
+    def aperture_radius(self) -> float:
+        """Radius of the pupil in metres."""
+        return self.aperture_diameter / 2
+
+    @property
+    def f_number(self) -> float:
+        """Focal length over aperture diameter."""
+        return self.focal_length / self.aperture_diameter
+
+    @property
+    def image_distance(self) -> float | Tensor:
+        """Distance from the lens to the sensor in metres, at which the focus distance is sharp."""
+        return 1 / (1 / self.focal_length - 1 / _at_least_float32(self.focus_distance))
+
+    def chromatic_defocus(self, wavelength: float) -> float:
+        r"""Return the defocus that a wavelength has more than 530 nm has, whatever the depth.
+
+        The power of a single element goes as its index less one, so
+
+        .. math:: \Delta\psi(\lambda) = \frac{\pi R^2}{\lambda_0} \left( \frac{1}{f} - \frac{1}{f(\lambda)} \right),
+            \qquad f(\lambda) = f \, \frac{n(\lambda_0) - 1}{n(\lambda) - 1}
+
+        Args:
+            wavelength: in metres.
+
+        Returns:
+            Radians at 530 nm, like all defocus; 0 for a lens corrected for colour. Blue, focused nearer to the lens,
+            has less.
+
+        Source: Goodman, Introduction to Fourier Optics, section 5.1 (lensmaker's equation); Chang and Wetzstein, ICCV
+        2019, for chromatic aberration as a code of depth.
+
+        Example:
+            >>> from kornia_tidy.optics.materials import PMMA
+            >>> lens = ThinLensCamera(lens_material=PMMA)
+            >>> [round(lens.chromatic_defocus(w), 2) for w in (610e-9, 530e-9, 470e-9)]
+            [1.8, 0.0, -2.08]
+        """
+        if self.lens_material is None:
+            return 0.0
+        power = (self.lens_material.index(wavelength) - 1) / (self.lens_material.index(REFERENCE_WAVELENGTH) - 1)
+        return math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH * (1 - power) / self.focal_length
+
+    def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
+        """Return the defocus map of a depth map at 530 nm. See :func:`thin_lens_defocus`.
+
+        Args:
+            depth: metres, any shape; ``inf`` is allowed.
+            check_inputs: look at the values first and refuse NaN, zero and negative depths.
+
+        Raises:
+            ValueError: if a depth is NaN or not positive.
+        """
+        if check_inputs:
+            check_depth(depth)
+        return thin_lens_defocus(depth, self.aperture_radius, self.focus_distance)
+
+    def depth(self, defocus: Tensor) -> Tensor:
+        r"""Return the depth that has a defocus: the inverse of :meth:`defocus`.
+
+        .. math:: 1 / z = 1 / z_{far} + (\psi - \psi_{far}) \, \lambda_0 / (\pi R^2)
+
+        Counted from the far end of the range, so that the defocus of infinity is exactly infinitely far.
+
+        Args:
+            defocus: radians, any shape.
+
+        Returns:
+            Metres, same shape and dtype; ``inf`` for the defocus of infinity, and for less, which no depth has.
+
+        Example:
+            >>> import torch
+            >>> camera = ThinLensCamera()
+            >>> camera.depth(camera.defocus(torch.tensor([0.3, 1.5, float("inf")])))
+            tensor([0.3000, 1.5000,    inf])
+        """
+        scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
+        inverse = 1 / self.depth_range[1] + (_at_least_float32(defocus) - self.defocus_range[0]) / scale
+        if isinstance(self.focus_distance, Tensor):  # it may have moved since the range was chosen
+            here = thin_lens_defocus(inverse.new_tensor(self.depth_range[1]), self.aperture_radius, self.focus_distance)
+            inverse = inverse + (self.defocus_range[0] - here) / scale
+        return inverse.clamp(min=0).reciprocal().to(defocus.dtype)
+
+    def resized(self, scale: float) -> ThinLensCamera:
+        """Return this camera for images resized by ``scale`` (0.5 halves their sides), so that PSFs keep their size.
+
+        Example:
+            >>> ThinLensCamera(pixel_pitch=8e-6).resized(0.5).pixel_pitch
+            1.6e-05
+        """
+        check_positive("scale", scale)
+        focus = self.focus_distance
+        return ThinLensCamera(
+            self.focal_length,
+            self.aperture_diameter,
+            focus.detach() if isinstance(focus, Tensor) else focus,
+            self.pixel_pitch / scale,
+            self.depth_range,
+            self.lens_material,
+        )
+
+    @classmethod
+    def for_scene(
+        cls,
+        depth_range: tuple[float, float],
+        defocus_range: tuple[float, float] = (-20.0, 20.0),
+        focal_length: float = 50e-3,
+        pixel_pitch: float = 8e-6,
+        lens_material: Material | None = None,
+    ) -> ThinLensCamera:
+        r"""Choose focus and aperture so that a range of depths fills a range of defocus.
+
+        Two equations, :math:`\psi(z_{far}) = \psi_{lo}` and :math:`\psi(z_{near}) = \psi_{hi}`, give R and z_f.
+
+        Args:
+            depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
+            defocus_range: defocus at the farthest and at the nearest depth in radians, lo < hi and lo <= 0 <= hi.
+            focal_length: in metres.
+            pixel_pitch: in metres.
+            lens_material: glass of a single element. Default: a lens corrected for colour.
+
+        Raises:
+            ValueError: if a range is empty, or no lens of this focal length can do it.
+
+        Example:
+            >>> import torch
+            >>> camera = ThinLensCamera.for_scene((0.5, 4.0))
+            >>> camera.defocus(torch.tensor([0.5, 4.0])).round(decimals=3)
+            tensor([ 20., -20.])
+        """
+        near, far = _depth_range(depth_range)
+        lo, hi = defocus_range
+        if not (lo <= 0 <= hi and lo < hi):
+            raise ValueError(f"defocus_range must be (lo, hi) with lo <= 0 <= hi and lo < hi, got {defocus_range}")
+        scale = (hi - lo) / (1 / near - 1 / far)
+        inverse_focus = 1 / far - lo / scale
+        focus = math.inf if inverse_focus == 0 else 1 / inverse_focus
+        radius = math.sqrt(scale * REFERENCE_WAVELENGTH / math.pi)
+        if focal_length < FASTEST * 2 * radius:
+            raise ValueError(
+                f"depths from {near:g} to {far:g} m need an aperture of {2 * radius:.3g} m for a defocus from {lo:g} "
+                f"to {hi:g} rad, and a focal length of {focal_length:g} m allows {focal_length / FASTEST:g} m: if they "
+                f"are millimetres, multiply them by 0.001 (--depth-scale 0.001); else ask for less defocus"
+            )
+        return cls(focal_length, 2 * radius, focus, pixel_pitch, depth_range, lens_material)
+
+    def extra_repr(self) -> str:
+        """Describe the lens in a person's words."""
+        near, far = self.depth_range
+        lo, hi = self.defocus_range
+        return (
+            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {_number(self.focus_distance):.4g} m, "
+            f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
+            f"{'' if self.lens_material is None else ', a single element of ' + self.lens_material.name}"
+        )
+
+
+class DefocusRange(nn.Module):
+    r"""Depth that already is a normalised disparity: maps [0, 1] linearly to a range of defocus.
+
+    The data of the paper come so. The lens behind it is only needed for the size of the PSF on the sensor.
+
+    Args:
+        lo: defocus in radians that a value of 0 means.
+        hi: defocus in radians that a value of 1 means.
+        lens: aperture, image distance and pixel pitch for the PSFs. Default: :class:`ThinLensCamera`.
+
+    Raises:
+        ValueError: if ``lo`` is not below ``hi``.
+        TypeError: if ``lens`` is not a ThinLensCamera.
+
+    Convention:
+        - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus, so 1 is nearest.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 4; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
+
+    Example:
+        >>> import torch
+        >>> DefocusRange(-20, 20).defocus(torch.tensor([0.0, 0.5, 1.0]))
+        tensor([-20.,   0.,  20.])
+    """
+
+    def __init__(self, lo: float = -20.0, hi: float = 20.0, lens: ThinLensCamera | None = None) -> None:
+        super().__init__()
+        if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
+            raise ValueError(f"a defocus range must be finite with lo < hi, got lo={lo}, hi={hi}")
+        self.defocus_range = (float(lo), float(hi))
+        self.lens = ThinLensCamera() if lens is None else lens
+        check_part("lens", self.lens, ThinLensCamera, "a ThinLensCamera")
+
+    @property
+    def aperture_radius(self) -> float:
+        """Radius of the pupil in metres."""
+        return self.lens.aperture_radius
+
+    @property
+    def image_distance(self) -> float | Tensor:
+        """Distance from the lens to the sensor in metres."""
+        return self.lens.image_distance
+
+    @property
+    def pixel_pitch(self) -> float:
+        """Distance between the sensor's pixels in metres."""
+        return self.lens.pixel_pitch
+
+    def chromatic_defocus(self, wavelength: float) -> float:
+        """Return the defocus that a wavelength has more than 530 nm has. See :class:`ThinLensCamera`."""
+        return self.lens.chromatic_defocus(wavelength)
+
+    def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
+        """Return the defocus map of a normalised disparity map.
+
+        Raises:
+            ValueError: if a value is NaN or outside [0, 1].
+        """
+        if check_inputs and depth.numel():
+            lowest, highest = torch.aminmax(depth.detach())
+            if not bool((lowest >= 0) & (highest <= 1)):  # False for NaN too
+                bad = depth[~((depth >= 0) & (depth <= 1))][0].item()
+                raise ValueError(
+                    f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}: metres need a "
+                    f"ThinLensCamera"
+                )
+        lo, hi = self.defocus_range
+        return (lo + (hi - lo) * _at_least_float32(depth)).to(depth.dtype)
+
+    def resized(self, scale: float) -> DefocusRange:
+        """Return this camera for images resized by ``scale``, so that PSFs keep their size in the scene."""
+        return DefocusRange(*self.defocus_range, lens=self.lens.resized(scale))
+
+    def extra_repr(self) -> str:
+        """Describe the range in a person's words."""
+        lo, hi = self.defocus_range
+        return f"normalised disparity 0 to 1 means psi {lo:+.4g} to {hi:+.4g} rad"

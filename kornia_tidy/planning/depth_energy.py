@@ -1,0 +1,256 @@
+r"""Where in depth the light of a scene varies, octave by octave.
+
+A texture and the dark around it may lie at different depths, so the power of an image says little of what one PSF makes
+of it. Here it is told apart twice. Box averages over cells of :math:`2^j` pixels split it into octaves: what is lost
+from one level to the next, :math:`m_j^2 - m_{j+1}^2` summed over cells, is the power that passes
+
+.. math:: K_j(f) = B_j(f) - B_{j+1}(f), \qquad B_j(f) = \prod_{x, y} \frac{\sin^2(\pi 2^j f)}{4^j \sin^2(\pi f)}
+
+on average over where the cells begin; :math:`K_j \ge 0`, and with the last average they sum to one. And as the averages
+stay in place, the power of each octave is given to the depths where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+LEVELS = 5  # octaves told apart: from 2 px to 32; slower ones stand together
+REACHES = (1, 3, 9)  # cells around, over which light is taken to spread: the largest sum counts
+_REACH_CELL = 8  # px; of octaves finer than this
+_STRIP = 1 << 18  # px; larger images are taken some rows at a time
+_OFFSET = 21  # px from a corner of a cell to the image's: edges at round pixels then lie inside cells of every level
+
+
+def octave_filters(size: int, levels: int = LEVELS) -> Tensor:
+    """Return how much of the power at each frequency belongs to each octave, the finest first; they sum to one.
+
+    Args:
+        size: side N of the frequency grid.
+        levels: octaves told apart; one more holds all that is slower.
+
+    Returns:
+        (levels + 1, N, N // 2 + 1) float64.
+
+    Example:
+        >>> filters = octave_filters(16)
+        >>> filters.shape, bool((filters >= 0).all()), bool(torch.allclose(filters.sum(0), torch.ones(16, 9).double()))
+        (torch.Size([6, 16, 9]), True, True)
+    """
+    down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
+    boxes = [torch.ones(size, len(across), dtype=torch.float64)]
+    for level in range(levels):
+        pair = [torch.cos(math.pi * 2**level * f).square() for f in (down, across)]
+        boxes.append(boxes[-1] * pair[0][:, None] * pair[1])
+    return torch.stack([*(a - b for a, b in pairwise(boxes)), boxes[-1]])
+
+
+class Depths:
+    """The depths of a scene in bins, and its pixels laid out in cells.
+
+    Args:
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+        lo: least defocus of the camera, and
+        hi: largest: what lies beyond is clamped.
+        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
+        margin: pixels at each side of the image that the capture does not show.
+        bins: how many there may be.
+
+    Attributes:
+        psi: (b,) float64, the mean defocus of each bin that is not empty, ascending.
+        share: (b,) the share of the pixels in it.
+        seen: the share of the image that the capture shows.
+    """
+
+    def __init__(self, defocus: Tensor, lo: float, hi: float, border: str, margin: int = 0, bins: int = 256) -> None:
+        at = defocus.detach().double().cpu().clamp(lo, hi)
+        low, high = float(at.min()), float(at.max())
+        index = ((at - low) * (bins / max(high - low, 1e-9))).long().clamp(max=bins - 1)
+        count = torch.bincount(index.flatten(), minlength=bins)
+        sums = torch.bincount(index.flatten(), at.flatten(), minlength=bins)
+        full = count > 0
+        self.psi, self.share = sums[full] / count[full], count[full].double() / at.numel()
+        self._index = (full.cumsum(0) - 1)[index]
+        self._border, self._margin = border, margin
+        height, width = defocus.shape[-2:]
+        self._shape = height, width
+        self.seen = (height - 2 * margin) * (width - 2 * margin) / (height * width)
+        self._rows, self._columns = (_cells(side, border) for side in defocus.shape[-2:])
+
+    def _laid_out(self, plane: Tensor, outside: float | Tensor) -> Tensor:
+        """Return (B, C, H, W) planes with what the border puts around them, in whole cells of the largest size."""
+        rows, columns = self._rows, self._columns
+        laid = plane[..., rows.clamp(min=0)[:, None], columns.clamp(min=0)]
+        if self._border != "zero":
+            return laid
+        return torch.where((rows[:, None] >= 0) & (columns >= 0), laid, outside)
+
+    def _once(self, margin: int) -> Tensor:
+        """Return 1 where each pixel of the image lies as laid out but for a margin, 0 elsewhere, (1, 1, H', W')."""
+        inside = torch.zeros(1, 1, len(self._rows), len(self._columns))
+        height, width = self._shape
+        top, left = _OFFSET + margin, _OFFSET + margin
+        inside[..., top : _OFFSET + height - margin, left : _OFFSET + width - margin] = 1
+        return inside
+
+    def _labels(self, batch: int) -> Tensor:
+        """Return the bin of each pixel as laid out, the number of bins where there is none, (B, 1, H', W')."""
+        outside = torch.tensor(len(self.psi))
+        return self._laid_out(self._index, outside).expand(batch, -1, -1, -1)
+
+    def shares(self, light: Tensor) -> Tensor:
+        r"""Return which share of each octave's power depths take in that blur the light around them, as gather does.
+
+        A pixel takes light in from as far as its PSF reaches. So the power is spread over several reaches, from none
+        to some tens of pixels, and of what they give to a depth the most counts: shares of an octave sum to one or
+        more. No share is larger than one.
+
+        Args:
+            light: (B, C, H, W).
+
+        Returns:
+            (C, levels + 1, b) float64.
+        """
+        light = light.detach().cpu()
+        mean = light.mean((-2, -1), keepdim=True)
+        averages = self._laid_out(light - mean, -mean)
+        labels = self._labels(len(light))
+        labels = torch.where(self._once(self._margin) > 0, labels, len(self.psi))
+        labels = labels.flatten()
+        alone = self._largest(averages.square(), 1, labels, (1,))  # a single light stands in all octaves at once
+        octaves = []
+        for level in range(LEVELS + 1):
+            squares = averages.square()
+            if level < LEVELS:
+                coarser = avg_pool2d(averages, 2)
+                squares, averages = avg_pool2d(squares, 2) - coarser.square(), coarser
+            side = 2 ** min(level + 1, LEVELS)
+            octaves.append(torch.maximum(alone, self._largest(squares.clamp(min=0), side, labels)))
+        return torch.stack(octaves, 1)
+
+    def _largest(self, squares: Tensor, side: int, labels: Tensor, reaches: Sequence[int] = REACHES) -> Tensor:
+        """Return the largest share of each bin over all reaches, (C, b), of the power in cells of so many pixels."""
+        inside = avg_pool2d(self._once(0), side)
+        total = (squares * inside).sum((0, 2, 3)).double()[:, None]
+        count = len(self.psi)
+        largest = torch.zeros(squares.shape[1], count, dtype=torch.float64)
+        for reach in reaches:
+            own, cell = squares, side
+            if reach > 1:
+                if side < _REACH_CELL:
+                    own, cell = avg_pool2d(own, _REACH_CELL // side), _REACH_CELL
+                own = avg_pool2d(own, reach, 1, reach // 2, count_include_pad=False)
+            spread = own.repeat_interleave(cell, -2).repeat_interleave(cell, -1).transpose(0, 1).flatten(1)
+            sums = spread.new_zeros(count + 1, len(spread)).index_add_(0, labels, spread.T).T[:, :count]
+            largest = torch.maximum(largest, sums.double() / side**2 / total)
+        return torch.where(total > 0, largest.clamp(max=1), self.share)
+
+    def means(self, light: Tensor) -> Tensor:
+        """Return the mean over the image of the light at each depth, (C, b) float64."""
+        planes = light.detach().cpu().transpose(0, 1).flatten(1).double()
+        labels = self._index.expand(len(light), -1, -1, -1).flatten()
+        return planes.new_zeros(len(planes), len(self.psi)).index_add_(1, labels, planes) / planes.shape[1]
+
+    def products(self, light: Tensor) -> Tensor:
+        """Return the products of the light at two depths in each octave, as scatter adds it up.
+
+        Light at each depth alone, black elsewhere, has outlines that the image has not; where depths are alike, those
+        of one cancel those of the next. The sum over both depths is the power of the image.
+
+        Args:
+            light: (B, C, H, W).
+
+        Returns:
+            (C, levels + 1, b, b) float64, a mean over pixels; of the last octave less that of the means.
+        """
+        light = light.detach().float().cpu()
+        count = len(self.psi)
+        planes = self._laid_out(light, 0.0).transpose(0, 1)
+        labels = self._labels(len(light))[:, 0]
+        inside = (labels[:1, None] < count).float()
+        covered = avg_pool2d(inside, 2**LEVELS)[0]
+        drawn_out = self._border == "replicate"  # streaks from the border add to the light of the image
+        pixels = len(light) * (self._shape[0] * self._shape[1] if drawn_out else float(inside.sum()))
+        rows = 2**LEVELS * max(1, _STRIP // (2**LEVELS * labels.shape[0] * labels.shape[-1]))
+        products = []
+        for plane in planes:
+            strips = [
+                _products_of_cells(*strip, count)
+                for strip in zip(plane.split(rows, 1), labels.split(rows, 1), strict=True)
+            ]
+            levels = torch.stack([levels for levels, _ in strips]).sum(0)
+            cells = torch.cat([cells for _, cells in strips], 1)
+            slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2).double()
+            levels = torch.cat([-levels.diff(dim=0), (slow.T @ slow)[None] / 4**LEVELS])
+            products.append(levels / pixels)
+        return torch.stack(products)
+
+
+def brightest_around(light: Tensor) -> Tensor:
+    """Return the brightest light about each pixel, averaged over cells of eight pixels a side; (B, C, H, W).
+
+    Example:
+        >>> star = torch.zeros(1, 1, 64, 64)
+        >>> star[..., 20, 20] = 64
+        >>> brightest_around(star)[0, 0, 30, ::15].tolist()
+        [0.0, 1.0, 1.0, 0.0, 0.0]
+    """
+    side = _REACH_CELL
+    height, width = light.shape[-2:]
+    cells = max_pool2d(avg_pool2d(light, side, ceil_mode=True, count_include_pad=False), 3, 1, 1)
+    return cells.repeat_interleave(side, -2)[..., :height, :].repeat_interleave(side, -1)[..., :width]
+
+
+def _cells(side: int, border: str) -> Tensor:
+    """Return which row of the image each row of whole cells is, -1 for none."""
+    whole = 2**LEVELS * math.ceil((side + _OFFSET) / 2**LEVELS)
+    at = torch.arange(whole) - _OFFSET
+    if border == "zero":
+        return torch.where((at >= 0) & (at < side), at, -1)
+    if border == "circular":
+        return at % side
+    if border == "replicate":
+        return at.clamp(0, side - 1)
+    period = max(1, 2 * side - 2)
+    at = at % period
+    return torch.minimum(at, period - at)
+
+
+def _products_of_cells(plane: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the products of the sums over cells of each level, (levels + 1, b, b), and the sums over the largest."""
+    levels = [_products_at(plane, labels, level, count) for level in range(2)]
+    cells = _cell_sums(plane, labels, 2, count)
+    for level in range(2, LEVELS + 1):
+        levels.append((cells.flatten(0, 2).T @ cells.flatten(0, 2)).double() / 4**level)
+        if level < LEVELS:
+            cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
+    return torch.stack(levels), cells
+
+
+def _products_at(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
+    """Return the products of the sums over cells of a fine level, pair by pair."""
+    side = 2**level
+    light, own = (_in_cells(each, side) for each in (plane, labels))
+    pairs = own[:, :, None] * (count + 1) + own[:, None]
+    weights = light[:, :, None] * light[:, None]
+    sums = torch.bincount(pairs.flatten(), weights.flatten(), minlength=(count + 1) ** 2)
+    return sums.double().view(count + 1, count + 1)[:count, :count] / 4**level
+
+
+def _in_cells(plane: Tensor, side: int) -> Tensor:
+    return plane.unflatten(1, (-1, side)).unflatten(3, (-1, side)).transpose(2, 3).flatten(3).flatten(0, 2)
+
+
+def _cell_sums(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
+    """Return the sum of the light at each depth in each cell, (B, rows, columns, b)."""
+    batch, height, width = (len(plane), *(side >> level for side in plane.shape[-2:]))
+    rows, columns = torch.arange(height << level) >> level, torch.arange(width << level) >> level
+    cells = (torch.arange(batch)[:, None, None] * height + rows[:, None]) * width + columns
+    sums = torch.zeros(batch * height * width * (count + 1), dtype=plane.dtype)
+    sums.index_add_(0, (cells * (count + 1) + labels).flatten(), plane.flatten())
+    return sums.view(batch, height, width, count + 1)[..., :count]

@@ -1,0 +1,77 @@
+"""RenderPlan: how a scene is to be captured, what that costs and how far it is from the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kornia_tidy.fidelity import Fidelity
+
+
+@dataclass(frozen=True)
+class RenderPlan:
+    """How to capture a scene, and what is known of it before. ``print`` it for a person.
+
+    Args:
+        fidelity: the setting, for ``optics.with_fidelity(plan.fidelity)``. Its window is fixed.
+        reference: what the error is against: the preset, with the window of the masks as they are now.
+        tolerance: error asked for.
+        predicted_error: root mean square of the noise-free linear capture against ``reference``, full scale 1: an
+            estimate from above, see :mod:`kornia_tidy.planning.planner` for what it rests on.
+        seconds: of one capture with its PSFs on one core, see :mod:`kornia_tidy.render.cost_model`.
+        memory_bytes: peak of one capture without gradients, beyond the image.
+        reference_seconds: what the reference would take.
+        layers_present: PSFs computed for the scene.
+        layers_total: those of the camera's whole range.
+        states: of the exposure, rendered one by one: 1 where their mean does, as it does unless layers hide others.
+        wavelengths: PSFs computed for each layer.
+        wavelengths_total: those that the camera's spectrum has, at all of which the reference is.
+        light_held: least and largest share of the light in the window over the range.
+        reference_error: of the reference, against a PSF of its own for each pixel's depth.
+        error_parts: what each economy adds to ``predicted_error``, by name.
+    """
+
+    fidelity: Fidelity
+    reference: Fidelity
+    tolerance: float
+    predicted_error: float
+    seconds: float
+    memory_bytes: int
+    reference_seconds: float
+    layers_present: int
+    layers_total: int
+    states: int
+    wavelengths: int
+    wavelengths_total: int
+    light_held: tuple[float, float]
+    reference_error: float
+    error_parts: tuple[tuple[str, float], ...]
+
+    def __str__(self) -> str:
+        """Tell what is computed, what is skipped and why, and what it costs."""
+        knobs, full = self.fidelity, self.reference
+        held = " to ".join(dict.fromkeys(f"{share:.0%}" for share in self.light_held))
+        skipped = [f"{self.layers_total - self.layers_present} of the layers, at depths that the scene does not have"]
+        reasons = {
+            "layers": "PSFs between the layers",
+            "window": f"light beyond {knobs.window} of {full.window} px",
+            "wavelengths": f"{self.wavelengths_total - self.wavelengths} wavelengths, merged with their neighbours",
+            "points a pixel": "finer integration over pixels",
+            "float32": "float64",
+        }
+        skipped += [f"{reasons[name]} (error {error:.1e})" for name, error in self.error_parts if error > 0]
+        every = f"{self.wavelengths} of {total}" if (total := self.wavelengths_total) > self.wavelengths else f"{total}"
+        at = f", at all {total} wavelengths of the camera's spectrum" if total > self.wavelengths else ""
+        return "\n".join(
+            [
+                f"{knobs.name}: error {self.predicted_error:.1e} of full scale against the reference"
+                + (", as nothing cheaper is within the tolerance" if knobs.name == full.name else ""),
+                f"  computes: {self.layers_present} of {self.layers_total} {knobs.layers} layers of defocus, for each "
+                f"PSFs at {every} wavelength{'s' if total != 1 else ''} of {knobs.window}x"
+                f"{knobs.window} px that hold {held} of the light, in float{64 if knobs.double else 32}"
+                + (f", and an image for each of {self.states} states of the exposure" if self.states > 1 else ""),
+                "  skips: " + "; ".join(skipped),
+                f"  costs: some {self.seconds:.2g} s on one core, {self.seconds / self.reference_seconds:.2%} of the "
+                f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",
+                f"  the reference itself is {self.reference_error:.1e} from a PSF of its own for each depth{at}",
+            ]
+        )

@@ -1,0 +1,242 @@
+"""The power of an image: of its spectrum, by octave, and by depth.
+
+Spectra are taken such that their sum times a filter's power is the mean square that the filter leaves of the image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_tidy.planning.depth_energy import LEVELS, Depths, brightest_around, octave_filters
+from kornia_tidy.render.borders import next_fast_size, pad_border
+
+CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
+GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
+_BLOCK = 1024  # px; larger images are looked at block by block
+_GRID = 33  # depths at which changes of PSFs are compared
+ALIKE = 2.0  # rad; how far apart in defocus changes of PSFs are still alike
+_USUAL = 0.1  # of the spectrum's shape is that of a photograph
+
+
+def spectrum_size(window: int) -> int:
+    """Return the side of the grid that PSFs of a window are compared on: at least such that it tells octaves apart."""
+    return next_fast_size(max(2 ** (LEVELS + 1), math.ceil(GRID_RATIO * window)))
+
+
+def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
+    r"""Return the power spectrum of images, such that its sum times a filter's power is the mean square it leaves.
+
+    Args:
+        light: (B, C, H, W).
+        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`. Made-up light counts too.
+        size: side N of the frequency grid.
+
+    Returns:
+        (C, N, N // 2 + 1) float64 for the half spectrum. The mean of each image is left out, as white stays white; at
+        frequency zero stands what varies more slowly than the grid can tell.
+
+    Example:
+        >>> image = torch.rand(1, 1, 40, 40, dtype=torch.float64)
+        >>> power = power_spectrum(image, "circular", 40)
+        >>> bool(torch.isclose(power.sum(), image.var(correction=0)))
+        True
+    """
+    light = light.double()
+    varying = light - light.mean((-2, -1), keepdim=True)
+    if border == "replicate":  # edges drawn out into streaks are coarser than the image, mirrored or not: take either
+        drawn_out = pad_border(varying, int(size / GRID_RATIO) // 2, "replicate")
+        return torch.maximum(*(_power_of_blocks(plane, "reflect", size) for plane in (varying, drawn_out)))
+    power = _power_of_blocks(light if border == "zero" else varying, border, size)
+    if border == "zero":  # with the veil the mean is kept, but for what is missed in the dark around
+        mean_square = light.mean((-2, -1)).square().mean(0).cpu()
+        missed = mean_square * _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
+        power[:, 0, 0] = _power_of_blocks(varying, "reflect", size)[:, 0, 0] + missed
+    return power
+
+
+def _dark_square(shape: Sequence[int], radius: int) -> float:
+    """Return the mean square of the share of a pixel's surroundings that lies beyond the image."""
+    inside = []
+    for side in shape:
+        at = torch.arange(side, dtype=torch.float64)
+        inside.append(((at + radius).clamp(max=side - 1) - (at - radius).clamp(min=0) + 1) / (2 * radius + 1))
+    return float((1 - inside[0][:, None] * inside[1]).square().mean())
+
+
+def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
+    total, pixels = torch.zeros((), dtype=torch.float64), 0
+    for top in range(0, light.shape[-2], _BLOCK):
+        for left in range(0, light.shape[-1], _BLOCK):
+            block = light[..., top : top + _BLOCK, left : left + _BLOCK]
+            total = total + _covariance(_endless(block, border, size), size) * block[0, 0].numel()
+            pixels += block[0, 0].numel()
+    return _half_plane(torch.fft.rfft2(total / pixels).real / size**2, size)
+
+
+def coarser(power: Tensor, size: int) -> Tensor:
+    """Return a power spectrum on a smaller grid: its covariance at the shifts that the grid has.
+
+    Example:
+        >>> power = power_spectrum(torch.rand(1, 1, 40, 40, dtype=torch.float64), "circular", 20)
+        >>> coarser(power, 10).shape
+        torch.Size([1, 10, 6])
+    """
+    full = power.shape[-2]
+    halves = torch.full((full // 2 + 1,), 0.5, dtype=torch.float64)
+    halves[0] = 1
+    if full % 2 == 0:
+        halves[-1] = 1
+    covariance = torch.fft.irfft2(power * halves, s=(full, full))
+    lags = torch.fft.fftfreq(size, 1 / size).round().long()
+    return _half_plane(torch.fft.rfft2(covariance[:, lags[:, None], lags]).real * (full / size) ** 2, size)
+
+
+def natural_power(channels: int, size: int) -> Tensor:
+    """Return the power spectrum of a typical photograph: 1 / f**2, with the standard deviation ``CONTRAST``.
+
+    At frequency zero stands that of half the lowest frequency of the grid.
+
+    Source: Field, Relations between the statistics of natural images and the response properties of cortical cells,
+    J. Opt. Soc. Am. A 4(12), 2379 (1987).
+
+    Example:
+        >>> round(float(natural_power(1, 64).sum().sqrt()), 6) == CONTRAST
+        True
+    """
+    down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
+    squared = down[:, None] ** 2 + across**2
+    squared[0, 0] = (0.5 / size) ** 2
+    power = _half_plane(1 / squared[None], size)
+    return (power * (CONTRAST**2 / power.sum())).expand(channels, -1, -1)
+
+
+class SceneLight:
+    """The power of a scene's light by channel, octave and depth, and the shape of its spectrum within each octave.
+
+    Args:
+        power: of the light, (C, N, N // 2 + 1), see :func:`power_spectrum`.
+        psi: (b,) defocus in the scene, ascending.
+        energies: of one kind of light or of several, of which the one that makes most of a difference counts: each
+            (C, octaves, b) where depths add up by themselves, (C, octaves, b, b) where they add up to light.
+    """
+
+    def __init__(self, power: Tensor, psi: Tensor, *energies: Tensor) -> None:
+        self.psi, self.energies = psi, [each if each.ndim == 3 else each.float() for each in energies]
+        self._power = power
+        self._shapes: dict[int, Tensor] = {}
+        # What changes slowly with defocus need not be known at each of them.
+        self.grid = torch.linspace(float(psi[0]), float(psi[-1]), _GRID, dtype=torch.float64)
+        spread = interpolation(psi, self.grid.tolist()) if psi[-1] > psi[0] else torch.ones(1, _GRID).double() / _GRID
+        self._on_grid = [
+            each @ spread if each.ndim == 3 else spread.mT @ (each @ spread.float()).double() for each in self.energies
+        ]
+
+    @classmethod
+    def seen(cls, light: Tensor, depths: Depths, border: str, size: int, compositing: str) -> SceneLight:
+        """Return that of an image, as it is composed."""
+        power = power_spectrum(light, border, size)
+        if compositing == "gather":
+            octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
+            return cls(power, depths.psi, octaves[..., None] * depths.shares(light) / depths.seen)
+        lights = [light]
+        if compositing == "occlusion":  # what is dark hides what is bright
+            lights.append(brightest_around(light) - light)
+        energies = [depths.products(each) / depths.seen for each in lights]
+        if border == "zero":
+            for each, own in zip(lights, energies, strict=True):
+                means = depths.means(each)
+                missed = _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
+                own[:, -1] += missed * means[:, :, None] * means[:, None]
+        return cls(power, depths.psi, *energies)
+
+    @classmethod
+    def unseen(cls, depths: Depths, channels: int, size: int) -> SceneLight:
+        """Return that of a typical photograph, alike at all depths."""
+        power = natural_power(channels, size)
+        octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
+        return cls(power, depths.psi, octaves[..., None] * depths.share)
+
+    def mean_square(self, squares: Tensor) -> Iterator[float]:
+        """Yield the mean square error that a change of PSFs makes, for each kind of light.
+
+        Changes at two depths are alike, or as unlike as those farther than ``ALIKE`` apart: whichever makes more.
+
+        Args:
+            squares: (C, octaves, grid) of what the change leaves of light of power one, at the depths of ``grid``.
+        """
+        sizes = squares.clamp(min=0).sqrt()
+        alike = torch.exp(-0.5 * ((self.grid[:, None] - self.grid) / ALIKE).square())
+        for own in self._on_grid:
+            if own.ndim == 3:
+                yield float((squares * own).sum((1, 2)).mean())
+            else:
+                sums = [((each @ sizes[..., None])[..., 0] * sizes).sum(-1) for each in (own, own * alike)]
+                yield float(torch.maximum(*sums).clamp(min=0).sum(1).mean())
+
+    def shapes(self, window: int) -> Tensor:
+        """Return the shapes of the spectrum, each with a sum of one, on a grid for PSFs of a window.
+
+        Of an octave that the image as a whole does not have, that of a photograph.
+
+        Returns:
+            (C, octaves, M, M // 2 + 1) float64.
+        """
+        full = self._power.shape[-2]
+        size = min(full, spectrum_size(window))
+        if size not in self._shapes:
+            power = coarser(self._power, size) if size < full else self._power
+            usual = natural_power(1, size) * power.sum((-2, -1), keepdim=True).clamp(min=1e-30)
+            power = power.clamp(min=0) + _USUAL * usual
+            octaves = power[:, None] * octave_filters(size)
+            self._shapes[size] = octaves / octaves.sum((-2, -1), keepdim=True)
+        return self._shapes[size]
+
+
+def interpolation(at: Tensor, nodes: Sequence[float]) -> Tensor:
+    """Return the weights of linear interpolation between nodes, constant beyond them, (len(at), len(nodes)).
+
+    Example:
+        >>> interpolation(torch.tensor([0.5, 9.0]), (0.0, 2.0)).tolist()
+        [[0.75, 0.25], [0.0, 1.0]]
+    """
+    columns = [np.interp(at.numpy(), nodes, row) for row in np.eye(len(nodes))]
+    return torch.as_tensor(np.stack(columns, 1), dtype=torch.float64)
+
+
+def _endless(block: Tensor, border: str, size: int) -> Tensor:
+    """Make a block periodic the way its border continues it: mirrored, repeated, or alone in the dark."""
+    height, width = block.shape[-2:]
+    if border == "zero":
+        return torch.nn.functional.pad(block, (0, size, 0, size)) * math.sqrt(
+            (height + size) * (width + size) / (height * width)
+        )
+    if border == "circular":
+        return block
+    return torch.nn.functional.pad(block, (0, max(0, width - 2), 0, max(0, height - 2)), mode="reflect")
+
+
+def _covariance(plane: Tensor, size: int) -> Tensor:
+    """Return the covariance of a periodic plane with itself at shifts up to half of ``size``, (C, size, size)."""
+    height, width = plane.shape[-2:]
+    power = _power(torch.fft.rfft2(plane)).mean(0) / (height * width)
+    lags = torch.fft.fftfreq(size, 1 / size).round().long()
+    rows = torch.fft.ifft(power, dim=-2)[:, lags % height]
+    return torch.fft.irfft(rows, n=width)[..., lags % width].cpu()
+
+
+def _power(spectrum: Tensor) -> Tensor:
+    return spectrum.real.square() + spectrum.imag.square()
+
+
+def _half_plane(power: Tensor, size: int) -> Tensor:
+    """Let columns that stand for two frequencies count twice."""
+    twice = torch.full((size // 2 + 1,), 2.0, dtype=torch.float64)
+    twice[0] = 1
+    if size % 2 == 0:
+        twice[-1] = 1
+    return power * twice

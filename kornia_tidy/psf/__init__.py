@@ -1,0 +1,20 @@
+"""From the pupil to point spread functions: propagation, interpolation over defocus, the PSF bank and its cache.
+
+Masks, modulator, camera, spectrum and fidelity come in as a lens; PSFs at the defocus of each layer go out as a bank.
+Read ``psf_model.py`` first; ``exact.py`` and ``paper.py`` are the two propagations.
+"""
+
+from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.psf.paper import AliasingWarning, paper_psf_bank
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.psf.state_bank import StateBank
+
+__all__ = [
+    "AliasingWarning",
+    "PSFBank",
+    "Pupil",
+    "StateBank",
+    "exact_psf_bank",
+    "paper_psf_bank",
+]

@@ -1,0 +1,163 @@
+r"""The energy of many waves by the mutual intensity in the pupil: what the PSFs of many states cost.
+
+A row of pixels sees waves :math:`v = K U_k` over the pupil's columns, one for each state and each point of the row.
+Their energy in a pixel of the row is a quadratic form that all of them share:
+
+.. math:: \sum_{v} w_v \Big| \sum_n K_{un} v_n \Big|^2 = \sum_{nm} J_{nm} B_{nm}, \qquad
+    J_{nm} = \sum_v w_v v_n v_m^*, \quad B_{nm} = K_{un} K_{um}^*
+
+J is the mutual intensity of the light in the row, B belongs to a pixel and adds up over its points. So nothing grows
+with states times points of both axes, and no wave on the sensor is ever formed. Both are Hermitian and are kept as one
+real matrix, the sum of real and imaginary part: that is symmetric plus antisymmetric, and those two are orthogonal.
+
+Source: Goodman, Statistical Optics, 5.2, for the mutual intensity.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.kernels.build import KERNELS, REALS, compiled
+from kornia_tidy.psf.checkpointed_sum import recomputed
+from kornia_tidy.runtime.tracing import is_followed
+
+SOURCE = KERNELS / "mutual_intensity.c"
+LARGEST_WINDOW = (
+    65  # px, in C: 0.6 (23 px) to 0.85 (61 px) of the time of matrix products, beyond 100 px more than they
+)
+
+_BLOCK_NUMBERS = 2**20  # held at once, if a single depth allows it: they stay near a core
+
+
+def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    r"""Return :math:`\sum_{k,q,q'} w_k |K_d U_k K_d^T|^2`, summed over the q points of a pixel on each axis.
+
+    Args:
+        field: U, (K, N, N) complex.
+        weights: (K,).
+        kernels: (D, P, q, N) complex, of the field's precision.
+
+    Returns:
+        (D, P, P), real. Twice differentiable in all three.
+
+    Example:
+        >>> mutual_energies(torch.full((1, 2, 2), 1j), torch.ones(1), torch.ones(1, 1, 1, 2) + 0j)
+        tensor([[[16.]]])
+    """
+    if _is_plain(field, weights, kernels) and goes_in_c(kernels.shape[1], field.real.dtype):
+        return _energies_in_c(field, weights, kernels)
+    weights = weights.to(field.real.dtype)[:, None, None]
+    plain, turned = _columns(field), _columns(field * weights * (1 + 1j))
+    left = torch.view_as_real(kernels).flatten(-2)
+    with torch.autocast(left.device.type, enabled=False):
+        # B is packed as real less imaginary part: with J's sum of both, that leaves the real part of their product.
+        pixels = (_real_rows(kernels).mT @ _real_rows(kernels * (1 - 1j))).flatten(-2)
+    return recomputed(_energies, _gradients, plain, turned, left, pixels)
+
+
+def goes_in_c(window: int, dtype: torch.dtype) -> bool:
+    """Whether energies without gradients are had faster in C: where there is a compiler, unless the window is large.
+
+    Args:
+        window: side of the PSFs in pixels.
+        dtype: of the energies.
+    """
+    return window <= LARGEST_WINDOW and dtype in REALS and compiled(SOURCE, dtype) is not None
+
+
+def _is_plain(*tensors: Tensor) -> bool:
+    """Whether these are in a processor's memory, and no one asks for gradients or follows what is done with them."""
+    if is_followed() or any(x.device.type != "cpu" for x in tensors):
+        return False
+    return not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
+
+
+def _energies_in_c(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    """What :func:`mutual_energies` returns, by mutual_intensity.c: waves and intensities of a row stay in its cache."""
+    real = field.real.dtype
+    field, kernels = (x.detach().resolve_conj().contiguous() for x in (field, kernels))
+    weights = weights.detach().to(real).contiguous()
+    depths, window, order, cells = kernels.shape
+    energies = torch.empty(depths, window, window, dtype=real)
+    library = compiled(SOURCE, real)
+    assert library is not None
+    failed = library.mutual_energies(
+        *(ctypes.c_void_p(x.data_ptr()) for x in (field, weights, kernels, energies)),
+        *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
+    )
+    if failed:
+        raise MemoryError(f"no memory for PSFs of {window}x{window} pixels")
+    return energies
+
+
+def _columns(field: Tensor) -> Tensor:
+    """Return the real matrix (2N, K 2N) that takes (re, im) of a kernel's cells to real and imaginary parts of K U."""
+    return _real_rows(torch.stack((field, 1j * field), 1).permute(2, 1, 0, 3)).flatten(2).flatten(0, 1)
+
+
+def _real_rows(numbers: Tensor) -> Tensor:
+    """Return (..., R, N) complex as (..., 2R, N): rows of real and of imaginary parts by turns."""
+    return torch.view_as_real(numbers).movedim(-1, -2).flatten(-3, -2)
+
+
+def _energies(plain: Tensor, turned: Tensor, left: Tensor, pixels: Tensor) -> Tensor:
+    """Energies (D, P, P) of plain and turned (2N, K 2N), left (D, P, q, 2N) and pixels (D, P, N N)."""
+    with torch.autocast(left.device.type, enabled=False):
+        lines = [
+            _intensity(*_rows(plain, turned, left[depth])).flatten(-2) @ pixels[depth].mT
+            for depth in _blocks(plain, left)
+        ]
+    return torch.cat(lines).clamp(min=0)  # where there is no light, rounding leaves less than none
+
+
+def _gradients(
+    plain: Tensor, turned: Tensor, left: Tensor, pixels: Tensor, gradient: Tensor, needed: Sequence[bool]
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients of the four inputs, of those needed; a sum over blocks, like the energies."""
+    to_plain, to_turned = torch.zeros_like(plain), torch.zeros_like(turned)
+    to_left: list[Tensor] = []
+    to_pixels: list[Tensor] = []
+    for depth in _blocks(plain, left):
+        block = left[depth]
+        rows, others = _rows(plain, turned, block)
+        to_intensity = (gradient[depth] @ pixels[depth]).unflatten(-1, (rows.shape[-1], -1))
+        to_rows = (others @ to_intensity.mT).view(-1, plain.shape[-1])
+        to_others = (rows @ to_intensity).view(-1, plain.shape[-1])
+        if needed[0] or needed[1]:
+            cells = block.reshape(-1, block.shape[-1]).mT
+            to_plain, to_turned = to_plain + cells @ to_rows, to_turned + cells @ to_others
+        if needed[2]:
+            to_left.append((to_rows @ plain.mT + to_others @ turned.mT).view(block.shape))
+        if needed[3]:
+            to_pixels.append(gradient[depth].mT @ _intensity(rows, others).flatten(-2))
+    return (
+        to_plain if needed[0] else None,
+        to_turned if needed[1] else None,
+        torch.cat(to_left) if needed[2] else None,
+        torch.cat(to_pixels) if needed[3] else None,
+    )
+
+
+def _rows(plain: Tensor, turned: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the waves of each row of pixels, and these weighted and times 1 + i, (depth, P, q K 2, N) each."""
+    depths, window, _, cells = left.shape
+    flat, shape = left.reshape(-1, cells), (depths, window, -1, cells // 2)
+    return (flat @ plain).view(shape), (flat @ turned).view(shape)
+
+
+def _intensity(rows: Tensor, others: Tensor) -> Tensor:
+    """Return the packed mutual intensity, (depth, P, N, N)."""
+    return rows.mT @ others
+
+
+def _blocks(plain: Tensor, left: Tensor) -> Iterator[slice]:
+    """Yield slices of depths, in order, whose waves and mutual intensities are _BLOCK_NUMBERS or one depth."""
+    depths, window, order, cells = left.shape
+    numbers = window * (2 * order * plain.shape[-1] + (cells // 2) ** 2)
+    together = max(1, _BLOCK_NUMBERS // numbers)
+    for depth in range(0, depths, together):
+        yield slice(depth, depth + together)

@@ -1,0 +1,177 @@
+r"""Light from the pupil to the sensor's pixels: a Fourier transform as two small matrices.
+
+The phase of defocus is separable, :math:`\psi\rho^2 = \psi x^2 + \psi y^2`, and a pixel of the mask has one phase. So
+the integral of the defocused wave over every mask pixel is a product of two one-dimensional integrals, and the field
+on the sensor is ``kernel @ field @ kernel.T`` with one small matrix for each depth and wavelength. Nothing is sampled
+in the pupil, so nothing aliases there, whatever the defocus.
+
+Source: Soummer, Pueyo, Sivaramakrishnan and Vanderbei, Optics Express 15(24) 15935 (2007), for the matrix transform.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.optics.quadrature import gauss_legendre, gauss_legendre_order
+from kornia_tidy.psf.mutual_intensity import mutual_energies
+from kornia_tidy.psf.wave_energy import wave_energies
+
+CELL_TOLERANCE = 1e-9  # of the integrals over mask pixels: exact for every purpose, and they cost next to nothing
+
+
+def cell_integrals(
+    defocus: Sequence[float],
+    frequency: Tensor,
+    highest: float,
+    num_cells: int,
+    pitch: float,
+    cells: Tensor | None = None,
+    moment: int = 0,
+) -> Tensor:
+    r"""Return the integrals of a defocused plane wave over each cell of the pupil along one axis.
+
+    .. math:: K_{dun} = \int_{x_n - p/2}^{x_n + p/2} x^m \exp(i \psi_d x^2 - 2\pi i u x) \, dx
+
+    Args:
+        defocus: :math:`\psi_d` in radians at the pupil edge, at the wavelength in use.
+        frequency: u in cycles per pupil radius, (U,); may carry gradients.
+        highest: bound of the frequencies' modulus.
+        num_cells: cells N along the axis, centred on the optical axis.
+        pitch: side p of a cell in pupil radii.
+        cells: where to integrate instead, begin and end of each interval in cells from the optical axis, (2, N').
+        moment: m; the first and the second make the slopes of the integrals over frequency and over defocus.
+
+    Returns:
+        Integrals in pupil radii, (D, U, N) complex128: in float64 because phases reach thousands of radians.
+
+    Example:
+        >>> cell_integrals([0.0], torch.zeros(1), 0.0, 4, 0.5).real.round(decimals=6).flatten().tolist()
+        [0.5, 0.5, 0.5, 0.5]
+    """
+    edge = num_cells * pitch / 2
+    slope = 2 * max(abs(psi) for psi in defocus) * edge + 2 * math.pi * highest  # of the phase, radians a pupil radius
+    points, weights = gauss_legendre(gauss_legendre_order(slope * pitch / 2, CELL_TOLERANCE), frequency.device)
+    if cells is None:
+        centres = torch.arange(num_cells, dtype=torch.float64, device=frequency.device) - (num_cells - 1) / 2
+        widths = torch.ones_like(centres)
+    else:
+        begin, end = cells.to(frequency.device)
+        centres, widths = (begin + end) / 2, end - begin
+    x = (centres[:, None] + widths[:, None] * points) * pitch
+    psi = torch.tensor(defocus, dtype=torch.float64, device=x.device)
+    wave = torch.exp(-2j * math.pi * frequency[:, None, None] * x)
+    lens = torch.exp(1j * psi[:, None, None] * x**2) * (widths[:, None] * weights * pitch * x**moment)
+    return torch.einsum("ung,dng->dun", wave, lens)
+
+
+def pixel_frequencies(step: float | Tensor, window: int, order: int, device: torch.device | None = None) -> Tensor:
+    """Return where a window of sensor pixels is sampled, as spatial frequency in the pupil, (window * order,) float64.
+
+    Args:
+        step: a pixel's side in cycles per pupil radius: pitch * R / (wavelength * image distance).
+        window: pixels along a side, odd.
+        order: Gauss-Legendre points for each pixel; 1 samples the pixel's centre.
+        device: where to put them.
+
+    Example:
+        >>> pixel_frequencies(0.5, 3, 1).tolist()
+        [-0.5, 0.0, 0.5]
+    """
+    centres = torch.arange(window, dtype=torch.float64, device=device) - window // 2
+    points, _ = gauss_legendre(order, device)
+    return (centres[:, None] + points).flatten() * step
+
+
+def sensor_kernels(
+    defocus: Sequence[float],
+    step: float | Tensor,
+    window: int,
+    num_cells: int,
+    pitch: float,
+    extent: float,
+    tolerance: float,
+    device: torch.device | None = None,
+    cells: Tensor | None = None,
+    moment: int = 0,
+) -> Tensor:
+    r"""Return the matrices that take a pupil field to the sensor's pixels, one for each depth.
+
+    Args:
+        defocus: radians at the pupil edge at the wavelength in use, (D,).
+        step: a pixel's side in cycles per pupil radius at that wavelength; may carry gradients.
+        window: pixels P along a side of the PSF, odd.
+        num_cells: cells N of the pupil along a side.
+        pitch: side of a cell in pupil radii.
+        extent: half width of the open pupil in pupil radii; it bounds the PSF's bandwidth to twice itself.
+        tolerance: error allowed to the integral over a pixel of the finest pattern the pupil can make.
+        device: where to put them.
+        cells: where to integrate instead of the N cells, see :func:`cell_integrals`.
+        moment: power of the place in the pupil to integrate with, see there.
+
+    Returns:
+        (D, P, q, N) complex128, weighted so that the sum of \|kernel @ field @ kernel.T\|^2 over the q points of a
+        pixel is the light in that pixel.
+
+    Example:
+        >>> sensor_kernels([0.0] * 21, 0.4, 23, 23, 0.1, 1.05, 1e-3).shape
+        torch.Size([21, 23, 4, 23])
+    """
+    pixel = float(step.detach()) if isinstance(step, Tensor) else step
+    order = gauss_legendre_order(2 * math.pi * extent * pixel, tolerance)
+    frequency = pixel_frequencies(step, window, order, device)
+    integrals = cell_integrals(defocus, frequency, pixel * window / 2, num_cells, pitch, cells, moment)
+    _, weights = gauss_legendre(order, device)
+    scale = (weights.sqrt() * step**0.5).repeat(window)  # squared by the intensity, once for each axis
+    return (integrals * scale[:, None]).unflatten(1, (window, order))
+
+
+def pixel_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    r"""Return the light that falls on each pixel, averaged over the states of the modulator.
+
+    .. math:: h_d(p) = \sum_k w_k \int_p \left| \mathcal{F}\{ U_k e^{i\psi_d\rho^2} \}(u) \right|^2 du
+
+    Args:
+        field: pupil fields U, one for each state, without defocus.
+        weights: share of the exposure of each state.
+        kernels: from :func:`sensor_kernels`.
+
+    Returns:
+        Energies in units of the squared amplitude times pupil radii squared, (D, P, P), real.
+
+    Shape:
+        - field (K, N, N) complex, weights (K,), kernels (D, P, q, N) complex.
+
+    Convention:
+        - Axes are (y, x); a phase that rises along +x moves the light towards larger column indices.
+
+    Example:
+        >>> field = torch.ones(1, 8, 8, dtype=torch.complex128)
+        >>> kernels = sensor_kernels([0.0], 0.25, 65, 8, 0.25, 1.0, 1e-9)
+        >>> light = pixel_energies(field, torch.ones(1), kernels)
+        >>> round(float(light.sum() / 4), 2)  # a square pupil of 2x2 radii lets through 4
+        0.99
+    """
+    by_waves, by_intensity = energy_operations(len(weights), *kernels.shape[1:])
+    energies = mutual_energies if by_intensity < by_waves else wave_energies
+    return energies(field, weights, kernels)
+
+
+def energy_operations(states: int, window: int, order: int, cells: int) -> tuple[int, int]:
+    r"""Return the additions and multiplications for a depth, wave by wave and by the mutual intensity.
+
+    .. math:: K (8 U N^2 + 8 U^2 N + 4 U^2) \quad\text{and}\quad 4 (5 K + 1) U N^2 + 2 P^2 N^2, \qquad U = q P
+
+    for K states, N cells of the pupil and q points a pixel along each side of a window P. The second way has little to
+    do for each state and point more, and the first for each cell.
+
+    Example:
+        >>> energy_operations(5, 61, 3, 23), energy_operations(1, 61, 3, 92)
+        ((35351940, 14004746), (37173156, 100162976))
+    """
+    points = order * window
+    by_waves = states * (8 * points * cells**2 + 8 * points**2 * cells + 4 * points**2)
+    return by_waves, (4 * (5 * states + 1) * points + 2 * window**2) * cells**2

@@ -1,0 +1,317 @@
+"""Camera raw files: the counts of a sensor as it wrote them, and what is needed to read them as linear light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.raw.decoding import Source, decode_raw, source_bytes, source_name
+from kornia_tidy.raw.filter_array import filter_tile, tile_planes, tiled
+from kornia_tidy.raw.plausible import check_plausible, plausible_white
+
+
+@dataclass(frozen=True)
+class RawInfo:
+    """What a raw file says about the camera and the exposure; None where it says nothing.
+
+    Attributes:
+        make: who built the camera.
+        model: its name.
+        lens: the lens's name.
+        iso: sensitivity.
+        exposure: time in seconds.
+        aperture: f-number.
+        focal_length: in metres.
+        timestamp: when the picture was taken, by the camera's clock.
+    """
+
+    make: str | None = None
+    model: str | None = None
+    lens: str | None = None
+    iso: float | None = None
+    exposure: float | None = None
+    aperture: float | None = None
+    focal_length: float | None = None
+    timestamp: datetime | None = None
+
+    @property
+    def camera(self) -> str:
+        """Make and model, the make once where the model repeats it; empty if unknown.
+
+        Example:
+            >>> RawInfo("NIKON CORPORATION", "NIKON D5100").camera, RawInfo("Sony", "ILCE-7").camera
+            ('NIKON D5100', 'Sony ILCE-7')
+        """
+        make, model = (self.make or "").strip(), (self.model or "").strip()
+        first = make.split()[0].lower() if make else ""
+        return model if first and first in model.lower() else f"{make} {model}".strip()
+
+
+@dataclass(frozen=True, eq=False)
+class RawCapture:
+    """The visible area of a sensor, as counts, with its levels, colours and orientation.
+
+    Attributes:
+        counts: (C, H, W) int32, in the sensor's orientation; C is 1 behind a filter array or for a monochrome
+            sensor, 3 for linear RGB.
+        pattern: index into ``colors`` at each place of the repeating tile, 2x2 (Bayer, four-colour) or 6x6 (X-Trans),
+            from the upper left corner of ``counts``; None without a filter array.
+        colors: names of the channels by index, ``"RGBG"`` for a Bayer array (the second green is that of blue's
+            rows), ``"GMCY"``, ``"RGB"`` for X-Trans and linear RGB, ``""`` for monochrome.
+        black: count without light, float32: one for each place of the tile, or (C,) without a filter array.
+        white: saturation count, black not yet taken off.
+        xyz_to_camera: from CIE XYZ under D65 to the camera's colours, (3 or 4 different letters of ``colors``, 3), or
+            None if unknown.
+        camera_to_srgb: from the camera's white-balanced colours to linear sRGB, (3, 3 or 4), as a DNG's colour
+            matrices give it, or None.
+        white_balance: factors as shot, (len(colors),), 1 for the first green; None if unknown.
+        daylight_balance: factors for daylight, likewise.
+        flip: how to turn the picture upright: 1 mirrors columns, 2 rows, then 4 swaps the two (LibRaw's code).
+        pixel_aspect: width of a pixel over its height.
+        info: camera, lens and exposure.
+    """
+
+    counts: Tensor = field(repr=False)
+    pattern: tuple[tuple[int, ...], ...] | None
+    colors: str
+    black: Tensor
+    white: float
+    xyz_to_camera: Tensor | None = None
+    camera_to_srgb: Tensor | None = None
+    white_balance: Tensor | None = None
+    daylight_balance: Tensor | None = None
+    flip: int = 0
+    pixel_aspect: float = 1.0
+    info: RawInfo = field(default_factory=RawInfo)
+
+    @classmethod
+    def open(
+        cls, source: Source, *, white: float | None = None, timeout: float = 60.0, memory_limit: int = 2**31
+    ) -> RawCapture:
+        """Read a camera raw file, whatever is in it: a picture comes back, or one sentence.
+
+        LibRaw decodes it in a process of its own, within these limits, so that a file that makes it crash, hang or
+        ask for all memory does no harm here. What it decodes is checked to be a picture.
+
+        Args:
+            source: a path, the bytes of a file, or a binary file.
+            white: saturation count. Default: the file's or, where its counts show that it lies, their largest.
+            timeout: seconds that decoding may take.
+            memory_limit: bytes of memory that decoding may use.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is empty, damaged, cut short, not a raw file, of a kind that LibRaw does not decode,
+                without a picture, or too much for the limits.
+
+        Warns:
+            UserWarning: if the file's white level lies, or more than one count in a thousand lies above white; and
+                if the length of a file without a header alone says that it is a Kodak C330's.
+
+        Convention:
+            The visible area only, without masked borders; a JPEG-like tone curve, if the file has one, is undone.
+        """
+        if white is not None:
+            check_positive("white", white, "counts")
+        header, counts, length = decode_raw(source, timeout, memory_limit)
+        name = source_name(source)
+        try:
+            raw = _from_header(header if white is None else {**header, "white": white}, counts)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"cannot read {name}: what it says of its sensor makes no sense ({error})") from None
+        check_plausible(name, raw.counts, raw.black, raw.white, length)
+        return replace(raw, white=plausible_white(name, raw.counts, raw.white, given=white is not None))
+
+    @classmethod
+    def open_dump(
+        cls,
+        source: Source,
+        size: tuple[int, int],
+        pattern: str | None,
+        black: float | Sequence[float],
+        white: float,
+        dtype: str = "uint16",
+        byte_order: str = "little",
+    ) -> RawCapture:
+        """Read a bare dump of a sensor's counts, row by row: a file without a header says nothing of itself.
+
+        Args:
+            source: a path, the bytes of a file, or a binary file.
+            size: rows and columns.
+            pattern: letters of the filter array's tile, by rows, such as ``"RGGB"``; None for a monochrome sensor.
+            black: count without light, one or one for each place of the tile.
+            white: saturation count.
+            dtype: ``"uint8"`` or ``"uint16"``.
+            byte_order: ``"little"`` or ``"big"``.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file's length is not that of these counts, or they are implausible.
+
+        Warns:
+            UserWarning: if more than one count in a thousand lies above white.
+
+        Example:
+            >>> data = bytes([1, 2, 1, 3, 1, 4, 2, 0])
+            >>> RawCapture.open_dump(data, (2, 2), "RGGB", black=256, white=1023, byte_order="big").counts
+            tensor([[[258, 259],
+                     [260, 512]]], dtype=torch.int32)
+        """
+        check_choice("dtype", dtype, ("uint8", "uint16"))
+        check_choice("byte_order", byte_order, ("little", "big"))
+        name, data = source_name(source), source_bytes(source)
+        layout = np.dtype(dtype).newbyteorder("<" if byte_order == "little" else ">")
+        height, width = size
+        if min(size) < 1 or len(data) != height * width * layout.itemsize:
+            raise ValueError(
+                f"cannot read {name}: {width} x {height} counts of {dtype} take {height * width * layout.itemsize} "
+                f"bytes, it has {len(data)}"
+            )
+        if not white <= np.iinfo(dtype).max:
+            raise ValueError(f"white must be at most {np.iinfo(dtype).max}, the largest {dtype}, got {white}")
+        counts = torch.from_numpy(np.frombuffer(data, layout).astype(np.int32).reshape(1, height, width))
+        raw = cls.from_counts(counts, pattern, black, white)
+        check_plausible(name, raw.counts, raw.black, raw.white, len(data))
+        plausible_white(name, raw.counts, raw.white, given=True)
+        return raw
+
+    @classmethod
+    def from_counts(
+        cls,
+        counts: Tensor,
+        pattern: str | None,
+        black: float | Sequence[float],
+        white: float,
+        info: RawInfo | None = None,
+    ) -> RawCapture:
+        """Return a capture of counts that did not come from a camera's file.
+
+        Args:
+            counts: (C, H, W), whole numbers; C is 1, or 3 for linear RGB.
+            pattern: letters of the repeating tile by rows, such as ``"RGGB"``, or 36 for X-Trans; None without a
+                filter array.
+            black: count without light, one or as many as places in the tile (by rows), or channels.
+            white: saturation count.
+            info: camera and exposure, if known.
+
+        Raises:
+            ValueError: if these do not belong together.
+
+        Example:
+            >>> raw = RawCapture.from_counts(torch.tensor([[[64, 164], [264, 1064]]]), "GBRG", black=64, white=1064)
+            >>> raw.pattern, raw.colors
+            (((3, 2), (0, 1)), 'RGBG')
+            >>> raw.mosaic()
+            tensor([[[0.0000, 0.1000],
+                     [0.2000, 1.0000]]])
+        """
+        if counts.ndim != 3 or counts.shape[0] not in {1, 3}:
+            raise ValueError(f"counts must have shape (1 or 3, H, W), got {tuple(counts.shape)}")
+        if pattern is not None and counts.shape[0] != 1:
+            raise ValueError(f"counts behind a filter array must have one channel, got {counts.shape[0]}")
+        if pattern is None:
+            tile, colors = None, "" if counts.shape[0] == 1 else "RGB"
+            shape = (counts.shape[0],)
+        else:
+            tile, colors = filter_tile(pattern)
+            shape = (len(tile), len(tile))
+        levels = torch.as_tensor(black, dtype=torch.float32)
+        if levels.numel() not in {1, math.prod(shape)}:
+            raise ValueError(f"black must be one level or {math.prod(shape)}, got {levels.numel()}")
+        if not white > float(levels.max()):
+            raise ValueError(f"white must be above black, got white {white} and black {float(levels.max())}")
+        levels = levels.flatten().expand(math.prod(shape)).reshape(shape)
+        return cls(counts.to(torch.int32), tile, colors, levels, float(white), info=info or RawInfo())
+
+    @property
+    def tile(self) -> tuple[int, int]:
+        """Rows and columns after which the filter array repeats; (1, 1) without one."""
+        return (1, 1) if self.pattern is None else (len(self.pattern), len(self.pattern[0]))
+
+    @property
+    def pattern_letters(self) -> str | None:
+        """Colours of the filter array's tile, by rows, such as ``"RGGB"``; None without one."""
+        return None if self.pattern is None else "".join(self.colors[index] for row in self.pattern for index in row)
+
+    def mosaic(self) -> Tensor:
+        r"""Return linear light, :math:`(n - n_{black}) / (n_{white} - n_{black})`, (C, H, W) float32.
+
+        Convention:
+            Noise around black stays below 0 and counts above white stay above 1: nothing is clamped.
+        """
+        light = self.counts.float()
+        if self.pattern is None:
+            black = self.black[:, None, None]
+            return light.sub_(black).div_(self.white - black)
+        rows = self.tile[0]
+        for row, black in enumerate(tiled(self.black, rows, light.shape[-1])):  # whole rows: their pixels lie together
+            light[:, row::rows].sub_(black).div_(self.white - black)
+        return light
+
+    def planes(self) -> Tensor:
+        """Return the mosaic taken apart by places of the tile, not interpolated: (places, H // rows, W // columns).
+
+        Without a filter array that is :meth:`mosaic`. Incomplete tiles at the right and the bottom are left out.
+        """
+        return tile_planes(self.mosaic(), self.tile)
+
+    def upright(self, image: Tensor) -> Tensor:
+        """Return a picture of this capture, (..., H, W), turned as the camera was held."""
+        if self.flip & 2:
+            image = image.flip(-2)
+        if self.flip & 1:
+            image = image.flip(-1)
+        return image.transpose(-1, -2) if self.flip & 4 else image
+
+
+def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
+    """Return the capture that the decoding process describes; a damaged file can make it say anything."""
+    pattern, colors, info = header["pattern"], header["colors"], dict(header["info"])
+    if pattern is not None:
+        pattern = tuple(map(tuple, pattern))
+        if not all(0 <= index < len(colors) for row in pattern for index in row):
+            raise ValueError(f"filter array {pattern} of colours {colors!r}")
+        if counts.shape[1] < len(pattern) or counts.shape[2] < len(pattern[0]):
+            raise ValueError(f"{counts.shape[2]} x {counts.shape[1]} pixels")
+    if not 0.1 < header["pixel_aspect"] < 10:
+        raise ValueError(f"pixel aspect {header['pixel_aspect']}")
+    if "timestamp" in info:
+        info["timestamp"] = datetime.fromisoformat(info["timestamp"])
+    different = len(set(colors))
+    return RawCapture(
+        counts,
+        pattern,
+        colors,
+        torch.tensor(header["black"], dtype=torch.float32),
+        float(header["white"]),
+        xyz_to_camera=_matrix([row[:3] for row in header["xyz_to_camera"][:different]]),
+        camera_to_srgb=_matrix([row[:different] for row in header["camera_to_srgb"]]),
+        white_balance=_balance(header["white_balance"], colors),
+        daylight_balance=_balance(header["daylight_balance"], colors),
+        flip=header["flip"] & 7,
+        pixel_aspect=header["pixel_aspect"],
+        info=RawInfo(**info),
+    )
+
+
+def _matrix(rows: list[list[float]]) -> Tensor | None:
+    """Return a matrix, or None where the file has none: LibRaw then says zeros."""
+    matrix = torch.tensor(rows)
+    return matrix if matrix.numel() and bool(matrix.isfinite().all() & (matrix != 0).any()) else None
+
+
+def _balance(factors: list[float], colors: str) -> Tensor | None:
+    """Return factors with that of the first green as 1, or None if one is unknown."""
+    if "G" not in colors:
+        return None
+    known = [factors[i] or factors[colors.index(letter)] for i, letter in enumerate(colors)]
+    balance = torch.tensor(known) / known[colors.index("G")] if known[colors.index("G")] else torch.zeros(1)
+    return balance if bool(balance.isfinite().all() & (balance > 0).all()) else None

@@ -1,0 +1,185 @@
+"""The process in which LibRaw decodes: a file on standard input, its counts and what LibRaw knows on standard output.
+
+LibRaw is C++ that parses what anybody may have written: a file can crash it, keep it busy or ask it for all memory.
+It does so here, within limits of its own, and the process that asked reads a header of JSON and plain numbers.
+:mod:`kornia_tidy.raw.decoding` runs this file by its path, so that no package is imported but NumPy and rawpy.
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import io
+import json
+import math
+import os
+import sys
+import types
+from typing import Any
+
+LARGEST_TILE = 6  # X-Trans
+LOADED = "loaded"  # printed as soon as NumPy and LibRaw are: a crash before is not the file's doing
+C330_LENGTHS = (2247168, 3370752)  # by which LibRaw tells the pictures of a Kodak C330, which have no header
+
+
+def main() -> None:
+    """Decode: arguments are sys.path, as JSON, seconds of processor time and bytes of memory that may be used."""
+    paths, seconds, memory = sys.argv[1:]
+    limit(int(seconds), int(memory))
+    sys.path[:] = json.loads(paths)
+    with os.fdopen(os.dup(1), "wb") as output:
+        os.dup2(2, 1)  # LibRaw prints here and there
+        try:
+            header, counts = decode(sys.stdin.buffer.read())
+        except Exception as error:  # whatever it is, the file cannot be read
+            header, counts = {"error": type(error).__name__, "text": _words(error)}, b""
+        output.write(json.dumps(header).encode() + b"\n")
+        output.write(counts)
+
+
+def limit(seconds: int, memory: int) -> None:
+    """Bound the processor time and the memory of this process, and leave no core file, where the system can."""
+    try:
+        import resource  # noqa: PLC0415 (not on Windows)
+    except ImportError:
+        return
+    wanted = {resource.RLIMIT_CPU: seconds, resource.RLIMIT_AS: memory, resource.RLIMIT_CORE: 0}
+    for kind, most in wanted.items():
+        hard = resource.getrlimit(kind)[1]
+        allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (allowed, allowed))
+
+
+def _beside(name: str) -> Any:
+    """Return a module of this folder, by its file: importing the package would take longer than decoding."""
+    path = os.path.join(os.path.dirname(os.path.abspath(__file__)), f"{name}.py")
+    loader = importlib.machinery.SourceFileLoader(name, path)
+    module = types.ModuleType(name)
+    loader.exec_module(module)
+    return module
+
+
+def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
+    """Return a header and the counts of the visible area, row by row, channels last, unsigned 16 bits."""
+    import numpy as np  # noqa: PLC0415 (after the limits)
+    import rawpy  # noqa: PLC0415
+
+    tags = _beside("tags")
+
+    sys.stderr.write(LOADED + "\n")  # not buffered
+    if missing := tags.missing_bytes(data):
+        raise ValueError(f"it is cut short, {missing} bytes of its picture are missing")
+    if fault := tags.filter_array_fault(data):
+        raise ValueError(fault)
+    raw = rawpy.imread(io.BytesIO(data))  # left open: the counts are LibRaw's own memory
+    counts = np.ascontiguousarray(raw.raw_image_visible)
+    sizes, levels = raw.sizes, raw.black_level_per_channel
+    channels = 1 if counts.ndim == 2 else min(raw.num_colors, counts.shape[2])
+    pattern = None if counts.ndim == 3 or raw.num_colors == 1 else filter_pattern(raw)
+    colors = raw.color_desc.decode("ascii", "replace")
+    if pattern is None:
+        colors = "" if channels == 1 else colors[:channels]
+        black = levels[:channels]
+    else:
+        colors = colors[: 1 + max(map(max, pattern))]
+        black = [[levels[c] for c in row] for row in pattern]
+        if (tile := tags.black_tile(data)) is not None:
+            black = mean_over_tile(tile, len(pattern), len(pattern[0]))
+    if counts.ndim == 3:
+        counts = np.ascontiguousarray(counts[..., :channels])
+    white = raw.white_level
+    if counts.ndim == 3 and len(set(levels)) == 1 and white + levels[0] in tags.white_levels(data):
+        white += levels[0]  # LibRaw takes one black level for all channels off white, but not off the counts
+    camera_to_srgb = raw.color_matrix.tolist()
+    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw reads the tag too, and keeps it to itself
+        camera_to_srgb = tags.kodak_matrix(data) or camera_to_srgb
+    header = {
+        "shape": (*counts.shape[:2], channels),
+        "pattern": pattern,
+        "colors": colors,
+        "black": black,
+        "white": white,
+        "xyz_to_camera": raw.rgb_xyz_matrix.tolist(),
+        "camera_to_srgb": camera_to_srgb,
+        "white_balance": raw.camera_whitebalance,
+        "daylight_balance": raw.daylight_whitebalance,
+        "flip": sizes.flip,
+        "pixel_aspect": sizes.pixel_aspect,
+        "info": {**tags.camera_tags(data), **libraw_info(raw)},
+    }
+    if counts.ndim == 3 and len(data) in C330_LENGTHS and not any(tags.tiff_directories(data)):
+        header |= finished_colors()
+    return header, counts.data.cast("B")
+
+
+def finished_colors() -> dict[str, Any]:
+    """Return the colours, the balance and the name of a Kodak C330, whose YCbCr is balanced and of sRGB."""
+    return {
+        "camera_to_srgb": [[float(row == column) for column in range(4)] for row in range(3)],
+        "white_balance": [1.0] * 4,
+        "daylight_balance": [1.0] * 4,
+        "info": {"make": "Kodak", "model": "C330"},
+    }
+
+
+def filter_pattern(raw: Any) -> list[list[int]]:
+    """Return the smallest tile, as indices of channels, by which the filter array repeats from the visible corner.
+
+    LibRaw is asked for every place: its own tile begins at the corner of the whole sensor, margins included.
+    """
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    span = range(4 * LARGEST_TILE)
+    places = [[raw.raw_color(top + row, left + column) for column in span] for row in span]
+    for side in (2, LARGEST_TILE):
+        tile = [row[:side] for row in places[:side]]
+        if all(places[row][column] == tile[row % side][column % side] for row in span for column in span):
+            return tile
+    raise ValueError("its filter array repeats neither after 2 nor after 6 pixels")
+
+
+def mean_over_tile(levels: list[list[float]], rows: int, columns: int) -> list[list[float]]:
+    """Return what black levels that repeat in their own way are, on average, at each place of the filter's tile."""
+    tall, wide = math.lcm(len(levels), rows), math.lcm(len(levels[0]), columns)
+
+    def mean(row: int, column: int) -> float:
+        places = [
+            levels[y % len(levels)][x % len(levels[0])]
+            for y in range(row, tall, rows)
+            for x in range(column, wide, columns)
+        ]
+        return sum(places) / len(places)
+
+    return [[mean(row, column) for column in range(columns)] for row in range(rows)]
+
+
+def libraw_info(raw: Any) -> dict[str, Any]:
+    """Return what LibRaw says of the exposure, by the names of RawInfo; older versions of rawpy do not pass it on."""
+    try:
+        other, lens = raw.other, raw.lens
+    except (AttributeError, OSError, OverflowError, ValueError):  # an impossible timestamp among them
+        return {}
+    numbers = {
+        "iso": other.iso_speed,
+        "exposure": other.shutter_speed,
+        "aperture": other.aperture,
+        "focal_length": other.focal_length * 1e-3,
+    }
+    found: dict[str, Any] = {
+        name: float(f"{value:.7g}")  # LibRaw's are 32 bits wide: 5.6 and not 5.599999904632568
+        for name, value in numbers.items()
+        if 0 < value < 1e9
+    }
+    if lens.model.strip() and lens.model.isprintable():
+        found["lens"] = lens.model.strip()
+    if other.timestamp.timestamp() > 0:
+        found["timestamp"] = other.timestamp.isoformat()
+    return found
+
+
+def _words(error: Exception) -> str:
+    """Return an error's message; LibRaw's come as bytes."""
+    cause = error.args[0] if error.args else ""
+    return cause.decode("ascii", "replace") if isinstance(cause, bytes) else str(cause)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""Demosaicing: all colours at every pixel, from the one that each saw behind its filter."""
+
+from __future__ import annotations
+
+import io
+import itertools
+
+import cv2
+import numpy as np
+import torch
+from kornia.color import CFA, raw_to_rgb
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.raw.color import srgb_from_xyz
+from kornia_tidy.raw.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
+from kornia_tidy.raw.filter_array import Tile
+from kornia_tidy.raw.whole_numbers import ROWS_AT_ONCE, in_whole_numbers
+
+# kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
+BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
+OPENCV = {"bilinear": ("", 16), "edge_aware": ("_EA", 16), "vng": ("_VNG", 8)}  # suffix and bits
+# LibRaw takes its VNG for four colours and Markesteijn's three passes for X-Trans, whatever it is asked for.
+LIBRAW = {
+    "Bayer": ("linear", "vng", "ppg", "ahd", "dcb", "dht"),
+    "four-colour": ("linear", "vng"),
+    "X-Trans": ("markesteijn",),
+}
+LARGEST_FACTOR = 100.0  # from sRGB to any camera: more is no camera, and would not fit a field
+# DCB and DHT pass over a picture again and again, Markesteijn's squares of 512 pixels are not all alike.
+LIBRAW_LOCAL, LIBRAW_REACH = ("linear", "vng", "ppg", "ahd"), 8  # rows: AHD's 5 at a border are bilinear, and 3 beyond
+LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # pixels of the shorter side that it takes
+
+METHODS = (
+    "bilinear",
+    "half",
+    "kornia",
+    *(f"opencv_{name}" for name in OPENCV),
+    *dict.fromkeys(f"libraw_{name}" for names in LIBRAW.values() for name in names),
+)
+
+
+def demosaic(
+    mosaic: Tensor, pattern: Tile, colors: str, method: str = "bilinear", to_srgb: Tensor | None = None
+) -> Tensor:
+    """Return all colours of a mosaic.
+
+    Args:
+        mosaic: (..., 1, H, W), linear; white-balanced, for the methods that follow edges.
+        pattern: index into ``colors`` at each place of the repeating tile, from the upper left corner.
+        colors: names of the channels by index; a letter that comes twice is one colour. Both as
+            :func:`~kornia_tidy.raw.filter_array.filter_tile` returns them.
+        method: how, by the name of who computes it.
+
+            * ``"bilinear"``: for any tile; differentiable, on any device, nothing rounded. Measured values stay; others
+              are the mean of the same colour nearby, weighted by a tent.
+            * ``"half"``: no interpolation. Each 2x2 tile (3x3 for X-Trans) becomes one pixel, the mean of each colour.
+            * ``"kornia"``: bilinear, Bayer of even height and width; differentiable, on any device.
+            * ``"opencv_bilinear"``, ``"opencv_edge_aware"``: Bayer. ``"opencv_vng"``: Bayer, and only 8 bits.
+            * ``"libraw_linear"``, ``"libraw_vng"``: Bayer and four-colour; ``"libraw_ppg"``, ``"libraw_ahd"``,
+              ``"libraw_dcb"``, ``"libraw_dht"``: Bayer; ``"libraw_markesteijn"``: X-Trans.
+        to_srgb: from the balanced colours to linear sRGB, (3, 3). ``"libraw_ahd"`` and ``"libraw_markesteijn"`` compare
+            colours as an eye sees them, and need it for that. Default: they are those of sRGB.
+
+    Returns:
+        (..., C, H, W) with C different colours, in the order of ``colors``; ``"half"``: (..., C, H // 2, W // 2).
+
+    Raises:
+        ValueError: if the method is none of these or not for this tile or size, or the mosaic is not as above or, for
+            OpenCV and LibRaw, not finite.
+
+    Convention:
+        - Nothing is clipped: values below 0 and above 1 come back, as far as interpolation keeps them.
+        - OpenCV and LibRaw compute in whole numbers. The range of the mosaic, which is taken to include 0 and 1, is cut
+          into 65535 steps (``"opencv_vng"``: 255): 1.5e-5 for values in [0, 1]. Gradients end there.
+
+    Source: VNG: Chang, Cheung and Pang 1999. AHD: Hirakawa and Parks 2005. PPG: Lin 2003. DCB: Góźdź. X-Trans:
+        Markesteijn, in dcraw.
+
+    Example:
+        >>> mosaic = torch.tensor([[[0.9, 0.5, 0.9, 0.5], [0.5, 0.1, 0.5, 0.1]]])
+        >>> rgb = demosaic(mosaic, ((0, 1), (3, 2)), "RGBG")
+        >>> rgb[:, 1, 2]
+        tensor([0.9000, 0.5000, 0.1000])
+    """
+    return _demosaic(mosaic, pattern, colors, method, to_srgb, None)
+
+
+def demosaic_to_srgb(mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor) -> Tensor:
+    """Return a mosaic in linear sRGB, (..., 3, H, W): what :func:`demosaic` returns, multiplied by ``to_srgb``.
+
+    One pass over the picture where it comes back from whole numbers. The arguments are those of :func:`demosaic`,
+    ``to_srgb`` (3, colours).
+
+    Example:
+        >>> matrix = torch.tensor([[1.0, 0, 0], [0, 0.5, 0], [0, 0.5, 0.5]])
+        >>> mosaic = torch.tensor([[[0.9, 0.5, 0.9, 0.5], [0.5, 0.1, 0.5, 0.1]]])
+        >>> demosaic_to_srgb(mosaic, ((0, 1), (3, 2)), "RGBG", "bilinear", matrix)[:, 1, 2]
+        tensor([0.9000, 0.2500, 0.3000])
+    """
+    return _demosaic(mosaic, pattern, colors, method, to_srgb, to_srgb)
+
+
+def mixed(image: Tensor, matrix: Tensor) -> Tensor:
+    """Return (..., 3, H, W) of an image (..., colours, H, W), in its own memory where it has room, times a matrix."""
+    result = image if image.shape[-3] == 3 else image.new_empty(*image.shape[:-3], 3, *image.shape[-2:])
+    for top in range(0, image.shape[-2], ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        result[..., rows, :] = torch.einsum("ij,...jhw->...ihw", matrix.to(image), image[..., rows, :])
+    return result
+
+
+def _demosaic(
+    mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor | None, mixture: Tensor | None
+) -> Tensor:
+    check_choice("method of demosaicing", method, METHODS)
+    check_float_tensor("mosaic", mosaic.reshape(-1, *mosaic.shape[-2:]), 3, "(..., 1, H, W)")
+    if mosaic.ndim < 3 or mosaic.shape[-3] != 1:
+        raise ValueError(f"mosaic must have shape (..., 1, H, W), got {tuple(mosaic.shape)}")
+    names = "".join(dict.fromkeys(colors))
+    tile: Tile = tuple(tuple(names.index(colors[index]) for index in row) for row in pattern)
+    height, width = mosaic.shape[-2:]
+    if height < len(tile) or width < len(tile[0]):
+        raise ValueError(f"mosaic must hold one tile of {len(tile)} x {len(tile[0])} px, got {height} x {width}")
+    library, _, name = method.partition("_")
+    flat = mosaic.reshape(-1, height, width)
+    letters = "".join(names[index] for row in tile for index in row)
+    if method in {"bilinear", "half"}:
+        image = (bilinear if method == "bilinear" else binned)(flat, tile)
+    elif library == "kornia":
+        image = _kornia(flat, letters, names)
+    else:
+        matrix = torch.eye(len(names)) if mixture is None else mixture
+        if library == "libraw":
+            image = _libraw(flat, letters, names, name, to_srgb, matrix)
+        else:
+            image = _opencv(flat, letters, names, name, matrix)
+        mixture = None
+    if mixture is not None:
+        image = mixed(image, mixture)
+    return image.reshape(*mosaic.shape[:-3], *image.shape[-3:])
+
+
+def bilinear(mosaic: Tensor, tile: Tile) -> Tensor:
+    """Return (N, C, H, W) of mosaics (N, H, W): each colour's samples, weighted by a tent around each pixel.
+
+    The tent reaches as far as the smallest square that holds every colour wherever it is put: two pixels for Bayer,
+    where this is bilinear interpolation, three for X-Trans. Beyond the picture lies what the next tile inside has at
+    the same place.
+
+    Source: Knutsson and Westin, Normalized and differential convolution, CVPR 1993.
+    """
+    rows, columns = len(tile), len(tile[0])
+    height, width = mosaic.shape[-2:]
+    reach = next(side for side in range(1, rows + 1) if _holds_all(tile, side, 1))
+    values = mosaic if mosaic.dtype == torch.float64 else mosaic.float()
+    values = values[:, _beyond(height, rows, reach - 1)][:, :, _beyond(width, columns, reach - 1)]
+    image = values.new_zeros(len(mosaic), 1 + max(map(max, tile)), height, width)
+    for y, x, color in itertools.product(range(rows), range(columns), range(image.shape[1])):
+        there = image[:, color, y::rows, x::columns]
+        for dy, dx, weight in _tent(tile, y, x, color, reach):
+            samples = values[:, y + dy + reach - 1 :: rows, x + dx + reach - 1 :: columns]
+            there.add_(samples[:, : there.shape[1], : there.shape[2]], alpha=weight)
+    return image.to(mosaic.dtype)
+
+
+def _tent(tile: Tile, y: int, x: int, color: int, reach: int) -> list[tuple[int, int, float]]:
+    """Return rows, columns and weights of a colour's samples around a place of the tile; itself if measured there."""
+    if tile[y][x] == color:
+        return [(0, 0, 1.0)]
+    steps = range(1 - reach, reach)
+    samples = [
+        (dy, dx, (reach - abs(dy)) * (reach - abs(dx)))
+        for dy, dx in itertools.product(steps, steps)
+        if tile[(y + dy) % len(tile)][(x + dx) % len(tile[0])] == color
+    ]
+    total = sum(weight for _, _, weight in samples)
+    return [(dy, dx, weight / total) for dy, dx, weight in samples]
+
+
+def _beyond(length: int, period: int, margin: int) -> Tensor:
+    """Return the indices of a row with a margin at both ends, taken from the same place of the next tile inside."""
+    index = torch.arange(-margin, length + margin)
+    last = (length - 1 - index.clamp(min=length - 1)).div(period, rounding_mode="floor") * period
+    first = (-index.clamp(max=0)).add(period - 1).div(period, rounding_mode="floor") * period
+    return index + first + last
+
+
+def binned(mosaic: Tensor, tile: Tile) -> Tensor:
+    """Return (N, C, H // s, W // s): the mean of each colour in squares of s x s pixels that hold all of them.
+
+    s is 2 for a 2x2 tile and 3 for X-Trans. Pixels beyond the last whole square are left out.
+    """
+    rows, columns = len(tile), len(tile[0])
+    side = next(side for side in range(1, rows + 1) if rows % side == 0 and _holds_all(tile, side, side))
+    height, width = mosaic.shape[-2] // side, mosaic.shape[-1] // side
+    image = mosaic.new_zeros(len(mosaic), 1 + max(map(max, tile)), height, width)
+    for top, left in itertools.product(range(0, rows, side), range(0, columns, side)):
+        squares = image[:, :, top // side :: rows // side, left // side :: columns // side]
+        places = list(itertools.product(range(top, top + side), range(left, left + side)))
+        for y, x in places:
+            samples = mosaic[:, y::rows, x::columns][:, : squares.shape[2], : squares.shape[3]]
+            count = sum(tile[j][i] == tile[y][x] for j, i in places)
+            squares[:, tile[y][x]] += samples / count
+    return image
+
+
+def _holds_all(tile: Tile, side: int, step: int) -> bool:
+    """Return whether squares of this side hold every colour, put at every ``step`` rows and columns."""
+    number = {index for row in tile for index in row}
+    places = range(0, len(tile), step)
+    return all(
+        {tile[(y + dy) % len(tile)][(x + dx) % len(tile)] for dy in range(side) for dx in range(side)} == number
+        for y in places
+        for x in places
+    )
+
+
+def _kornia(mosaic: Tensor, letters: str, colors: str) -> Tensor:
+    check_choice("the filter array of demosaicing by kornia", letters, tuple(BAYER))
+    if mosaic.shape[-2] % 2 or mosaic.shape[-1] % 2:
+        raise ValueError(f"demosaicing by kornia needs even height and width, got {tuple(mosaic.shape[-2:])}")
+    values = mosaic if mosaic.dtype == torch.float64 else mosaic.float()
+    image = raw_to_rgb(values[:, None], BAYER[letters]).to(mosaic.dtype)
+    return image if colors == "RGB" else image[:, ["RGB".index(letter) for letter in colors]]
+
+
+def _opencv(mosaic: Tensor, letters: str, colors: str, name: str, matrix: Tensor) -> Tensor:
+    check_choice("the filter array of demosaicing by OpenCV", letters, tuple(BAYER))
+    suffix, bits = OPENCV[name]
+    code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names begin at the corner
+    matrix = matrix[:, [colors.index(letter) for letter in "RGB"]]
+    return in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits, matrix)
+
+
+def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
+    import rawpy  # noqa: PLC0415  (only who asks for it loads a C++ library)
+
+    kind = "Bayer" if letters in BAYER else "four-colour" if len(colors) == 4 else "X-Trans"
+    check_choice(f"LibRaw's demosaicing of a {kind} array", name, LIBRAW[kind])
+    side = 6 if kind == "X-Trans" else 2
+    lacking = LIBRAW_SMALLEST[kind] - min(mosaic.shape[-2:])
+    tiles = max(-(-lacking // (2 * side)), int(kind == "X-Trans"), 0)  # it leaves the corner of X-Trans black
+    margin = tiles * side
+    height, width = mosaic.shape[-2:]
+    algorithm = rawpy.DemosaicAlgorithm["AHD" if name == "markesteijn" else name.upper()]
+    fields = [] if kind == "four-colour" else _matrix_fields(to_srgb)
+
+    def postprocess(counts: np.ndarray) -> np.ndarray:
+        with rawpy.imread(io.BytesIO(dng_bytes(counts[..., None], letters, colors, 65535, fields))) as raw:
+            return raw.postprocess(
+                demosaic_algorithm=algorithm,
+                output_color=rawpy.ColorSpace.raw,
+                output_bps=16,
+                gamma=(1, 1),
+                user_wb=[1.0, 1.0, 1.0, 1.0],
+                no_auto_bright=True,
+                adjust_maximum_thr=0.0,
+                user_flip=0,
+            )
+
+    wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
+    image = in_whole_numbers(wide, postprocess, 16, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
+    return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
+
+
+def _matrix_fields(to_srgb: Tensor | None) -> list[Field]:
+    """Say which colours R, G and B are: those of sRGB where nothing is known, or the matrix is almost singular."""
+    matrix = torch.eye(3, dtype=torch.float64) if to_srgb is None else to_srgb.detach().double().cpu()
+    inverse = matrix.pinverse()
+    if float(inverse.abs().max()) > LARGEST_FACTOR:
+        inverse = torch.eye(3, dtype=torch.float64)
+    from_xyz = inverse @ srgb_from_xyz()
+    return [(50721, SRATIONAL, from_xyz.flatten().tolist()), (50778, SHORT, [D65])]

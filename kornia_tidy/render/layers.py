@@ -1,0 +1,172 @@
+"""Layer assignment: how much of each pixel's light belongs to each defocus layer of a PSF bank.
+
+A bank knows its PSFs at a few nodes of defocus. A pixel between two nodes lies at a ``fraction`` of the way from node
+``lower`` to node ``lower + 1``; all weights follow from these two numbers, so no (B, D, H, W) tensor is needed.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
+
+LAYER_MODES = ("nearest", "linear")
+
+
+def clamp_defocus(defocus: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """Move defocus beyond the end nodes to the end nodes, and say where that was done.
+
+    Args:
+        defocus: defocus map in radians, any shape.
+        nodes: (D,) ascending defocus of the layers in radians.
+
+    Returns:
+        The clamped defocus in float32 or float64, and a bool mask of ``defocus``'s shape: True where it lay outside.
+
+    Convention:
+        An end node itself is inside. Clamped values have no gradient.
+
+    Example:
+        >>> import torch
+        >>> clamp_defocus(torch.tensor([-30.0, 0.0, 20.0]), torch.tensor([-20.0, 20.0]))
+        (tensor([-20.,   0.,  20.]), tensor([ True, False, False]))
+    """
+    dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
+    defocus, nodes = defocus.to(dtype), nodes.to(dtype)
+    return defocus.clamp(nodes[0], nodes[-1]), (defocus < nodes[0]) | (defocus > nodes[-1])
+
+
+def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Tensor]:
+    r"""Return the layer below each pixel's defocus and the fraction of its light that belongs to the next one.
+
+    .. math:: t = \frac{\psi - \psi_i}{\psi_{i+1} - \psi_i}, \qquad \psi_i \le \psi \le \psi_{i+1}
+
+    Args:
+        defocus: (B, 1, H, W) defocus in radians. Values beyond the nodes are clamped, see :func:`clamp_defocus`.
+        nodes: (D,) defocus of the layers in radians, strictly ascending; the spacing may vary.
+        mode: ``"linear"`` shares the light between two layers, ``"nearest"`` gives all of it to one.
+
+    Returns:
+        ``lower``, the int64 index i of a layer, and ``fraction``, t in [0, 1], both (B, 1, H, W). Layer i has the
+        weight 1 - t and layer i + 1 the weight t. For ``"nearest"`` the fraction is zero.
+
+    Raises:
+        ValueError: if ``mode`` is not known, or the nodes do not ascend (not checked while compiling).
+
+    Convention:
+        - Half way between two nodes, nearest takes the lower one (the farther from the camera).
+        - Linear has a gradient with respect to defocus; on a node it is that of the interval above, on the last node
+          that of the interval below. Nearest has none.
+
+    Example:
+        >>> import torch
+        >>> defocus = torch.tensor([-4.0, 0.5, 3.0, 9.0]).view(1, 1, 1, 4)
+        >>> lower, fraction = assign_layers(defocus, torch.tensor([-2.0, 0.0, 4.0]), "linear")
+        >>> lower.flatten().tolist(), fraction.flatten().tolist()
+        ([0, 1, 1, 1], [0.0, 0.125, 0.75, 1.0])
+    """
+    check_choice("layers", mode, LAYER_MODES)
+    check_float_tensor("nodes", nodes, 1, "(D,)")
+    if not is_value_unknown() and not bool((nodes.diff() > 0).all()):
+        raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
+    dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
+    defocus, nodes = defocus.to(dtype), nodes.to(dtype)
+    spacing = _even_spacing(nodes)
+    if mode == "nearest" and spacing is not None:
+        steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
+        return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
+    if mode == "nearest" or len(nodes) == 1:
+        middles = (nodes[1:] + nodes[:-1]) / 2
+        lower = torch.bucketize(defocus.detach().contiguous(), middles.detach())
+        return lower, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
+    if spacing is not None:
+        steps = (defocus - nodes[0]).div_(spacing).clamp_(0, len(nodes) - 1)
+        lower = steps.detach().floor().clamp_(max=len(nodes) - 2)
+        return lower.long(), steps - lower
+    clamped = defocus.clamp(nodes[0], nodes[-1])
+    # Inner nodes only: the end nodes belong to the first and last interval.
+    lower = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
+    return lower, (clamped - nodes.take(lower)) / nodes.diff().take(lower)
+
+
+def _even_spacing(nodes: Tensor) -> Tensor | None:
+    """The distance between nodes if it is the same everywhere, to rounding: a search in a list takes ten times as long.
+
+    None too where nodes are learnt, or on a device that one would have to wait for.
+    """
+    if is_followed() or nodes.device.type != "cpu" or nodes.requires_grad or len(nodes) == 1:
+        return None
+    spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
+    even = nodes[0] + spacing * torch.arange(len(nodes), dtype=nodes.dtype)
+    rounding = 4 * torch.finfo(nodes.dtype).eps * nodes.abs().max()
+    return spacing if bool(((nodes - even).abs() <= rounding).all()) else None
+
+
+def layer_weight(lower: Tensor, fraction: Tensor | None, index: int | Tensor) -> Tensor:
+    """Return the weight of one layer at every pixel, from what :func:`assign_layers` returned.
+
+    Args:
+        lower: (B, 1, H, W) int64 index of the layer below.
+        fraction: (B, 1, H, W) share of the layer above, or None for none.
+        index: the layer wanted, or a tensor of layers that broadcasts with the pixels.
+
+    Returns:
+        (B, 1, H, W) weight in [0, 1], of ``fraction``'s dtype, or bool if that is None.
+    """
+    if fraction is None:
+        return lower == index
+    return torch.where(lower == index, 1 - fraction, torch.where(lower == index - 1, fraction, 0))
+
+
+def layer_weights(defocus: Tensor, nodes: Tensor, mode: str) -> Tensor:
+    """Return the weights of all layers at once; a renderer asks for one at a time with :func:`layer_weight`.
+
+    Args:
+        defocus: (B, 1, H, W) defocus in radians.
+        nodes: (D,) ascending defocus of the layers in radians.
+        mode: ``"nearest"`` (one-hot) or ``"linear"`` (hat functions), see :func:`assign_layers`.
+
+    Returns:
+        (B, D, H, W) weights in [0, 1] in float32 or float64. Their sum over D is exactly one.
+
+    Example:
+        >>> import torch
+        >>> defocus = torch.tensor([[[[0.5]]]])
+        >>> layer_weights(defocus, torch.tensor([-2.0, 0.0, 4.0]), "linear").flatten()
+        tensor([0.0000, 0.8750, 0.1250])
+        >>> layer_weights(defocus, torch.tensor([-2.0, 0.0, 4.0]), "nearest").flatten()
+        tensor([0., 1., 0.])
+    """
+    lower, fraction = assign_layers(defocus, nodes, mode)
+    return torch.cat([layer_weight(lower, fraction, index) for index in range(len(nodes))], dim=1)
+
+
+def present_layers(lower: Tensor, fraction: Tensor | None, count: int) -> list[int]:
+    """Return the layers out of ``count`` that a scene contains, ascending. Waits for the device once, for all layers.
+
+    While compiling or under torch.func, all layers are returned: which are present depends on the data. Where gradients
+    with respect to defocus are wanted, both neighbours of a pixel count: on a node the next layer's weight is zero, its
+    slope is not.
+
+    Args:
+        lower: (B, 1, H, W) int64 index of the layer below, from :func:`assign_layers`.
+        fraction: (B, 1, H, W) share of the layer above, or None for none.
+        count: the number of layers D.
+
+    Example:
+        >>> import torch
+        >>> present_layers(torch.tensor([0, 3]), torch.tensor([1.0, 0.5]), count=6)
+        [1, 3, 4]
+    """
+    if is_followed():
+        return list(range(count))
+    present = torch.zeros(count, dtype=torch.bool, device=lower.device)
+    if fraction is None:
+        present[lower] = True
+        return [index for index, here in enumerate(present.tolist()) if here]
+    sloped = fraction.requires_grad
+    present[lower if sloped else torch.where(fraction < 1, lower, lower + 1)] = True
+    present[lower + 1 if sloped else torch.where(fraction > 0, lower + 1, lower)] = True
+    return [index for index, here in enumerate(present.tolist()) if here]

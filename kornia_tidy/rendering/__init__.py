@@ -1,7 +1,0 @@
-"""Data sets rendered once and for all: coded captures on disk, in folders or in shards, and how to train on them."""
-
-from kornia_tidy.rendering.captures import CodedCaptures
-from kornia_tidy.rendering.layout import Layout
-from kornia_tidy.rendering.render_scenes import Rendered, render_scenes, shard_items_within
-
-__all__ = ["CodedCaptures", "Layout", "Rendered", "render_scenes", "shard_items_within"]

@@ -1,0 +1,79 @@
+"""A batch of no images gives no captures, as kornia's operators do: no error, no noise drawn, gradients of zero."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, TiDyOptics, burst, moving_capture
+from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.compositing import COMPOSITING
+from tests.base import BaseTester
+
+
+class Sample(NamedTuple):
+    image: Tensor
+    depth: Tensor
+    label: str
+
+
+def camera(**options) -> TiDyOptics:
+    options = {"fidelity": Fidelity(window=9, layer_spacing=5.0), **options}
+    return TiDyOptics(PixelwiseMask(2), modulator=LearnableDwellTimes((1, 2)), **options)
+
+
+def scenes(dtype=torch.float32, channels=3):
+    return torch.rand(0, channels, 24, 32, dtype=dtype), torch.rand(0, 1, 24, 32, dtype=dtype)
+
+
+class TestEmptyBatch(BaseTester):
+    @pytest.mark.parametrize("border", BORDERS)
+    @pytest.mark.parametrize("compositing", list(COMPOSITING))
+    @pytest.mark.parametrize("channels", [3, 1])
+    def test_cardinality_is_that_of_captures(self, compositing, border, channels, dtype):
+        optics, state = camera(compositing=compositing, border=border), torch.get_rng_state()
+        coded = optics(*scenes(dtype, channels))
+        assert coded.shape == (0, channels, *((16, 24) if border == "valid" else (24, 32)))
+        assert coded.dtype == dtype
+        assert optics.clamped_pixels == 0
+        assert torch.equal(torch.get_rng_state(), state)
+
+    def test_feature_every_form_of_a_sample(self):
+        optics, (image, depth) = camera(border="valid"), scenes()
+        for sample in ((image, depth, "a"), [image, depth, "a"], Sample(image, depth, "a")):
+            coded, there, label = optics(sample)
+            assert type(optics(sample)) is type(sample)
+            assert (coded.shape, there.shape, label) == ((0, 3, 16, 24), (0, 1, 16, 24), "a")
+        mapping = optics({"image": image, "depth": depth, "mask": depth > 0})
+        assert {name: tuple(value.shape) for name, value in mapping.items()} == {
+            "image": (0, 3, 16, 24), "all_in_focus": (0, 3, 16, 24), "depth": (0, 1, 16, 24), "mask": (0, 1, 16, 24),
+        }  # fmt: skip
+        assert optics(image, torch.ones(1, 1, 24, 32)).shape == (0, 3, 16, 24)
+        assert optics.as_transform()({"image": image, "depth": depth})["image"].shape == (0, 3, 16, 24)
+        assert optics(image, depth, params=optics.draw(image)).shape == (0, 3, 16, 24)
+
+    def test_feature_gradients_are_zero(self):
+        optics, (image, depth) = camera(), scenes()
+        optics(image.requires_grad_(), depth.requires_grad_()).sum().backward()
+        for parameter in optics.parameters():
+            assert float(parameter.grad.abs().max()) == 0
+        assert image.grad.shape == image.shape
+        assert depth.grad.shape == depth.shape
+
+    def test_feature_bursts_and_moving_scenes(self):
+        optics, (image, depth) = camera(), scenes()
+        assert burst(optics, image, depth).shape == (0, 2, 3, 24, 32)
+        images, depths = torch.rand(0, 2, 3, 24, 32), torch.rand(0, 2, 1, 24, 32)
+        assert moving_capture(optics, images, depths).shape == (0, 3, 24, 32)
+
+    def test_exception_a_plan_needs_a_scene(self):
+        image, depth = scenes()
+        with pytest.raises(ValueError, match="a plan needs at least one image and its depth, got 0 and 0"):
+            camera().plan(depth, image)
+
+    def test_exception_images_still_have_pixels(self):
+        with pytest.raises(ValueError, match=r"image must hold at least one pixel, got shape \(0, 3, 0, 32\)"):
+            camera()(torch.rand(0, 3, 0, 32), torch.rand(0, 1, 0, 32))

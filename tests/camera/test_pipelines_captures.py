@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import math
+import warnings
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import functional_call
+
+from kornia_tidy import FresnelLens, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from tests.base import BaseTester
+from tests.camera.pipeline_samples import FAST, camera, scene
+
+
+def convolved(image: Tensor, psfs: Tensor) -> Tensor:
+    """Convolution with one PSF a channel by direct sums, reflecting at the border."""
+    radius = psfs.shape[-1] // 2
+    padded = torch.nn.functional.pad(image, (radius,) * 4, mode="reflect")
+    return torch.nn.functional.conv2d(padded, psfs.flip((-2, -1))[:, None], groups=psfs.shape[0])
+
+
+class TestDepth(BaseTester):
+    def test_feature_infinity_is_exactly_the_far_end(self, device, dtype):
+        optics = camera(sensor=None, color_space="linear").to(device)
+        image, depth = (x.to(device, dtype) for x in scene())
+        bank = optics.psf_bank(dtype=dtype)
+        assert float(bank.defocus[0]) == pytest.approx(-math.pi * (2.835e-3 / 2) ** 2 / (530e-9 * 0.595))
+        coded = optics(image, torch.full_like(depth, math.inf))
+        self.assert_close(coded, convolved(image, bank.psfs[0]))
+        assert optics.clamped_pixels == 0
+
+    def test_feature_focus_is_exactly_the_node_at_zero(self, device, dtype):
+        optics = camera(sensor=None, color_space="linear").to(device)
+        image, depth = (x.to(device, dtype) for x in scene())
+        bank = optics.psf_bank(dtype=dtype)
+        assert abs(float(bank.defocus[2])) < 1e-12
+        self.assert_close(optics(image, torch.full_like(depth, 0.595)), convolved(image, bank.psfs[2]))
+
+    def test_feature_nearer_than_the_range_is_the_near_end_counted_and_said_once(self):
+        optics, (image, depth) = camera(sensor=None, color_space="linear"), scene(1)
+        depth = torch.full_like(depth, 0.2975)  # half the focus distance: the near end itself
+        depth[..., :7] = 0.2
+        with pytest.warns(UserWarning, match=r"280 of 1920 pixels have a defocus between .* and \+39.5\d rad, beyond"):
+            coded = optics(image, depth)
+        assert optics.clamped_pixels == 280
+        self.assert_close(coded, convolved(image, optics.psf_bank().psfs[-1]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            optics(image, depth)
+        assert optics.clamped_pixels == 280
+        optics(image, depth.clamp(min=0.3))
+        assert optics.clamped_pixels == 0
+
+    def test_feature_an_unchecked_camera_counts_in_silence(self):
+        optics, (image, depth) = camera(check_inputs=False), scene(1)
+        optics(image, torch.full_like(depth, 0.1))
+        assert optics.clamped_pixels == 1920
+
+
+class TestRandomness(BaseTester):
+    def test_feature_the_global_seed_repeats_a_capture(self):
+        optics, (image, depth) = camera(), scene()
+        torch.manual_seed(1)
+        first, second = optics(image, depth), optics(image, depth)
+        torch.manual_seed(1)
+        assert torch.equal(optics(image, depth), first)
+        assert not torch.equal(first, second)
+
+    def test_feature_a_generator_repeats_a_capture_and_leaves_the_global_one_alone(self):
+        optics, (image, depth) = camera(), scene()
+        before = torch.get_rng_state()
+        one, two = (optics(image, depth, generator=torch.Generator().manual_seed(8)) for _ in range(2))
+        assert torch.equal(one, two)
+        assert torch.equal(torch.get_rng_state(), before)
+
+    @pytest.mark.parametrize("sensor", [SensorNoise(0.02), SensorNoise.physical(8000, 3)])
+    def test_feature_params_replay_what_the_global_generator_would_have_drawn(self, sensor):
+        optics, (image, depth) = camera(sensor=sensor), scene()
+        torch.manual_seed(2)
+        direct = optics(image, depth)
+        torch.manual_seed(2)
+        params = optics.draw(image)
+        assert torch.equal(optics(image, depth, params=params), direct)
+        assert torch.equal(optics({"image": image, "depth": depth}, params=params)["image"], direct)
+
+    def test_feature_eval_keeps_the_noise(self):
+        optics, (image, depth) = camera(color_space="linear").eval(), scene(1, height=128, width=128)
+        image = 0.25 + image / 2
+        silent = camera(masks=optics.masks, sensor=None, color_space="linear")
+        noise = (optics(image, depth) - silent(image, depth)).detach()
+        assert float(noise.std()) == pytest.approx(0.01, rel=0.02)  # 49 152 samples: one standard error is 0.3 %
+
+
+class TestTimeAverage(BaseTester):
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("stray_light", ["discard", "veil"])
+    def test_feature_the_mean_of_single_mask_captures_is_the_capture_of_the_sequence(
+        self, compositing, stray_light, device, dtype
+    ):
+        # Renormalised PSFs are left out: there each mask is scaled by the light of its own window.
+        options = {
+            "sensor": None,
+            "color_space": "linear",
+            "compositing": compositing,
+            "fidelity": FAST.replace(stray_light=stray_light),
+        }
+        together = camera(masks=PixelwiseMask(3), **options).to(device, dtype)
+        image, depth = (x.to(device, dtype) for x in scene())
+        mean = torch.zeros_like(image)
+        for phase in together.masks.phase.detach():
+            single = camera(masks=PixelwiseMask(1), **options).to(device, dtype)
+            single.masks.phase.data = phase[None].clone()
+            mean += single(image, depth) / 3
+        tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+        self.assert_close(together(image, depth), mean, rtol=0, atol=tolerance)
+
+    def test_feature_encoding_is_not_linear_so_the_identity_needs_linear_light(self):
+        options = {"sensor": None, "fidelity": FAST.replace(stray_light="discard")}
+        together = camera(masks=PixelwiseMask(2), **options)
+        singles = [camera(masks=PixelwiseMask(1), **options) for _ in range(2)]
+        for single, phase in zip(singles, together.masks.phase.detach(), strict=True):
+            single.masks.phase.data = phase[None].clone()
+        image, depth = scene()
+        mean = sum(single(image, depth) for single in singles) / 2
+        assert (mean - together(image, depth)).abs().max() > 1e-4
+
+
+class TestGradients(BaseTester):
+    """Through optics, scene and sensor, in float64: noise replayed, no converter, no clipping."""
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("name", ["masks.phase", "camera.focus_distance", "image", "depth"])
+    def test_gradcheck(self, name, compositing):
+        lens = ThinLensCamera(focus_distance=torch.tensor(0.6), depth_range=(0.25, math.inf))
+        optics = TiDyOptics(
+            PixelwiseMask(2),
+            lens,
+            sensor=SensorNoise(0.01, clip=False),
+            fidelity=FAST.replace(window=5, layer_spacing=60.0),  # two nodes: no knot inside the range
+            compositing=compositing,
+        ).double()
+        image, depth = (x.double() for x in scene(1, height=12, width=14))
+        image = 0.2 + 0.6 * image
+        depth = 0.3 + 2 * torch.rand_like(depth)
+        params = optics.draw(image)
+        inputs = {"image": image, "depth": depth, **{n: p.detach() for n, p in optics.named_parameters()}}
+
+        def capture(value: Tensor) -> Tensor:
+            values = {**inputs, name: value}
+            scene_of = values.pop("image"), values.pop("depth")
+            return functional_call(optics, values, scene_of, {"params": params})
+
+        self.gradcheck(capture, (inputs[name],))
+
+    def test_feature_fixed_masks_have_no_gradient_and_the_image_still_has(self):
+        optics, (image, depth) = camera(masks=FresnelLens()), scene()
+        image.requires_grad_()
+        optics(image, depth).sum().backward()
+        assert not list(optics.parameters())
+        assert image.grad.abs().sum() > 0

@@ -1,0 +1,241 @@
+"""The camera as a whole: what light does in it. How it fits into pipelines is tested in test_pipelines*.py."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kornia_tidy import (
+    DefocusRange,
+    DwellTimes,
+    Fidelity,
+    FresnelLens,
+    PixelwiseMask,
+    SensorNoise,
+    Spectrum,
+    ThinLensCamera,
+    TiDyOptics,
+)
+from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.spectrum import camera_spectrum
+from kornia_tidy.psf.psf_bank import enclosing_window
+from tests.base import BaseTester, oracle
+from tests.rounding import gamma
+
+SMALL = Fidelity(window=9, layer_spacing=5.0)
+
+
+class TestLight(BaseTester):
+    def test_feature_white_stays_white_in_gather(self, dtype):
+        optics = TiDyOptics(sensor=None, fidelity=Fidelity(window=23))
+        depth = 0.3 + 3 * torch.rand(1, 1, 48, 56, dtype=dtype)
+        white = optics(torch.ones(1, 3, 48, 56, dtype=dtype), depth)
+        assert float((white.detach() - 1).abs().max()) < 1e-6
+
+    def test_feature_flux_is_conserved_by_scatter_with_a_circular_border(self):
+        optics = TiDyOptics(
+            sensor=None, compositing="scatter", border="circular", color_space="linear", fidelity=Fidelity(window=23)
+        )
+        image = torch.rand(2, 3, 40, 40, dtype=torch.float64)
+        coded = optics(image, 0.3 + 3 * torch.rand(2, 1, 40, 40, dtype=torch.float64))
+        self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-6, atol=0)
+
+    def test_feature_a_veil_keeps_the_flux_without_renormalising(self):
+        fidelity = SMALL.replace(stray_light="veil")
+        optics = TiDyOptics(
+            sensor=None, compositing="scatter", border="circular", color_space="linear", fidelity=fidelity
+        )
+        image = torch.rand(1, 3, 32, 32, dtype=torch.float64)
+        coded = optics(image, torch.full((1, 1, 32, 32), 0.4, dtype=torch.float64))
+        self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-9, atol=0)
+        lost = TiDyOptics(
+            optics.masks, sensor=None, color_space="linear", fidelity=SMALL.replace(stray_light="discard")
+        )
+        assert float(lost(image, torch.full((1, 1, 32, 32), 0.4)).detach().sum()) < 0.9 * float(image.sum())
+
+    def test_feature_geometric_blur_uses_the_image_distance(self):
+        """A thin lens blurs a point to a disc of radius R s' |1/z - 1/z_f|; with f for s' it would be 9 % smaller."""
+        camera = ThinLensCamera(50e-3, 12.5e-3, 0.595, 8e-6, depth_range=(0.4, 0.6))
+        disc = circular_aperture(92, 2.3 / 92, edges="area")
+        fidelity = Fidelity(window=201, layer_spacing=400.0)
+        optics = TiDyOptics(
+            PixelwiseMask(1, initial="flat"),
+            camera,
+            None,
+            None,
+            fidelity,
+            spectrum=Spectrum.monochrome(),
+            aperture=disc,
+        )
+        psf = optics.psf_bank().psfs[-1, 0].detach().double()  # at 0.4 m
+        lo, hi = 0.0, 100.0
+        for _ in range(40):
+            middle = (lo + hi) / 2
+            inside = float((psf * circular_aperture(201, 1.0, radius=middle, edges="area")).sum())
+            lo, hi = (middle, hi) if inside < 0.5 else (lo, middle)
+        expected = 6.25e-3 * camera.image_distance * (1 / 0.4 - 1 / 0.595) / 8e-6
+        assert lo * math.sqrt(2) == pytest.approx(expected, rel=0.01)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_equals_the_oracle_end_to_end(self, compositing):
+        model = oracle()
+        fidelity = SMALL.replace(layers="nearest", double=True)
+        optics = TiDyOptics(sensor=None, color_space="linear", compositing=compositing, fidelity=fidelity)
+        image = torch.rand(3, 30, 34, dtype=torch.float64)
+        depth = 0.3 + 2 * torch.rand(1, 30, 34, dtype=torch.float64)
+        coded = optics(image, depth).detach().numpy()
+        psi = model.defocus(depth[0].numpy(), optics.camera.aperture_radius, 0.595)
+        psfs = optics.psf_bank().psfs.detach().numpy()
+        label = model.nearest(psi, optics.defocus_nodes)
+        expected = getattr(model, compositing)(image.numpy(), label, psfs)
+        assert abs(coded - expected).max() < 1e-12
+
+    def test_feature_occlusion_equals_the_oracle_state_by_state(self):
+        model = oracle()
+        optics = TiDyOptics(
+            PixelwiseMask(2),
+            modulator=DwellTimes((3, 1)),
+            sensor=None,
+            color_space="linear",
+            compositing="occlusion",
+            fidelity=SMALL.replace(layers="nearest", double=True),
+        )
+        image = torch.rand(3, 30, 34, dtype=torch.float64)
+        depth = torch.where(torch.arange(34) < 15, 0.45, 1.4).expand(1, 30, 34).double()
+        coded = optics(image, depth).detach().numpy()
+        label = model.nearest(
+            model.defocus(depth[0].numpy(), optics.camera.aperture_radius, 0.595), optics.defocus_nodes
+        )
+        bank = optics.psf_bank(states=True)
+        near_first = list(range(len(bank.defocus)))[::-1]
+        expected = sum(
+            float(w) * model.occlusion(image.numpy(), label, state.psfs.detach().numpy(), near_first)
+            for w, state in zip(bank.weights, bank, strict=True)
+        )
+        assert abs(coded - expected).max() < 1e-9
+
+    @pytest.mark.parametrize("layers", ["nearest", "linear", "bandlimited"])
+    def test_feature_an_occlusion_capture_is_the_weighted_mean_of_single_masks(self, layers):
+        """And not the capture through the mean PSFs, which is what ``occlusion_states="mean"`` takes."""
+        masks, shares = PixelwiseMask(3), (3, 1, 2)
+        options = {"sensor": None, "color_space": "linear", "compositing": "occlusion"}
+        fidelity = SMALL.replace(layers=layers, layer_spacing=2.0)
+        optics = TiDyOptics(masks, modulator=DwellTimes(shares), fidelity=fidelity, **options)
+        image, depth = torch.rand(1, 3, 40, 44), torch.where(torch.arange(44) < 20, 0.4, 2.0).expand(1, 1, 40, 44)
+        single = [
+            TiDyOptics(PixelwiseMask(initial=height[None]), fidelity=fidelity, **options)(image, depth).detach()
+            for height in masks.heights().detach()
+        ]
+        expected = sum(share / 6 * own for share, own in zip(shares, single, strict=True))
+        coded = optics(image, depth)
+        self.assert_close(coded, expected, rtol=0, atol=2e-6)
+        through_mean = optics.with_fidelity(fidelity.replace(occlusion_states="mean"))(image, depth)
+        error = float((through_mean - coded).detach().abs().max())
+        assert 2e-5 < error < 2e-2
+
+    def test_feature_occlusion_sends_gradients_to_every_mask_and_to_depth(self):
+        optics = TiDyOptics(PixelwiseMask(2), sensor=None, compositing="occlusion", fidelity=SMALL)
+        image = torch.rand(1, 3, 30, 30)
+        depth = torch.where(torch.arange(30) < 15, 0.4, 2.0).expand(1, 1, 30, 30).clone().requires_grad_()
+        optics(image, depth).square().mean().backward()
+        assert optics.masks.phase.grad.abs().amax((1, 2)).min() > 0
+        assert depth.grad.abs().max() > 0
+
+    def test_exception_what_hides_has_no_spectrum_of_its_own(self):
+        with pytest.raises(ValueError, match="compositing 'occlusion' needs colours without spectra"):
+            TiDyOptics(compositing="occlusion", spectrum=camera_spectrum(samples=8, reflectance=True))
+
+    def test_feature_paper_takes_srgb_as_light_and_correlates(self):
+        masks = PixelwiseMask(2)
+        paper = TiDyOptics(masks, DefocusRange(-10, 10), sensor=None, fidelity="paper")
+        assert paper.color_space == "paper"
+        image, disparity = torch.rand(1, 3, 40, 44), torch.full((1, 1, 40, 44), 0.75)
+        index = paper.defocus_nodes.index(5.0) if 5.0 in paper.defocus_nodes else None
+        bank = paper.psf_bank()
+        nearest = int((bank.defocus - 5.0).abs().argmin()) if index is None else index
+        expected = torch.nn.functional.conv2d(  # torch's conv2d is a correlation
+            torch.nn.functional.pad(image, [11] * 4, mode="reflect"), bank.psfs[nearest][:, None], groups=3
+        )
+        self.assert_close(paper(image, disparity), expected, atol=0, rtol=2 * gamma(23 * 23, torch.float32))
+
+    def test_feature_a_paper_camera_refuses_contradictions(self):
+        for options in ({"color_space": "srgb"}, {"compositing": "scatter"}):
+            with pytest.raises(ValueError, match="fidelity 'paper' means"):
+                TiDyOptics(camera=DefocusRange(-10, 10), fidelity="paper", **options)
+
+    def test_feature_linear_light_passes_hdr_untouched(self):
+        optics = TiDyOptics(sensor=None, color_space="linear", fidelity=SMALL)
+        image = torch.full((1, 3, 20, 20), 37.5)
+        roundings = 2 * optics.window**2 + 8  # PSFs are divided by their sum, and light is added up over them
+        coded = optics(image, torch.ones(1, 1, 20, 20))
+        self.assert_close(coded, image, rtol=gamma(roundings, torch.float32), atol=0)
+
+    def test_feature_noise_is_added_in_linear_light(self):
+        """sigma = 0.01 of linear full scale; in sRGB it is larger in the shadows by the slope of the curve."""
+        optics = TiDyOptics(sensor=SensorNoise(0.01), fidelity=SMALL)
+        image, depth = torch.full((1, 3, 200, 200), 0.5), torch.ones(1, 1, 200, 200)
+        linear = ((0.5 + 0.055) / 1.055) ** 2.4
+        slope = 1.055 / 2.4 * linear ** (1 / 2.4 - 1)
+        assert float(optics(image, depth).detach().std()) == pytest.approx(0.01 * slope, rel=0.02)
+
+    def test_feature_dwell_times_weight_the_masks(self):
+        masks = PixelwiseMask(2)
+        weighted = TiDyOptics(masks, modulator=DwellTimes((3, 1)), fidelity=SMALL.replace(stray_light="discard"))
+        alone = [
+            TiDyOptics(PixelwiseMask(initial=h), fidelity=weighted.fidelity).psf_bank().psfs for h in masks.heights()
+        ]
+        self.assert_close(weighted.psf_bank().psfs, 0.75 * alone[0] + 0.25 * alone[1], atol=1e-6, rtol=0)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_learns_where_determinism_is_demanded(self, compositing, device):
+        """Torch then refuses operations that have no deterministic form."""
+        optics = TiDyOptics(PixelwiseMask(2), sensor=None, compositing=compositing, fidelity=SMALL).to(device)
+        image = torch.rand(1, 3, 40, 40, device=device, requires_grad=True)
+        depth = (0.3 + torch.rand(1, 1, 40, 40, device=device)).requires_grad_()
+        found = []
+        before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+        torch.use_deterministic_algorithms(True)
+        try:
+            for _ in range(2):
+                loss = optics(image, depth).square().sum()
+                found.append(torch.autograd.grad(loss, [image, depth, *optics.parameters()]))
+        finally:
+            torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        for first, second in zip(*found, strict=True):
+            assert torch.equal(first, second)
+            assert float(first.abs().max()) > 0
+
+    def test_feature_fresnel_baseline_has_nothing_to_learn(self):
+        optics = TiDyOptics(FresnelLens(), sensor=None, fidelity=SMALL)
+        assert list(optics.parameters()) == []
+        assert optics(torch.rand(1, 3, 20, 20), torch.ones(1, 1, 20, 20)).requires_grad is False
+
+
+class TestWindow(BaseTester):
+    def test_feature_the_window_is_the_smallest_that_holds_the_share(self):
+        optics = TiDyOptics(PixelwiseMask(initial="flat"), fidelity=Fidelity(enclosed_energy=0.9, layer_spacing=20.0))
+        wide = TiDyOptics(optics.masks, fidelity=Fidelity(window=65, layer_spacing=20.0, stray_light="discard"))
+        psfs = wide.psf_bank().psfs.detach()
+        assert abs(optics.window - enclosing_window(psfs, 0.9)) <= 2  # measured with coarser pixels
+        assert optics.window < 41
+
+    def test_feature_random_masks_need_wide_windows(self):
+        assert TiDyOptics(PixelwiseMask(5)).window > TiDyOptics(PixelwiseMask(5, initial="flat")).window
+
+    def test_feature_a_window_too_small_warns_with_numbers(self):
+        with pytest.warns(UserWarning, match=r"9 px, holds \d+% of the light where it should hold 80%"):
+            TiDyOptics(fidelity=Fidelity(max_window=9))
+
+    def test_smoke_repr_tells_the_camera(self):
+        words = repr(TiDyOptics())
+        for part in (
+            "f/17.6",
+            "0.595 m",
+            "psi +20.02 to -20.02",
+            "5 learnable masks of 23x23",
+            "PSF window",
+            "% of the light",
+        ):
+            assert part in words

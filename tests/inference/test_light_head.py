@@ -1,0 +1,115 @@
+"""Trained networks on linear light: they see what they were trained with, and depth comes back in metres."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.color import linear_rgb_to_rgb
+from torch import nn
+
+from kornia_tidy.inference.light_head import LightHead, reconstruct_light, reconstruct_opencv
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.tasks import channels_of
+from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
+from kornia_tidy.reconstruction import receptive_field
+from tests.base import BaseTester
+
+
+class Passing(nn.Module):
+    """Returns the image, and its red channel as nearness."""
+
+    def __init__(self, task):
+        super().__init__()
+        self.task = task
+
+    def forward(self, image):
+        maps = {"edof": image, "depth": image[:, :1], "joint": torch.cat([image[:, :1], image], 1)}[self.task]
+        assert maps.shape[1] == channels_of(self.task)
+        return maps
+
+
+def light_head(task, color_space=None, head=None, **settings):
+    settings = TrainingSettings(task=task, masks=1, window=23, color_space=color_space, **settings)
+    return LightHead(TrainedSystem(build_optics(settings), head or Passing(task), settings, 0))
+
+
+class TestLightHead(BaseTester):
+    @pytest.mark.parametrize("color_space", ["srgb", "linear"])
+    def test_feature_networks_see_the_space_they_were_trained_in(self, color_space):
+        """Passed on as it is, the light comes out encoded, whichever space the network worked in."""
+        head, light = light_head("edof", color_space), torch.rand(1, 3, 9, 8) * 1.4 - 0.2
+        seen = []
+        head.head.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+        (image,) = head(light)
+        clipped = light.clamp(0, 1)
+        self.assert_close(image, linear_rgb_to_rgb(clipped))
+        self.assert_close(seen[0], linear_rgb_to_rgb(clipped) if color_space == "srgb" else clipped)
+
+    def test_feature_it_is_the_encoding_of_the_camera(self):
+        head, light = light_head("edof"), torch.rand(1, 3, 9, 8)
+        optics = build_optics(TrainingSettings(masks=1, window=23))
+        self.assert_close(head(light)[0], optics.encode(light))
+
+    @pytest.mark.filterwarnings("ignore::kornia_tidy.psf.paper.AliasingWarning")
+    def test_feature_the_paper_takes_light_for_light(self):
+        head, light = light_head("edof", fidelity="paper"), torch.rand(1, 3, 9, 8)
+        seen = []
+        head.head.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+        head(light)
+        self.assert_close(seen[0], light)
+
+    def test_feature_looks_as_far_as_its_network(self):
+        settings = TrainingSettings(head="plain", width=2)
+        assert receptive_field(light_head("edof", head=build_head(settings).eval())) == 31
+
+
+class TestReconstructLight(BaseTester):
+    def test_feature_each_task_gives_its_maps(self):
+        light = torch.rand(3, 40, 30)
+        for task, expected in (("edof", (True, False)), ("depth", (False, True)), ("joint", (True, True))):
+            result = reconstruct_light(light_head(task), light)
+            assert (result.image is not None, result.depth is not None) == expected
+        self.assert_close(result.image, linear_rgb_to_rgb(light))
+
+    def test_feature_depth_is_in_metres(self):
+        """Linear colours, so that red light is nearness: half is the focus distance of the default lens."""
+        light = torch.tensor([0.0, 0.5, 1.0]).view(1, 1, 3)
+        depth = reconstruct_light(light_head("depth", "linear"), light).depth
+        self.assert_close(depth.flatten()[1:], torch.tensor([0.595, 0.2975]))
+        assert math.isinf(depth.flatten()[0])
+
+    def test_feature_the_light_is_left_alone(self):
+        light = torch.rand(3, 12, 14) * 2
+        before = light.clone()
+        reconstruct_light(light_head("joint"), light)
+        assert torch.equal(light, before)
+
+    def test_exception_names_the_shape(self):
+        with pytest.raises(ValueError, match=r"light must have shape \(3, H, W\) or \(1, H, W\), got \(2, 4, 4\)"):
+            reconstruct_light(light_head("edof"), torch.rand(2, 4, 4))
+
+
+class TestReconstructOpenCV(BaseTester):
+    @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+    def test_feature_a_network_that_passes_gives_the_picture_back(self, kind):
+        picture = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (20, 30, 3), kind)
+        image, depth = reconstruct_opencv(light_head("joint"), picture)
+        assert image.dtype == kind
+        assert depth.shape == (20, 30)
+        assert np.abs(image.astype(int) - picture).max() <= (1 if kind is np.uint8 else 3)
+
+    def test_feature_linear_pictures_come_back_encoded(self):
+        picture = np.full((4, 4, 3), 32768, np.uint16)
+        image, _ = reconstruct_opencv(light_head("edof"), picture, linear=True)
+        assert abs(int(image[0, 0, 0]) - 65535 * 0.73536) < 3  # sRGB's encoding of 0.5
+
+    def test_feature_grey_pictures_and_color_order(self):
+        grey, _ = reconstruct_opencv(light_head("edof"), np.full((4, 5), 77, np.uint8))
+        assert grey.shape == (4, 5, 3)
+        blue = np.zeros((4, 4, 3), np.uint8)
+        blue[..., 0] = 200
+        assert cv2.split(reconstruct_opencv(light_head("edof"), blue)[0])[0].mean() == pytest.approx(200, abs=1)

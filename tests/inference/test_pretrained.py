@@ -1,0 +1,68 @@
+"""The systems that come with the library."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, about_pretrained, load_pretrained, ship
+from kornia_tidy.inference.state_file import read_state, write_state
+from kornia_tidy.training.evaluation import evaluate, mean_row
+from tests.base import BaseTester
+
+MEGABYTES = 16  # that all of them may take
+
+
+class TestPretrained(BaseTester):
+    @pytest.mark.parametrize("name", PRETRAINED)
+    def test_smoke_loads_with_its_task_and_masks(self, name):
+        system = load_pretrained(name)
+        task, masks = name.split("-")
+        assert system.settings.task == task
+        assert system.settings.masks == int(masks)
+        assert not system.head.training
+
+    @pytest.mark.parametrize("name", PRETRAINED)
+    def test_feature_beats_its_capture_on_new_scenes(self, name):
+        """The scores that heads.json tells, on other scenes than those it was measured on."""
+        system = load_pretrained(name)
+        captures = []
+
+        def note(looked):
+            captures.append(-10 * (looked.coded - looked.truth["image"]).square().mean().log10())
+
+        scenes = DeadLeaves(4, 128, 128, depth_range=system.optics.camera.depth_range, seed=31)
+        scores = mean_row(evaluate(system, scenes, each=note))
+        told = about_pretrained()["systems"][name]["scores"]["dead leaves"]
+        gain = told["image_psnr"] - told["capture_psnr"]
+        assert scores["image_psnr"] > float(torch.stack(captures).mean()) + gain / 2
+        assert abs(scores["image_psnr"] - told["image_psnr"]) < 2.5
+        if "depth_rmse" in told:
+            assert scores["depth_rmse"] < told["depth_rmse"] + 0.1
+
+    def test_feature_all_are_small(self):
+        assert sum(path.stat().st_size for path in FOLDER.iterdir() if path.is_file()) < MEGABYTES << 20
+
+    def test_feature_what_is_shipped_is_what_was_trained(self, tmp_path):
+        state = read_state(FOLDER / "edof-5.safetensors")
+        weights = dict(state["state_dict"])
+        state["state_dict"] = {**weights, "head.extra": torch.ones(1000, 1000), "average.steps": torch.tensor(1)}
+        write_state(tmp_path / "run.safetensors", {**state, "optimizer": {"lr": 1.0}})
+        ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors")
+        again = read_state(tmp_path / "small.safetensors")
+        assert set(again) == {"settings", "global_step", "state_dict"}
+        assert again["state_dict"].keys() == weights.keys()
+        assert all(torch.equal(again["state_dict"][key], value) for key, value in weights.items())
+
+    def test_exception_a_run_without_an_average(self, tmp_path):
+        state = read_state(FOLDER / "edof-5.safetensors")
+        state["state_dict"] = {k: v for k, v in state["state_dict"].items() if k.startswith("optics.")}
+        write_state(tmp_path / "run.safetensors", state)
+        with pytest.raises(ValueError, match="holds no moving average of its network"):
+            ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors")
+        assert not (tmp_path / "small.safetensors").exists()
+
+    def test_exception_unknown_name(self):
+        with pytest.raises(ValueError, match="name must be one of"):
+            load_pretrained("edof-7")

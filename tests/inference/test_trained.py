@@ -1,0 +1,89 @@
+"""Checkpoints whose parts do not fit each other: refused in one sentence, before a camera or a network is made."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.state_file import write_state
+from kornia_tidy.inference.trained import build_head, build_optics, load_trained
+from tests.base import BaseTester
+
+SETTINGS = TrainingSettings(
+    task="joint", masks=2, head="plain", width=4, size=32, window=9, fidelity="draft", depth_range=(0.5, 2.0)
+)
+
+
+@pytest.fixture(scope="module")
+def state():
+    optics, head = build_optics(SETTINGS), build_head(SETTINGS)
+    weights = {f"optics.{name}": value for name, value in optics.state_dict().items()}
+    weights |= {f"head.{name}": value for name, value in head.state_dict().items()}
+    return {"settings": SETTINGS.as_dict(), "state_dict": weights, "global_step": 3}
+
+
+class TestLoadTrained(BaseTester):
+    def test_smoke_a_whole_one(self, state, tmp_path):
+        write_state(tmp_path / "a", state)
+        assert load_trained(tmp_path / "a").step == 3
+
+    @pytest.mark.parametrize(
+        ("changes", "sentence"),
+        [
+            ({"masks": "5"}, "masks must be a whole number, got '5'"),
+            ({"masks": True}, "masks must be a whole number, got True"),
+            ({"masks": 900}, "it holds 2 masks, and its settings tell of 900"),
+            ({"masks": 10**9}, "masks must be 1024 or fewer"),
+            ({"width": 10**4}, "head does not fit: layers.0.weight is"),
+            ({"width": 10**18}, "no network can be made by its settings"),
+            ({"task": ["joint"]}, "task must be a text, got"),
+            ({"sigma": "x"}, "sigma must be a finite number, got 'x'"),
+            ({"sigma": float("nan")}, "sigma must be a finite number, got nan"),
+            ({"focal_length": 10**400}, "focal_length must be a finite number, got 1000"),
+            ({"depth_range": [1]}, "depth_range must be two numbers"),
+            ({"depth_range": [1, None]}, "depth_range must be two numbers"),
+            ({"window": "9"}, "window must be a whole number"),
+            ({"augment": 1}, "augment must be true or false"),
+            ({"a" * 5000: 1}, "settings hold unknown names: aaa"),
+        ],
+    )
+    def test_exception_settings_that_cannot_be(self, changes, sentence, state, tmp_path):
+        write_state(tmp_path / "a", {**state, "settings": {**state["settings"], **changes}})
+        with pytest.raises(ValueError, match=sentence) as error:
+            load_trained(tmp_path / "a")
+        assert len(str(error.value)) < 600
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"settings": 5},
+            {"settings": [1]},
+            {"state_dict": 5},
+            {"state_dict": {"head.weight": 5}},
+            {"global_step": None},
+            {"global_step": "3"},
+        ],
+    )
+    def test_exception_parts_that_cannot_be(self, changes, state, tmp_path):
+        write_state(tmp_path / "a", {**state, **changes})
+        with pytest.raises(ValueError, match=f"cannot read {tmp_path / 'a'}: "):
+            load_trained(tmp_path / "a")
+
+    def test_exception_every_flipped_bit_of_the_settings_is_read_or_refused(self, state, tmp_path):
+        text = json.dumps(SETTINGS.as_dict()).encode()
+        generator = torch.Generator().manual_seed(0)
+        for bit in torch.randperm(8 * len(text), generator=generator)[:200].tolist():
+            damaged = bytearray(text)
+            damaged[bit // 8] ^= 1 << (bit % 8)
+            path = tmp_path / "settings.json"
+            path.write_bytes(damaged)
+            try:
+                TrainingSettings.read(path).camera()
+            except ValueError as error:
+                told = str(error)
+            else:
+                continue
+            assert "\n" not in told

@@ -1,0 +1,242 @@
+"""Random calls of the C sources, each with what it should return and the round-off that this may be off by.
+
+Planes are as small as a kernel takes, or have odd sizes, overlap their neighbours in memory, and have PSFs larger than
+a block; layers lie in every way in which they are found (one, noise, stripes, squares), nearest and linear.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, one_hot
+
+from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW, mutual_energies
+from kornia_tidy.render.backends import direct
+from kornia_tidy.render.backends import direct_occlusion as occlusion_direct
+from kornia_tidy.render.backends.dense_occlusion import occlude_dense
+from kornia_tidy.render.backends.tile_plan import Labels
+from kornia_tidy.render.borders import BORDERS, pad_border
+from tests.psf.energies import round_off, written_out
+from tests.rounding import gamma
+
+DTYPES = (torch.float32, torch.float64)
+
+
+LARGEST = 3 * 10**6  # products, of calls
+CHEAP = 3 * 10**5  # products, of calls whose values are looked at too: that is slower than the calls are
+
+
+@dataclass(frozen=True)
+class Call:
+    """A kernel's result, and what it should be.
+
+    Args:
+        about: the shapes, in words.
+        got: by the kernel.
+        products: that are to be made.
+        truth: returns the same in float64, and how far apart they may be.
+    """
+
+    about: str
+    got: Tensor
+    products: int
+    truth: Callable[[], tuple[Tensor, Tensor | float]]
+
+    def error(self) -> float:
+        """Return the largest difference over what is allowed."""
+        expected, allowed = self.truth()
+        off = (self.got.double() - expected).abs()
+        return float(torch.where(off > 0, off / allowed, 0).max())
+
+
+@dataclass(frozen=True)
+class _Scene:
+    light: Tensor
+    psfs: Tensor
+    lower: Tensor
+    fraction: Tensor | None
+    about: str
+    products: int
+
+
+def gather(draw: random.Random) -> Call:
+    """``mix`` and ``count_pairs`` of direct.c."""
+    scene = _gathered(draw)
+    labels, slope = Labels(scene.lower, scene.fraction), scene.fraction is not None and draw.random() < 0.5
+    pairs = direct.count_pairs(labels, scene.light.dtype)
+    assert pairs >= 0, scene.about
+    got = direct.mix_directly(scene.light, scene.psfs, labels, slope=slope)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        weights = _weights(labels, len(scene.psfs), slope=slope)
+        expected, total = (_mixed(x(scene.light), x(scene.psfs), x(weights)) for x in (Tensor.double, _magnitudes))
+        return expected, 2 * gamma(scene.psfs.shape[-1] ** 2 + 4, got.dtype) * total
+
+    return Call(f"{scene.about} slope {slope}", got, scene.products, truth)
+
+
+def correlate(draw: random.Random) -> Call:
+    """``correlate`` of direct.c: the gradient of a sum over pixels to the PSFs."""
+    scene = _gathered(draw)
+    labels = Labels(scene.lower, scene.fraction)
+    own = torch.randn(len(scene.light), scene.light.shape[1], *scene.lower.shape[-2:], dtype=scene.light.dtype)
+    got = direct.correlate_directly(scene.light, own, labels, scene.psfs.shape)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        sums = []
+        for x in (Tensor.double, _magnitudes):
+            psfs = x(scene.psfs).requires_grad_()
+            coded = _mixed(x(scene.light), psfs, x(_weights(labels, len(psfs))))
+            sums.append(torch.autograd.grad((coded * x(own)).sum(), psfs)[0])
+        return sums[0], 2 * gamma(own.numel() + 4, got.dtype) * sums[1]
+
+    return Call(scene.about, got, scene.products, truth)
+
+
+def occlude(draw: random.Random) -> Call:
+    """``occlude`` and ``count`` of occlusion_direct.c.
+
+    Light, layers and what is behind them are sums of positive numbers, each off by gamma of itself; a share that is let
+    through is a difference and keeps its absolute error, which grows with each layer, and so does the sum of layers. In
+    float64 whole weights come from differences of sums up to 1, which a layer seen by a single pixel is divided by.
+    """
+    dtype, border = draw.choice(DTYPES), draw.choice(BORDERS)
+    products = LARGEST + 1
+    while products > LARGEST:
+        side, layers, channels = draw.choice((1, 3, 5, 7, 9, 15, 17, 31)), draw.randint(1, 6), draw.choice((1, 3))
+        smallest, edge = (8, 128 // dtype.itemsize), side - 1 if border == "valid" else 0
+        height, width = (_size(draw, max(n, side // 2 + 1), 60) + edge for n in smallest)
+        images, maps = draw.choice(((1, 1), (2, 1), (2, 2)))
+        products = images * channels * layers * height * width * side**2
+    psfs = torch.rand(layers, channels, side, side, dtype=dtype) + 0.5
+    psfs /= psfs.sum((-2, -1), keepdim=True)
+    image = torch.rand(images, channels, height, width, dtype=dtype)
+    lower, fraction = _layers(draw, (maps, height, width), layers, dtype)
+    veil = torch.rand(layers, channels, dtype=dtype) if draw.random() < 0.5 else None
+    about = f"{dtype} {border} {tuple(image.shape)} maps {maps} psfs {tuple(psfs.shape)} shared {fraction is not None}"
+
+    radius = side // 2
+    plane = pad_border(image, radius, border)
+    below = pad_border(lower[:, None].to(dtype), radius, border)[:, 0]
+    share = None if fraction is None else pad_border(fraction[:, None], radius, border)[:, 0]
+    inside = pad_border(torch.ones(1, 1, height, width, dtype=dtype), radius, border)[0] if border == "zero" else None
+    mean = None if veil is None else image.mean((-2, -1))
+    assert occlusion_direct.can_go_directly(plane, psfs), about
+    counts = occlusion_direct.count(plane, psfs, below, share)
+    assert min(counts) >= 0, about
+    got = occlusion_direct.occlude_directly(plane, psfs, below, share, mean, veil, inside)
+
+    def truth() -> tuple[Tensor, float]:
+        shared = None if fraction is None else fraction[:, None]
+        expected = occlude_dense(image, lower[:, None], shared, psfs, veil=veil, border=border)
+        apart = 1 if dtype == torch.float32 else 1 + 3 * side**2
+        return expected, 6 * layers * (layers + 1) * apart * gamma(side**2 + 16, dtype)
+
+    return Call(about, got, products, truth)
+
+
+def energies(draw: random.Random) -> Call:
+    """``mutual_energies`` of mutual_intensity.c."""
+    dtype = draw.choice(DTYPES)
+    states, cells, order, depths = draw.randint(1, 6), draw.randint(1, 36), draw.randint(1, 4), draw.randint(1, 4)
+    window = draw.choice((1, 2, 3, 4, 5, 9, 22, 33)) if draw.random() < 0.95 else LARGEST_WINDOW
+    complex_type = dtype.to_complex()
+    field = torch.randn(states, cells, cells, dtype=complex_type)
+    kernels = torch.randn(depths, window, order, cells, dtype=complex_type)
+    if draw.random() < 0.3:
+        kernels = kernels.transpose(1, 2).contiguous().transpose(1, 2)
+    weights = torch.rand(states, dtype=dtype)
+    about = f"{dtype} states {states} cells {cells} order {order} depths {depths} window {window}"
+    got = mutual_energies(field, weights, kernels)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        expected = written_out(field.to(torch.complex128), weights.double(), kernels.to(torch.complex128))
+        return expected, 2 * round_off(field, weights, kernels)
+
+    return Call(about, got, depths * window**2 * cells * (cells + states * order**2), truth)
+
+
+KERNELS: dict[str, Callable[[random.Random], Call]] = {
+    "direct.c: gather": gather,
+    "direct.c: correlate": correlate,
+    "occlusion_direct.c": occlude,
+    "mutual_intensity.c": energies,
+}
+
+
+def _size(draw: random.Random, smallest: int, more: int) -> int:
+    """The smallest size a third of the time, and now and then a large one."""
+    return smallest + draw.choice((0, draw.randint(0, 3), draw.randint(0, more), draw.randint(0, more)))
+
+
+def _gathered(draw: random.Random) -> _Scene:
+    dtype, products = draw.choice(DTYPES), LARGEST + 1
+    while products > LARGEST:
+        side = draw.choice((1, 3, 5, 7, 9, 15, 21, 33))
+        height, width = _size(draw, direct.STRIP_ROWS, 40), _size(draw, 128 // dtype.itemsize, 70)
+        if draw.random() < 0.02:  # more bands or blocks than a piece of a correlation holds
+            height, width, side = draw.choice(((290, 33, 3), (7, 1300, 3)))
+        images, channels, layers = draw.randint(1, 3), draw.randint(1, 3), draw.randint(1, 8)
+        products = images * channels * layers * height * width * side**2
+    light = torch.randn(images, channels, height + side - 1, width + side - 1, dtype=dtype)
+    memory = draw.choice(("whole", "shared by channels", "cut out"))
+    if memory == "shared by channels":
+        light = light[:, :1].expand(-1, channels, -1, -1)
+    elif memory == "cut out":
+        light = torch.nn.functional.pad(light, (0, 3, 0, 2))[..., : light.shape[-2], : light.shape[-1]]
+    psfs = torch.randn(layers, channels, side, side, dtype=dtype)
+    maps = draw.choice((1, images))
+    lower, fraction = (
+        x if x is None else x.expand(images, -1, -1) for x in _layers(draw, (maps, height, width), layers, dtype)
+    )
+    assert direct.can_go_directly(Labels(lower, fraction), dtype)
+    about = f"{dtype} light {tuple(light.shape)} {memory} psfs {tuple(psfs.shape)} shared {fraction is not None}"
+    return _Scene(light, psfs, lower, fraction, about, products)
+
+
+def _layers(
+    draw: random.Random, shape: tuple[int, int, int], layers: int, dtype: torch.dtype
+) -> tuple[Tensor, Tensor | None]:
+    """Layers of pixels, and shares of the next ones: both exact where they lie in one layer."""
+    maps, height, width = shape
+    y, x = torch.arange(height)[:, None], torch.arange(width)
+    kind = draw.choice(("one", "noise", "stripes", "squares", "speck"))
+    lower = {
+        "one": torch.full((height, width), draw.randrange(layers)),
+        "noise": torch.randint(layers, (height, width)),
+        "stripes": (x % layers).expand(height, width),
+        "squares": (y // 11 * 3 + x // 13 * 5) % layers,
+        "speck": ((y == height // 2) & (x == width - 1)).long() * (layers - 1),
+    }[kind].expand(maps, -1, -1)
+    if layers == 1 or draw.random() < 0.5:
+        return lower.contiguous(), None
+    lower = lower.clamp(max=layers - 2)
+    fraction = torch.rand(maps, height, width, dtype=dtype)
+    fraction = torch.where(torch.rand(maps, height, width) < draw.random(), fraction.round(), fraction)
+    return lower.contiguous(), fraction
+
+
+def _weights(labels: Labels, layers: int, *, slope: bool = False) -> Tensor:
+    """(B, D, H, W): what pixels take of each layer, or gain of it on the way to the next one."""
+    lower = one_hot(labels.lower, layers + 1).movedim(-1, 1).double()
+    upper = one_hot(labels.lower + 1, layers + 1).movedim(-1, 1).double()
+    if slope:
+        return (upper - lower)[:, :layers]
+    fraction = torch.zeros(()) if labels.fraction is None else labels.fraction[:, None].double()
+    return ((1 - fraction) * lower + fraction * upper)[:, :layers]
+
+
+def _mixed(light: Tensor, psfs: Tensor, weights: Tensor) -> Tensor:
+    """The definition: a convolution of the whole plane for each layer, and their weighted sum."""
+    layers, channels = psfs.shape[:2]
+    kernels = psfs.flip((-2, -1)).transpose(0, 1).flatten(0, 1)[:, None]
+    blurred = conv2d(light, kernels, groups=channels).unflatten(1, (channels, layers))
+    return torch.einsum("bcdhw,bdhw->bchw", blurred, weights)
+
+
+def _magnitudes(x: Tensor) -> Tensor:
+    return x.double().abs()

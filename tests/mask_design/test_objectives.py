@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum
+from kornia_tidy.mask_design.fisher_information import crlb
+from kornia_tidy.mask_design.objectives import design, design_fisher_mask, point_error, restoration_error
+from kornia_tidy.masks import CubicMask
+from kornia_tidy.masks.initial_heights import fisher_mask
+from kornia_tidy.psf import PSFBank
+from kornia_tidy.psf.psf_model import CodedLens
+from tests.base import BaseTester
+
+COARSE = Fidelity("coarse", pixel_tolerance=0.1, window=33, stray_light="discard")
+
+
+def lens_with(masks, limit=10.0):
+    return CodedLens(masks, DefocusRange(-limit, limit), fidelity=COARSE, spectrum=Spectrum.monochrome())
+
+
+def bank_of(*psfs):
+    """A bank of one channel, in float64."""
+    stack = torch.stack([torch.as_tensor(psf).double() for psf in psfs])[:, None]
+    return PSFBank(stack, torch.arange(len(psfs)).double(), stack.sum((2, 3)))
+
+
+def impulse(size=9, strength=1.0):
+    psf = torch.zeros(size, size, dtype=torch.float64)
+    psf[size // 2, size // 2] = strength
+    return psf
+
+
+class TestDesign(BaseTester):
+    def test_feature_finds_the_least_of_a_parabola(self):
+        masks = PixelwiseMask(1, initial="flat")
+        history = design(masks, lambda: (masks.phase - 0.5).square().mean(), iterations=200, lr_metres=5e-9)
+        assert history[0] == pytest.approx(0.25)
+        assert len(history) == 200
+        self.assert_close(masks.phase.detach(), torch.full((1, 23, 23), 0.5), rtol=0, atol=1e-3)
+
+    def test_feature_the_first_step_is_of_the_learning_rate(self):
+        masks = PixelwiseMask(1, initial="flat")
+        design(masks, lambda: (masks.phase - 9).square().mean(), iterations=1, lr_metres=1e-8)
+        self.assert_close(masks.heights().detach() * 1e8, torch.ones(1, 23, 23))
+
+    def test_feature_the_bound_of_a_lens_falls(self):
+        """Two masks in three colours: nothing is special about one mask and the published setting."""
+        masks = PixelwiseMask(2)
+        lens = CodedLens(masks, DefocusRange(-10, 10), fidelity=COARSE.replace(window=17, layer_spacing=5.0))
+        history = design(masks, lambda: crlb(lens).mean(), iterations=15, lr_metres=3e-8)
+        assert history[-1] < 0.8 * history[0]
+
+    @pytest.mark.parametrize(("name", "options"), [("iterations", {"iterations": 0}), ("lr_metres", {"lr_metres": -1})])
+    def test_exception_counts_and_rates(self, name, options):
+        masks = PixelwiseMask(1)
+        with pytest.raises(ValueError, match=f"{name} must be positive"):
+            design(masks, masks.phase.sum, **options)
+
+
+class TestFisherDesign(BaseTester):
+    def test_feature_beats_the_published_mask_by_far(self):
+        """0.0785 rad for the mask published with PhaseCam3D, in the same setting; half the steps do."""
+        _, bound = design_fisher_mask(seed=0, iterations=75)
+        assert bound < 0.072
+
+    def test_feature_seeds_repeat_and_differ(self):
+        (first, one), (again, same), (_, other) = (design_fisher_mask(seed=s, iterations=3) for s in (0, 0, 1))
+        assert torch.equal(first.phase, again.phase)
+        assert one == same != other
+
+    def test_feature_two_lobes_turn_by_a_quarter_through_focus(self):
+        """The tetrapod of Shechtman et al.: its PSF is long on one axis before focus and on the other one behind it."""
+        with torch.no_grad():
+            psfs = lens_with(PixelwiseMask(initial=fisher_mask())).psf_bank(defocus=[-8.0, 0.0, 8.0]).psfs[:, 0]
+        x = torch.arange(33.0) - 16
+        psfs = psfs * (psfs > 0.2 * psfs.amax((1, 2), keepdim=True))  # the lobes, not the veil around them
+        psfs = psfs / psfs.sum((1, 2), keepdim=True)
+        x, y = (one - (psfs * one).sum((1, 2))[:, None, None] for one in (x[None, None], x[None, :, None]))
+        xx, yy, xy = ((psfs * product).sum((1, 2)) for product in (x * x, y * y, x * y))
+        angle = torch.rad2deg(torch.atan2(2 * xy, xx - yy) / 2)
+        length = torch.hypot(xx - yy, 2 * xy) / (xx + yy)
+        assert bool((length[[0, 2]] > 0.8).all())
+        assert length[1] < 0.2
+        assert abs(float(angle[0] - angle[2])) == pytest.approx(90, abs=3)
+
+    def test_feature_lenses_of_other_pixels_gain_too(self):
+        """The default camera's pixels are 2.5 times as coarse as those it was designed with."""
+        nodes = np.linspace(-10, 10, 11)
+        ours = crlb(lens_with(PixelwiseMask(initial=fisher_mask())), nodes).detach()
+        noise = crlb(lens_with(PixelwiseMask(1)), nodes).detach()
+        plain = crlb(lens_with(PixelwiseMask(1, initial="flat")), [-0.5, 0.5]).detach()  # all but blind in focus
+        assert ours.mean() < 0.6 * noise.mean()
+        assert ours.max() < 1.25 * ours.min()
+        assert ours.max() < 0.5 * plain.min()
+
+    def test_feature_is_better_than_defocus_alone(self):
+        """A plain lens that is focused beside the range is nowhere blind in it, but its images are large."""
+        nodes, wide = np.linspace(-10, 10, 11), COARSE.replace(window=65)
+        plain = CodedLens(PixelwiseMask(1, initial="flat"), fidelity=wide, spectrum=Spectrum.monochrome())
+        ours = crlb(lens_with(PixelwiseMask(initial=fisher_mask())), nodes).detach().mean()
+        for beside in (11, 12, 15):
+            assert ours < 0.7 * crlb(plain, nodes + beside).detach().mean()
+
+    def test_exception_limit(self):
+        with pytest.raises(ValueError, match="limit must be positive and finite radians, got -1"):
+            design_fisher_mask(limit=-1)
+
+
+class TestPointError(BaseTester):
+    def test_feature_literals(self):
+        assert float(point_error(bank_of(impulse()))) == 0
+        assert float(point_error(bank_of(impulse(), torch.zeros(9, 9)))) == 0.5
+        even = torch.full((9, 9), 1 / 81)
+        assert float(point_error(bank_of(even))) == pytest.approx(1 - 1 / 81)
+
+
+class TestRestorationError(BaseTester):
+    def test_feature_is_the_error_of_the_best_filter_written_out(self):
+        """Every frequency by itself, in NumPy: the least of E|1 - G H|² S + |G|² noise² over complex G."""
+        psfs = torch.rand(3, 7, 7, dtype=torch.float64)
+        psfs /= psfs.sum((1, 2), keepdim=True)
+        f = np.fft.fftfreq(14)
+        spectrum = 1 / (f[:, None] ** 2 + f**2 + (1 / 64) ** 2)
+        spectrum /= spectrum.mean()
+        transfer = np.fft.fft2(psfs.numpy(), s=(14, 14))
+        best = (transfer.mean(0).conj() * spectrum) / ((np.abs(transfer) ** 2).mean(0) * spectrum + 0.2**2)
+        error = (np.abs(1 - best * transfer) ** 2).mean(0) * spectrum + np.abs(best) ** 2 * 0.2**2
+        assert float(restoration_error(bank_of(*psfs), noise=0.2)) == pytest.approx(error.mean(), rel=1e-9)
+
+    def test_feature_blur_alone_costs_nothing_without_noise_and_change_does(self):
+        blur = torch.zeros(9, 9, dtype=torch.float64)
+        blur[4, 3:6] = torch.tensor([0.2, 0.6, 0.2])
+        assert float(restoration_error(bank_of(blur, blur), noise=1e-6)) < 1e-9
+        assert float(restoration_error(bank_of(blur, impulse()), noise=1e-6)) > 1e-3
+
+    def test_feature_a_dark_lens_loses_the_scene(self):
+        assert float(restoration_error(bank_of(torch.zeros(9, 9)))) == pytest.approx(1)
+        errors = [float(restoration_error(bank_of(impulse(strength=s)))) for s in (1.0, 0.5, 0.1)]
+        assert errors == sorted(errors)
+
+    def test_feature_where_the_psf_lies_costs_nothing(self):
+        """A filter moves an image back; so the tilt of a mask is free."""
+        moved = impulse().roll((2, -1), (0, 1))
+        assert float(restoration_error(bank_of(moved))) == pytest.approx(float(restoration_error(bank_of(impulse()))))
+
+    def test_feature_cubic_beats_plain_and_design_beats_cubic(self):
+        plain, cubic = PixelwiseMask(1, initial="flat"), CubicMask(15.0)
+        ours = PixelwiseMask(initial=cubic.heights().detach())
+        lens = lens_with(ours)
+        design(ours, lambda: restoration_error(lens.psf_bank()), 60, 1e-8)
+        with torch.no_grad():
+            errors = [float(restoration_error(lens_with(masks).psf_bank())) for masks in (plain, cubic, ours)]
+        assert errors[0] > 1.2 * errors[1] > 1.2 * 1.2 * errors[2]
+
+    @pytest.mark.parametrize("noise", [0, -1, math.inf, math.nan])
+    def test_exception_noise(self, noise):
+        with pytest.raises(ValueError, match="noise must be positive and finite, got"):
+            restoration_error(bank_of(impulse()), noise)
+
+    def test_gradcheck(self):
+        defocus, energy = torch.arange(2.0).double(), torch.ones(2, 1).double()
+        psfs = torch.rand(2, 1, 5, 5)
+        self.gradcheck(lambda p: restoration_error(PSFBank(p, defocus, energy)), (psfs,))
+        self.gradcheck(lambda p: point_error(PSFBank(p, defocus, energy)), (psfs,))

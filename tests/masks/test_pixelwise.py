@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.materials import FUSED_SILICA, constant_index
+from kornia_tidy.psf.psf_model import CodedLens
+from tests.base import BaseTester
+
+
+class TestPixelwiseMask(BaseTester):
+    def test_cardinality(self):
+        for masks, size in ((1, 23), (5, 23), (3, 64)):
+            assert PixelwiseMask(masks, size).phase.shape == (masks, size, size)
+        assert PixelwiseMask(initial=torch.zeros(7, 7)).phase.shape == (1, 7, 7)
+
+    def test_feature_noise_is_the_start_of_the_paper(self):
+        heights = PixelwiseMask(20, 64).heights().detach()
+        assert 0 <= float(heights.min()) < 0.01e-6
+        assert 1.19e-6 < float(heights.max()) <= 1.2e-6
+        assert float(heights.mean()) == pytest.approx(0.6e-6, rel=0.01)
+
+    def test_feature_given_heights_come_back(self):
+        heights = torch.rand(2, 23, 23) * 1e-6
+        for material in (constant_index(1.5), FUSED_SILICA):
+            self.assert_close(PixelwiseMask(initial=heights, material=material).heights(), heights, rtol=1e-6, atol=0)
+
+    def test_feature_the_generator_decides(self):
+        one, two = (PixelwiseMask(generator=torch.Generator().manual_seed(3)).phase for _ in range(2))
+        assert torch.equal(one, two)
+
+    def test_feature_half_precision_keeps_the_height(self):
+        """Radians survive a cast to half; metres of order 1e-7 would not."""
+        masks = PixelwiseMask()
+        before = masks.heights().detach()
+        after = masks.half().heights().detach()
+        assert after.dtype == torch.float32
+        assert float((after - before).abs().max()) < 1e-9
+
+    @pytest.mark.parametrize("initial", ["nois", torch.zeros(3), torch.zeros(0, 4, 4), torch.full((4, 4), math.nan)])
+    def test_exception_initial(self, initial):
+        with pytest.raises(ValueError, match="initial"):
+            PixelwiseMask(initial=initial)
+
+    def test_feature_given_heights_come_back_within_a_constraint(self):
+        heights = torch.rand(2, 23, 31) * 0.9e-6 + 0.05e-6
+        for constraint in ("none", "clamp", "sigmoid", "wrapped"):
+            back = PixelwiseMask(initial=heights, constraint=constraint).heights().detach()
+            self.assert_close(back, heights, rtol=1e-5, atol=1e-12)
+
+    def test_feature_light_passes_through_the_middle_of_a_longer_mask(self):
+        heights = torch.rand(2, 23, 23) * 1e-6
+        wide = torch.rand(2, 23, 41) * 1e-6
+        wide[..., 9:32] = heights
+        banks = [CodedLens(PixelwiseMask(initial=h)).psf_bank(defocus=[-3.0]) for h in (heights, wide, wide.mT)]
+        self.assert_close(banks[1].psfs, banks[0].psfs, rtol=0, atol=1e-7)
+        self.assert_close(banks[2].psfs, banks[0].psfs.mT, rtol=0, atol=1e-5)
+
+    def test_exception_a_mask_that_cannot_be_centred(self):
+        with pytest.raises(ValueError, match="rows and columns of a mask must both be odd or both even, got 4 and 3"):
+            PixelwiseMask(initial=torch.zeros(2, 4, 3))

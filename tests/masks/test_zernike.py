@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import eval_jacobi
+from torch import Tensor
+
+from kornia_tidy.masks.base import mask_axes
+from kornia_tidy.masks.zernike import ZernikeMask, zernike_polynomials
+from kornia_tidy.optics.aperture import circular_aperture
+from tests.base import BaseTester
+
+
+def disc_quadrature(order: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points y, x and weights that average every polynomial of a degree below 2 * order exactly over the disc."""
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    azimuth = 2 * math.pi * torch.arange(2 * order + 1, dtype=torch.float64) / (2 * order + 1)
+    radius = torch.from_numpy(np.sqrt((nodes + 1) / 2))[:, None]
+    share = torch.from_numpy(weights / 2)[:, None].expand(-1, len(azimuth)) / len(azimuth)
+    return radius * azimuth.sin(), radius * azimuth.cos(), share
+
+
+class TestZernikePolynomials(BaseTester):
+    def test_feature_low_orders_equal_their_closed_forms(self):
+        y, x = torch.rand(2, 50, dtype=torch.float64) * 1.4 - 0.7
+        r2 = x**2 + y**2
+        expected = {
+            0: torch.ones_like(x),
+            1: 2 * y,
+            2: 2 * x,
+            3: math.sqrt(6) * 2 * x * y,
+            4: math.sqrt(3) * (2 * r2 - 1),
+            5: math.sqrt(6) * (x**2 - y**2),
+            6: math.sqrt(8) * (3 * x**2 * y - y**3),
+            7: math.sqrt(8) * (3 * r2 - 2) * y,
+            8: math.sqrt(8) * (3 * r2 - 2) * x,
+            9: math.sqrt(8) * (x**3 - 3 * x * y**2),
+            12: math.sqrt(5) * (6 * r2**2 - 6 * r2 + 1),
+            24: math.sqrt(7) * (20 * r2**3 - 30 * r2**2 + 12 * r2 - 1),
+        }
+        polynomials = zernike_polynomials(25, y, x)
+        for index, formula in expected.items():
+            self.assert_close(polynomials[index], formula, rtol=0, atol=1e-13)
+
+    @pytest.mark.parametrize("count", [55, 350])
+    def test_feature_orthonormal_on_the_disc(self, count):
+        y, x, share = disc_quadrature(40)
+        polynomials = zernike_polynomials(count, y, x).flatten(1)
+        gram = polynomials * share.flatten() @ polynomials.T
+        self.assert_close(gram, torch.eye(count, dtype=torch.float64), rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize(("n", "m"), [(25, 1), (24, 0), (25, 25), (60, 2)])
+    def test_feature_high_orders_equal_jacobi_polynomials(self, n, m):
+        """Where factorials cancel each other: the sum of monomials of order 60 has terms of 1e21."""
+        radius = torch.linspace(0, 1, 101, dtype=torch.float64)
+        index = (n * (n + 2) + m) // 2
+        polynomial = zernike_polynomials(index + 1, torch.zeros(()), radius)[index]
+        jacobi = radius.numpy() ** m * eval_jacobi((n - m) // 2, 0, m, 2 * radius.numpy() ** 2 - 1)
+        norm = math.sqrt((2 if m else 1) * (n + 1))
+        self.assert_close(polynomial / norm, torch.from_numpy(jacobi), rtol=0, atol=1e-12)
+
+    def test_exception_number_of_modes(self):
+        with pytest.raises(ValueError, match="num_modes must be positive"):
+            zernike_polynomials(0, torch.zeros(1), torch.zeros(1))
+
+
+class TestZernikeMask(BaseTester):
+    def test_feature_a_coefficient_is_the_root_mean_square_over_the_pupil(self):
+        masks = ZernikeMask(size=400, num_modes=55, initial=torch.eye(55)[1:])
+        open_ = circular_aperture(400, 2.3 / 400).bool()
+        rms = masks.phase.detach()[:, open_].double().square().mean(1).sqrt()
+        self.assert_close(rms, torch.ones(54).double(), rtol=0, atol=0.02)
+
+    def test_feature_pixels_hold_the_value_at_their_centre(self):
+        masks = ZernikeMask(initial=torch.eye(55)[[2, 4]])
+        assert float(masks.phase[0, 11, 21].detach()) == pytest.approx(2.0, abs=1e-6)  # 2 x at x = 1
+        assert float(masks.phase[1, 21, 11].detach()) == pytest.approx(math.sqrt(3), abs=1e-6)
+
+    def test_feature_beyond_the_edge_the_phase_of_the_edge_goes_on(self):
+        masks = ZernikeMask(num_masks=1)
+        corner = masks.phase[0, 0, 22].detach()
+        edge = zernike_polynomials(55, torch.tensor(-(0.5**0.5)).double(), torch.tensor(0.5**0.5).double())
+        self.assert_close(corner, edge @ masks.coefficients[0].detach().double(), rtol=1e-4, atol=1e-4)
+
+    @pytest.mark.parametrize("size", [23, 24, (24, 38), (41, 23)])
+    def test_feature_a_quarter_mirrored_is_the_whole(self, size):
+        """Every one of 350 polynomials, evaluated on all pixels."""
+        y, x = mask_axes(size)
+        inward = torch.hypot(y, x).clamp(min=1)
+        expected = zernike_polynomials(350, y / inward, x / inward)
+        masks = ZernikeMask(size=size, num_modes=350, initial=torch.eye(350))
+        self.assert_close(masks.phase.detach().double(), expected, rtol=0, atol=1e-5)
+
+    def test_feature_noise_is_as_rough_as_the_start_of_the_paper(self):
+        phase = ZernikeMask(200, 100).phase.detach()
+        inside = phase[:, circular_aperture(100, 0.023).bool()]
+        assert float(inside.square().mean().sqrt()) == pytest.approx(2.05, rel=0.05)

@@ -1,0 +1,182 @@
+"""Grey levels, stroke and crosstalk against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
+from kornia_tidy.modulator.phase_panel import (
+    GreyLevels,
+    PixelCrosstalk,
+    StrokeError,
+    crosstalk_kernel,
+    level_phases,
+    nearest_level,
+)
+from tests.base import BaseTester
+
+
+def turns_apart(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Signed difference in radians, modulo 2 pi."""
+    return (a - b + math.pi).remainder(2 * math.pi) - math.pi
+
+
+class TestPanel(BaseTester):
+    @pytest.mark.parametrize("part", [GreyLevels(6), StrokeError(0.9), PixelCrosstalk(0.3)], ids=repr)
+    def test_smoke(self, part, device, dtype):
+        phase = (7 * torch.rand(2, 9, 9)).to(device, dtype)
+        shown = part(phase)
+        assert (shown.shape, shown.device.type, shown.dtype) == (phase.shape, device.type, dtype)
+        self.assert_close(shown, part(phase.double()), rtol=0, atol=1e-5)
+
+
+class TestGreyLevels(BaseTester):
+    def test_exception(self):
+        for bits in (0, 11, 2.0, -1):
+            with pytest.raises(ValueError, match="bits must be a whole number from 1 to 10"):
+                GreyLevels(bits)
+        with pytest.raises(ValueError, match="phase_range must be positive"):
+            GreyLevels(8, phase_range=0)
+        for response in ([1.0], [0.0, float("nan")], [[0.0, 1.0]]):
+            with pytest.raises(ValueError, match="at least two finite phases"):
+                GreyLevels(8, response=response)
+
+    @pytest.mark.parametrize("bits", range(1, 11))
+    def test_feature_error_variance_and_efficiency_are_those_of_theory(self, bits):
+        """A uniform error over one step: variance step^2 / 12, and sinc^2(2^-b) of the light stays together."""
+        wanted = 12 * math.pi * torch.rand(400, 500, dtype=torch.float64) - 20
+        error = turns_apart(GreyLevels(bits)(wanted), wanted)
+        step = 2 * math.pi / 2**bits
+        assert float(error.abs().max()) <= step / 2 + 1e-12
+        assert float(error.square().mean()) == pytest.approx(step**2 / 12, rel=0.02)
+        efficiency = float(error.cos().mean() ** 2 + error.sin().mean() ** 2)
+        assert efficiency == pytest.approx(np.sinc(2.0**-bits) ** 2, abs=5e-3)
+
+    @pytest.mark.parametrize(("bits", "order"), [(1, 0.4053), (2, 0.8106), (3, 0.9496), (4, 0.9872)])
+    def test_feature_a_stepped_grating_has_goodmans_efficiency(self, bits, order):
+        """Literals of the first order of 2, 4, 8 and 16 steps; the finest step here is 1/1024 of a period."""
+        ramp = 2 * math.pi * (torch.arange(1024, dtype=torch.float64) + 0.5) / 1024
+        shown = GreyLevels(bits)(ramp)
+        first = torch.polar(torch.ones_like(ramp), shown - ramp).mean()
+        assert float(first.abs() ** 2) == pytest.approx(order, abs=1e-4)
+
+    @pytest.mark.parametrize("bits", [1, 2, 3])
+    def test_feature_the_peak_of_the_psf_falls_by_the_efficiency(self, bits):
+        """A fine ramp keeps its focus off the axis, with sinc^2(2^-b) of the light of the exact ramp."""
+        size = 161  # 17.9 pixels a period: phases fall everywhere in a step
+        ramp = 0.35 * torch.arange(size, dtype=torch.float64).expand(size, size)
+        masks = PixelwiseMask(initial=ramp * 530e-9 / math.pi)
+        fidelity = Fidelity(window=41, layer_spacing=40.0, stray_light="discard")
+        panel = SpatialLightModulator(GreyLevels(bits), DwellTimes())
+        with torch.no_grad():
+            exact, stepped = (
+                TiDyOptics(masks, modulator=m, fidelity=fidelity).psf_bank(1, defocus=[0.0]).psfs[0, 0]
+                for m in (DwellTimes(), panel)
+            )
+        peak = int(exact.argmax())
+        assert abs(peak % 41 - 20) > 5
+        assert float(stepped.flatten()[peak] / exact.max()) == pytest.approx(np.sinc(2.0**-bits) ** 2, abs=0.01)
+
+    @settings(max_examples=100, deadline=None)
+    @given(
+        levels=st.lists(st.floats(0, 9), min_size=1, max_size=20),
+        wanted=st.floats(-30, 30),
+    )
+    def test_feature_the_nearest_level_is_chosen_whatever_their_order(self, levels, wanted):
+        phases = torch.tensor(levels, dtype=torch.float64)
+        target = torch.tensor(wanted, dtype=torch.float64)
+        chosen = phases[nearest_level(target, phases)]
+        assert abs(float(turns_apart(chosen, target))) <= float(turns_apart(phases, target).abs().min()) + 1e-9
+
+    def test_feature_a_short_stroke_shows_its_nearer_end(self):
+        panel = GreyLevels(8, phase_range=math.pi)
+        top = math.pi * 255 / 256
+        shown = panel(torch.tensor([1.3 * math.pi, 1.9 * math.pi]))
+        self.assert_close(shown, torch.tensor([top, 0.0]))
+
+    def test_feature_a_measured_response_is_written_through(self):
+        """Frames written through the curve show what was wanted, to half a local step."""
+        grey = np.linspace(0, 1, 17)
+        curve = 2.2 * math.pi * grey**1.8
+        panel = GreyLevels(10, response=curve.tolist())
+        wanted = 2 * math.pi * torch.rand(2, 23, 23, dtype=torch.float64)
+        frames = panel.frames(wanted).numpy()
+        assert frames.min() >= 0
+        assert frames.max() <= 1023
+        shown = np.interp(frames / 1023, grey, curve)
+        widest = 2.2 * math.pi * np.diff(grey**1.8).max() * 16 / 1023  # step between levels, on the steepest piece
+        assert float(turns_apart(torch.from_numpy(shown), wanted).abs().max()) < widest / 2
+        self.assert_close(panel(wanted), torch.from_numpy(shown), rtol=0, atol=1e-12)
+
+    def test_feature_the_gradient_goes_straight_through(self):
+        phase = torch.rand(2, 3, 3, requires_grad=True)
+        GreyLevels(1)(phase).sum().backward()
+        assert torch.equal(phase.grad, torch.ones_like(phase))
+
+    def test_feature_half_precision_masks_are_shown_exactly(self):
+        panel = GreyLevels(10).half()
+        self.assert_close(panel(torch.full((1, 1, 1), 3.0)), torch.full((1, 1, 1), 489 * 2 * math.pi / 1024))
+
+    def test_dynamo(self):
+        panel, phase = GreyLevels(3), 6 * torch.rand(2, 5, 5)
+        compiled = torch.compile(panel, backend="eager", fullgraph=True)
+        self.assert_close(compiled(phase), panel(phase), rtol=0, atol=0)
+
+    def test_feature_level_phases_wrap_after_the_last(self):
+        phases = level_phases(4)
+        self.assert_close(phases.diff(), torch.full((15,), math.pi / 8, dtype=torch.float64))
+        assert int(nearest_level(torch.tensor(2 * math.pi - 0.01), phases)) == 0
+
+
+class TestStrokeError(BaseTester):
+    def test_exception(self):
+        with pytest.raises(ValueError, match="gain must be positive"):
+            StrokeError(0.0)
+
+    @pytest.mark.parametrize("gain", [0.9, 1.05])
+    def test_feature_a_blazed_grating_loses_the_closed_form(self, gain):
+        """First order of a ramp of g 2 pi: sinc^2(1 - g)."""
+        ramp = 2 * math.pi * (torch.arange(4096, dtype=torch.float64) + 0.5) / 4096
+        shown = StrokeError(gain)(ramp)
+        first = torch.polar(torch.ones_like(ramp), shown - ramp).mean()
+        assert float(first.abs() ** 2) == pytest.approx(np.sinc(1 - gain) ** 2, abs=1e-6)
+
+
+class TestPixelCrosstalk(BaseTester):
+    def test_exception(self):
+        with pytest.raises(ValueError, match="sigma must be positive"):
+            PixelCrosstalk(0.0)
+
+    @pytest.mark.parametrize("sigma", [0.1, 0.4, 1.5])
+    def test_feature_the_kernel_is_the_mean_of_a_blurred_pixel(self, sigma):
+        """Pixel 0 alone, blurred by SciPy's Gaussian, averaged over each pixel by SciPy's quadrature."""
+        kernel = crosstalk_kernel(sigma)
+        reach = len(kernel) // 2
+        for d in range(-min(reach, 3), min(reach, 3) + 1):
+            edges = (d - 0.5, d + 0.5)
+            blurred = quad(lambda x: norm.cdf((x + 0.5) / sigma) - norm.cdf((x - 0.5) / sigma), *edges, epsabs=1e-12)
+            assert float(kernel[d + reach]) == pytest.approx(blurred[0], abs=1e-9)
+        assert float(kernel.sum()) == pytest.approx(1, abs=1e-12)
+
+    def test_feature_even_masks_stay_and_steps_are_rounded(self):
+        crosstalk = PixelCrosstalk(0.5)
+        even = torch.full((2, 9, 9), 1.7)
+        self.assert_close(crosstalk(even), even, rtol=0, atol=1e-6)
+        step = torch.zeros(1, 9, 9)
+        step[..., 5:] = 2 * math.pi
+        shown = crosstalk(step)[0, 4]
+        assert bool((shown.diff() >= 0).all())
+        assert float(shown[4]) == pytest.approx(2 * math.pi - float(shown[5]), abs=1e-5)
+        assert 0.3 < float(shown[4]) < 2.0
+
+    def test_gradcheck(self):
+        self.gradcheck(PixelCrosstalk(0.3), (torch.rand(2, 5, 5),))

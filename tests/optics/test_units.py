@@ -1,0 +1,462 @@
+"""Wrong units and ranges: each is told with the remedy, and real scenes raise no alarm."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from kornia_tidy import (
+    DefocusRange,
+    DwellTimes,
+    Fidelity,
+    PixelwiseMask,
+    SensorNoise,
+    SpatialLightModulator,
+    Spectrum,
+    ThinLensCamera,
+    TiDyOptics,
+)
+from kornia_tidy.camera.burst import burst
+from kornia_tidy.camera.motion import moving_capture
+from kornia_tidy.cli import main
+from kornia_tidy.data import DeadLeaves
+from kornia_tidy.data.depth_files import read_depth, write_depth
+from kornia_tidy.data.pfm import encode_pfm
+from kornia_tidy.inference.trained import check_weights
+from kornia_tidy.masks import ZernikeMask
+from kornia_tidy.masks.initial_heights import initial_heights
+from kornia_tidy.modulator.modulator import LearnableDwellTimes
+from kornia_tidy.modulator.switching import Switching
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction import PhaseCam3DUNet
+from kornia_tidy.systems import SYSTEMS
+from tests.base import BaseTester, shared
+from tests.scenes import ENTRIES, load_scene
+
+INF = math.inf
+
+
+def camera(**options):
+    options = {"masks": PixelwiseMask(1, initial="flat"), "fidelity": "draft", **options}
+    return TiDyOptics(**options)
+
+
+def scene(depth=0.8, size=64, dtype=torch.float32, device="cpu"):
+    return torch.rand(1, 3, size, size, dtype=dtype, device=device), torch.full(
+        (1, 1, size, size), depth, dtype=dtype, device=device
+    )
+
+
+class TestDepth(BaseTester):
+    @pytest.mark.parametrize(
+        ("near", "far", "said"),
+        [
+            (700, 1500, "700 m away, .* infinity: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
+            (500, 65535, "are these millimetres"),
+            (70, 150, "70 m away, .*: are these centimetres.* by 0.01 .*--depth-scale 0.01"),
+        ],
+    )
+    def test_feature_other_units_are_told_once(self, near, far, said, device, dtype):
+        optics, (image, depth) = camera().to(device), scene(near, dtype=dtype, device=device)
+        depth[..., :20] = far
+        with pytest.warns(UserWarning, match=said) as told:
+            optics(image, depth)
+        assert len(told) == 1
+        optics(image, depth)
+
+    def test_feature_all_beyond_a_camera_s_range_are_told_by_their_unit(self):
+        optics = camera(camera=ThinLensCamera.for_scene((0.5, 4.0)))
+        with pytest.warns(UserWarning, match=r"no difference from 4 m: are these millimetres") as told:
+            optics(*scene(900.0))
+        assert len(told) == 1
+
+    def test_feature_a_large_picture_taken_in_bands_is_told_too(self):
+        optics = camera(memory_budget=1)
+        with pytest.warns(UserWarning, match="are these millimetres"), torch.no_grad():
+            optics(*scene(900.0, size=160))
+
+    @pytest.mark.parametrize(
+        ("depths", "options"),
+        [
+            ((0.5, 3.0), {}),
+            ((2.0, 400.0), {}),  # a street
+            ((30.0, INF), {}),  # a landscape under a sky
+            ((INF, INF), {}),
+            ((60.0, 2000.0), {"camera": ThinLensCamera(0.3, 0.1, 100.0, depth_range=(50.0, INF))}),  # a long lens
+            ((3.9, 4.0), {"camera": ThinLensCamera.for_scene((0.5, 4.0))}),
+            ((0.0, 1.0), {"camera": DefocusRange()}),
+            ((900.0, 900.0), {"check_inputs": False}),
+        ],
+    )
+    def test_feature_real_depths_raise_no_alarm(self, depths, options):
+        image, depth = scene(depths[0])
+        depth[..., 30:] = depths[1]
+        camera(**options)(image, depth)
+
+    def test_exception_a_normalised_camera_says_what_metres_need(self):
+        with pytest.raises(ValueError, match=r"normalised disparity in \[0, 1\], got 1.5.*: metres need a ThinLens"):
+            camera(camera=DefocusRange())(*scene(1.5))
+
+    def test_exception_a_lens_for_millimetres_is_refused(self):
+        with pytest.raises(ValueError, match=r"700 to 1500 m need an aperture of 0.188 m .* millimetres, .* 0.001"):
+            ThinLensCamera.for_scene((700.0, 1500.0))
+
+    @pytest.mark.filterwarnings("default")
+    def test_smoke_command_says_it_in_a_line(self, tmp_path, capsys):
+        cv2.imwrite(str(tmp_path / "rgb.png"), np.full((80, 80, 3), 90, np.uint8))
+        cv2.imwrite(str(tmp_path / "depth.png"), np.full((80, 80), 1100, np.uint16))
+        args = ["simulate", str(tmp_path / "rgb.png"), "--depth", str(tmp_path / "depth.png"), "--fidelity", "draft"]
+        assert main([*args, "-o", str(tmp_path / "out.png"), "--masks", "1"]) == 0
+        told = capsys.readouterr().err.splitlines()
+        assert [line for line in told if "--depth-scale 0.001" in line and line.startswith("kornia-tidy: warning: ")]
+        assert not any(".py" in line for line in told)
+
+
+class TestImage(BaseTester):
+    @pytest.mark.parametrize("color_space", ["srgb", "paper"])
+    @pytest.mark.parametrize(("value", "said"), [(255.0, "255: divide 8-bit"), (1e30, r"1e\+30: divide 8-bit")])
+    def test_exception_codes_beyond_white(self, color_space, value, said, device, dtype):
+        optics, (image, depth) = camera(color_space=color_space), scene(dtype=dtype, device=device)
+        image[0, 1, 2, 3] = value
+        with pytest.raises(ValueError, match=f"image must hold values from 0 to 1, got {said}"):
+            optics(image, depth)
+        with pytest.raises(ValueError, match="image must hold values from 0 to 1"):
+            burst(optics, image, depth)
+        with pytest.raises(ValueError, match="image must hold values from 0 to 1"):
+            moving_capture(optics, image[:, None], depth[:, None])
+
+    def test_exception_light_that_sums_to_infinity(self):
+        image, depth = scene()
+        with pytest.raises(ValueError, match=r"within 1e\+30 .*, got 3e\+38"):
+            camera(color_space="linear", sensor=None)(image * 0 + 3e38, depth)
+
+    def test_feature_light_beyond_white_passes_where_it_is_linear(self):
+        image, depth = scene()
+        assert camera(color_space="linear", sensor=None)(1e4 * image, depth).isfinite().all()
+
+    @pytest.mark.parametrize("color_space", ["srgb", "linear"])
+    def test_feature_normalised_images_are_told_once(self, color_space, device, dtype):
+        optics, (image, depth) = camera(color_space=color_space), scene(dtype=dtype, device=device)
+        with pytest.warns(UserWarning, match=r"undo that first: image \* std \+ mean") as told:
+            optics((image - 0.45) / 0.225, depth)
+        assert len(told) == 1
+        optics((image - 0.45) / 0.225, depth)
+
+    def test_feature_codes_a_little_beyond_white_are_told(self):
+        image, depth = scene()
+        with pytest.warns(UserWarning, match=r"from 0 to 1, got 3"):
+            camera()(image * 0 + 3, depth)
+
+    def test_feature_noise_and_overshoot_raise_no_alarm(self):
+        image, depth = scene()
+        camera()(1.4 * image - 0.2, depth)
+        camera(color_space="linear", sensor=None)(2.7 * image - 0.8, depth)
+        camera(check_inputs=False)(255 * image, depth)
+
+    @pytest.mark.parametrize(("whole", "scale"), [(torch.uint8, 255), (torch.int32, 65535)])
+    def test_exception_whole_numbers_say_how_to_convert(self, whole, scale):
+        image, depth = scene()
+        with pytest.raises(TypeError, match=rf"image must be floating .*: convert it with image.float\(\) / {scale}$"):
+            camera()(image.to(whole), depth)
+        with pytest.raises(TypeError, match=r"convert it with depth.float\(\) \* 0.001 if it is in millimetres"):
+            camera()(image, depth.to(torch.int32))
+
+    @pytest.mark.parametrize(
+        ("shape", "remedy"),
+        [
+            ((1, 4, 64, 64), r"drop alpha with image\[:, :3\]"),
+            ((4, 64, 64), r"drop alpha with image\[:3\]"),
+            ((1, 64, 64, 3), r"channels first with image.permute\(0, 3, 1, 2\)$"),
+            ((64, 64, 3), r"channels first with image.permute\(2, 0, 1\)$"),
+            ((64, 64, 4), r"channels first with image.permute\(2, 0, 1\)\[:3\]$"),
+        ],
+    )
+    def test_exception_layout_says_what_to_do(self, shape, remedy):
+        depth = torch.ones(1, 64, 64) if len(shape) == 3 else torch.ones(1, 1, 64, 64)
+        with pytest.raises(ValueError, match=remedy):
+            camera()(torch.rand(shape), depth)
+        if len(shape) == 4:
+            with pytest.raises(ValueError, match=remedy):
+                PhaseCam3DUNet(width=2)(torch.rand(shape))
+
+    def test_exception_depth_layout_says_what_to_do(self):
+        image, _ = scene()
+        with pytest.raises(ValueError, match=r"depth.unsqueeze\(-3\)"):
+            camera()(image, torch.ones(1, 64, 64))
+        with pytest.raises(ValueError, match=r"depth.permute\(0, 3, 1, 2\)"):
+            camera()(image, torch.ones(1, 64, 64, 1))
+
+    @pytest.mark.parametrize(("low", "high", "said"), [(0, 255, "divide by 255"), (-2.1, 2.6, "undo that first")])
+    def test_feature_a_network_is_told_once(self, low, high, said, device):
+        head, image = PhaseCam3DUNet(width=2).to(device), torch.linspace(low, high, 3 * 32 * 32, device=device)
+        with pytest.warns(UserWarning, match=said) as told:
+            head(image.view(1, 3, 32, 32))
+        assert len(told) == 1
+        head(image.view(1, 3, 32, 32))
+
+    def test_dynamo_does_not_look(self):
+        image = 255 * torch.rand(1, 3, 32, 32)
+        torch.compile(PhaseCam3DUNet(width=2).eval(), fullgraph=True, backend="eager")(image)
+
+
+class TestLens(BaseTester):
+    @pytest.mark.parametrize(
+        ("options", "said"),
+        [
+            (
+                {"focal_length": 50, "aperture_diameter": 2.8, "focus_distance": 600},
+                "focal_length must be metres between 1e-05 and 10 .50 mm is 50e-3., got 50",
+            ),
+            ({"aperture_diameter": 2.8}, "aperture_diameter must be at most 0.1 m, which is f/0.5, .*got 2.8"),
+            ({"aperture_diameter": 28}, "aperture_diameter must be metres between"),
+            ({"pixel_pitch": 8}, "pixel_pitch must be metres between 1e-07 and 0.001 .8 um is 8e-6., got 8"),
+            ({"pixel_pitch": 8e-3}, "pixel_pitch must be metres between"),
+        ],
+    )
+    def test_exception_lengths_in_other_units(self, options, said):
+        with pytest.raises(ValueError, match=said):
+            ThinLensCamera(**options)
+
+    @pytest.mark.parametrize(
+        ("options", "said"),
+        [
+            ({"focal_length": "50 mm"}, "focal_length must be a number in metres, got '50 mm'"),
+            ({"focus_distance": None}, "focus_distance must be a number in metres, got None"),
+            ({"depth_range": 5}, "depth_range must be two numbers, .near, far. in metres, got 5"),
+            ({"lens_material": "PMMA"}, "lens_material must be a material such as .*, got 'PMMA'"),
+        ],
+    )
+    def test_exception_types(self, options, said):
+        with pytest.raises(TypeError, match=said):
+            ThinLensCamera(**options)
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {"focal_length": 2e-3, "aperture_diameter": 2e-3, "focus_distance": 4e-3},  # a microscope's objective
+            {"focal_length": 3.9, "aperture_diameter": 0.28, "focus_distance": INF, "depth_range": (1e4, INF)},
+            {"focal_length": 4e-3, "aperture_diameter": 2e-3, "pixel_pitch": 0.56e-6},  # a telephone
+        ],
+    )
+    def test_feature_real_lenses_pass(self, options):
+        ThinLensCamera(**options)
+
+    def test_exception_too_much_defocus_is_refused_before_any_work(self):
+        wide = ThinLensCamera(aperture_diameter=50e-3)
+        with pytest.raises(ValueError, match=r"needs 6226 layers of PSFs 573 px wide, .* at most 4096 and 650 px"):
+            camera(camera=wide)
+        with pytest.raises(ValueError, match="at most 4096"):
+            camera(fidelity=Fidelity(layer_spacing=1e-3))
+
+    @pytest.mark.parametrize("call", [lambda: PixelwiseMask(1, constraint="clamp", max_height=1.2)])
+    def test_exception_heights_in_micrometres(self, call):
+        with pytest.raises(ValueError, match=r"max_height must be metres between .* .1 um is 1e-6., got 1.2"):
+            call()
+        with pytest.raises(ValueError, match=r"initial heights must be metres within 0.001 .1 um is 1e-6., got 1"):
+            PixelwiseMask(initial=torch.ones(1, 23, 23))
+        with pytest.raises(ValueError, match=r"lr_metres must be metres between .* .10 nm is 10e-9., got 10"):
+            camera().parameter_groups(lr_metres=10)
+
+    def test_exception_switching_time_in_milliseconds(self):
+        with pytest.raises(ValueError, match=r"switching_time must be .*seconds up to 10 .4 ms is 4e-3., got 20"):
+            Switching(20, exposure=100)
+
+    def test_exception_wavelengths_in_nanometres(self):
+        with pytest.raises(ValueError, match=r"wavelengths must be metres between .* .530 nm is 530e-9., got 530"):
+            Spectrum((530,), ((1,),))
+
+
+class TestTypes(BaseTester):
+    @pytest.mark.parametrize(
+        ("name", "value", "said"),
+        [
+            ("masks", 5, r"masks must be phase masks such as PixelwiseMask\(5\), got the number 5"),
+            ("masks", ThinLensCamera(), "masks must be phase masks .*, got a ThinLensCamera"),
+            ("camera", "lens", "camera must be a camera such as .*, got 'lens'"),
+            ("camera", PixelwiseMask(1), "camera must be a camera such as .*, got a PixelwiseMask"),
+            ("modulator", 5, r"modulator must be a modulator such as DwellTimes\(\), got the number 5"),
+            ("sensor", 0.01, r"sensor must be a sensor such as SensorNoise\(0.01\), .*, got the number 0.01"),
+            ("fidelity", 3, "fidelity must be a Fidelity or one of 'paper', .*, got the number 3"),
+            ("spectrum", (530e-9,), "spectrum must be a Spectrum such as .*, got a tuple"),
+            ("aperture", 23, "aperture must be a tensor .*, got the number 23"),
+            ("memory_budget", "1 GB", "memory_budget must be a number in bytes, got '1 GB'"),
+        ],
+    )
+    def test_exception_arguments_of_the_camera(self, name, value, said):
+        with pytest.raises(TypeError, match=said):
+            TiDyOptics(**{name: value})
+
+    def test_exception_unknown_fidelity(self):
+        with pytest.raises(ValueError, match="fidelity must be one of 'paper'"):
+            TiDyOptics(fidelity="best")
+
+    def test_exception_a_part_is_swapped_for_another_kind(self):
+        optics = camera()
+        with pytest.raises(TypeError, match=r"masks must be phase masks"):
+            optics.masks = DwellTimes()
+        with pytest.raises(TypeError, match=r"fidelity must be a Fidelity .*, got 'draft'"):
+            optics.fidelity = "draft"
+
+    def test_exception_generators(self):
+        optics, (image, depth) = camera(), scene()
+        calls = [
+            lambda: optics(image, depth, generator=0),
+            lambda: optics.draw(image, generator=0),
+            lambda: TiDyOptics.from_preset("tidy-5", generator=0),
+            lambda: PixelwiseMask(generator=0),
+            lambda: ZernikeMask(generator=0),
+            lambda: initial_heights("noise", generator=0),
+            lambda: SensorNoise()(image, generator=0),
+            lambda: burst(optics, image, depth, generator=0),
+        ]
+        for call in calls:
+            with pytest.raises(TypeError, match=r"such as torch.Generator\(\).manual_seed\(0\), got the number 0"):
+                call()
+
+    def test_exception_dwell_times(self):
+        for kind in (DwellTimes, LearnableDwellTimes):
+            with pytest.raises(TypeError, match=r"a number for each mask, such as \(3, 1\), got the number 5"):
+                kind(5)
+
+    def test_feature_a_panel_without_parts_shows_each_mask_as_long(self):
+        phase = torch.rand(4, 23, 23)
+        states, weights = SpatialLightModulator(fill_factor=0.93)(phase)
+        assert torch.equal(states, phase)
+        assert weights.tolist() == [0.25] * 4
+
+    def test_exception_a_part_of_a_panel(self):
+        with pytest.raises(TypeError, match=r"each part of a modulator must be a module such as .*, got the number 5"):
+            SpatialLightModulator(5)
+
+
+class TestNotANumber(BaseTester):
+    def test_exception_masks_at_a_capture(self, device, dtype):
+        optics = camera().to(device, dtype)
+        with torch.no_grad():
+            optics.masks.phase[0, 3, 4] = math.nan
+        with pytest.raises(ValueError, match="the phase of the masks must be finite, got nan"):
+            optics(*scene(dtype=dtype, device=device))
+
+    def test_exception_dwell_times_at_a_capture(self):
+        optics = camera(masks=PixelwiseMask(2), modulator=LearnableDwellTimes((1, 1)))
+        with torch.no_grad():
+            optics.modulator.logits[0] = math.nan
+        with pytest.raises(ValueError, match="the weights of the modulator must be finite"):
+            optics(*scene())
+
+    def test_exception_masks_that_are_loaded(self):
+        state = camera().state_dict()
+        state["masks.phase"] = torch.full_like(state["masks.phase"], math.inf)
+        with pytest.raises(ValueError, match="must be finite, got inf"):
+            camera().load_state_dict(state)
+
+    def test_exception_a_checkpoint_s_weights(self):
+        head = nn.Linear(2, 1)
+        weights = {**head.state_dict(), "bias": torch.tensor([math.nan])}
+        with pytest.raises(ValueError, match=r"a.ckpt does not fit: bias holds NaN or infinity"):
+            check_weights(head, weights, "a.ckpt")
+
+    @pytest.mark.parametrize("name", ["psfs", "defocus", "energy", "veil"])
+    def test_exception_psf_banks(self, name, tmp_path):
+        tensors = {
+            "psfs": torch.ones(2, 3, 1, 1),
+            "defocus": torch.tensor([-1.0, 1.0]),
+            "energy": torch.ones(2, 3),
+            "veil": torch.zeros(2, 3),
+        }
+        tensors[name].view(-1)[1] = math.nan
+        PSFBank(**tensors).save(tmp_path / "bank.safetensors")
+        with pytest.raises(ValueError, match=f"{name} of .*bank.safetensors must be finite, got nan"):
+            PSFBank.load(tmp_path / "bank.safetensors")
+        if name in ("psfs", "defocus"):
+            with pytest.raises(ValueError, match="must be finite"):
+                PSFBank.from_measured(tensors["psfs"], tensors["defocus"])
+
+
+class TestDepthFiles(BaseTester):
+    @staticmethod
+    def disparity():
+        """As Middlebury's: 20 to 60 px, unknown here and there."""
+        values = np.random.default_rng(0).uniform(20, 60, (40, 40)).astype(np.float32)
+        values[np.random.default_rng(1).uniform(size=(40, 40)) < 0.1] = np.inf
+        return values
+
+    def test_feature_a_disparity_read_as_metres_is_told_once_a_folder(self, tmp_path):
+        for name in ("a.pfm", "b.pfm"):
+            (tmp_path / name).write_bytes(encode_pfm(self.disparity()))
+        with pytest.warns(UserWarning, match=r"a.pfm holds infinity, .*--depth-kind disparity --invalid inf") as told:
+            read_depth(tmp_path / "a.pfm")
+        assert len(told) == 1
+        read_depth(tmp_path / "b.pfm")
+
+    def test_feature_disparities_skies_and_rooms_raise_no_alarm(self, tmp_path):
+        path = tmp_path / "a.pfm"
+        path.write_bytes(encode_pfm(self.disparity()))
+        read_depth(path, kind="disparity", focal_px=1000.0, baseline_m=0.1)
+        read_depth(path, invalid=[INF])
+        sky = np.full((40, 40), 30, np.float32)
+        sky[:15, :30] = sky[18, 4:9] = np.inf  # and below a branch
+        path.write_bytes(encode_pfm(sky))
+        assert read_depth(path).valid.all()
+        path.write_bytes(encode_pfm(self.disparity() / 20))
+        read_depth(path)
+
+    def test_feature_maps_without_a_number_raise_no_alarm(self, tmp_path):
+        (tmp_path / "a.pfm").write_bytes(encode_pfm(np.full((8, 8), np.inf, np.float32)))
+        assert read_depth(tmp_path / "a.pfm").valid.all()
+
+    @pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry["invalid"] == "inf"])
+    def test_feature_real_disparities_without_their_options_are_told(self, name, tmp_path):
+        path = shutil.copy(shared(f"data/{ENTRIES[name]['depth']}"), tmp_path)
+        with pytest.warns(UserWarning, match="kind='disparity'"):
+            read_depth(path)
+
+    def test_feature_65535_taken_for_a_depth_is_told(self, tmp_path):
+        cv2.imwrite(str(tmp_path / "a.png"), np.array([[700, 65535], [900, 4000]], np.uint16))
+        with pytest.warns(UserWarning, match=r"holds 65535 where its other values end at 4000, .*--invalid 65535"):
+            read_depth(tmp_path / "a.png", 0.001)
+
+    def test_feature_65535_that_is_meant_raises_no_alarm(self, tmp_path):
+        path = tmp_path / "a.png"
+        cv2.imwrite(str(path), np.array([[700, 65535], [900, 4000]], np.uint16))
+        assert read_depth(path, 0.001, invalid=[65535]).valid.sum() == 3
+        cv2.imwrite(str(path), np.array([[700, 65535], [900, 64000]], np.uint16))
+        assert read_depth(path, 0.001).valid.all()
+        write_depth(path, torch.tensor([[[0.25, INF]]]), 0.001, saturate=True)
+        assert read_depth(path, 0.001).valid.all()
+
+
+class TestNoFalseAlarm(BaseTester):
+    """Warnings are errors here, as in all tests."""
+
+    @pytest.mark.parametrize("name", ENTRIES)
+    def test_feature_real_scenes(self, name):
+        found = load_scene(name)
+        step = max(1, min(found.image.shape[1:]) // 96)
+        image, depth = found.image[:, ::step, ::step].contiguous(), found.depth[:, ::step, ::step].contiguous()
+        near, far = float(depth.min()), float(depth.max())
+        with warnings.catch_warnings():
+            # Of the default range and of windows something may be said; of units nothing.
+            warnings.filterwarnings("ignore", message=".*beyond the camera's range|the largest PSF window")
+            for lens in (ThinLensCamera(), ThinLensCamera.for_scene((near, max(far, 1.1 * near)))):
+                camera(camera=lens)(image, depth)
+            nearness = (1 / depth - 1 / far) / (1 / near - 1 / far)
+            camera(camera=DefocusRange())(image, nearness.clamp(0, 1))
+
+    def test_feature_dead_leaves(self):
+        for item in range(4):
+            leaves = DeadLeaves(4, 64, 64, seed=3)[item]
+            camera()(leaves["image"], leaves["depth"])
+
+    @pytest.mark.parametrize("name", SYSTEMS)
+    def test_feature_presets(self, name):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*beyond the camera's range|the largest PSF window")
+            TiDyOptics.from_preset(name, fidelity="draft")(*scene(1.5))

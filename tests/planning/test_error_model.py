@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import pytest
+import scipy.ndimage
+import scipy.special
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.planning.depth_energy import Depths, octave_filters
+from kornia_tidy.planning.error_model import (
+    LayerErrors,
+    change_error,
+    chebyshev_nodes,
+    chebyshev_weights,
+    layer_coefficients,
+    nodes_needed,
+)
+from kornia_tidy.planning.psf_samples import CameraSurvey
+from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, coarser, natural_power, power_spectrum
+from kornia_tidy.render.compositing import render
+from tests.base import BaseTester
+
+FLAT = Depths(torch.zeros(1, 1, 4, 4), -20, 20, "reflect")
+
+
+def one_depth(power: torch.Tensor) -> SceneLight:
+    """Light of a power spectrum, all at one depth."""
+    octaves = (power[:, None] * octave_filters(power.shape[-2])).sum((-2, -1))
+    return SceneLight(power, FLAT.psi, octaves[..., None])
+
+
+class TestInterpolation(BaseTester):
+    @settings(max_examples=20, deadline=None)
+    @given(st.floats(-30, 0), st.floats(1, 40), st.integers(2, 12))
+    def test_property_polynomials_are_exact(self, lo, length, count):
+        nodes = chebyshev_nodes(lo, lo + length, count)
+        at = torch.cat([torch.linspace(lo, lo + length, 7, dtype=torch.float64), nodes])
+        polynomial = torch.special.chebyshev_polynomial_t(2 * (at - lo) / length - 1, count - 1)
+        known = torch.special.chebyshev_polynomial_t(2 * (nodes - lo) / length - 1, count - 1)
+        self.assert_close(chebyshev_weights(at, nodes) @ known, polynomial, atol=1e-9, rtol=0)
+
+    @pytest.mark.parametrize(("half_range", "bandwidth"), [(20.0, 1.3), (8.0, 1.1), (1.0, 2.2), (100.0, 1.5)])
+    def test_feature_enough_nodes_for_the_bandwidth(self, half_range, bandwidth):
+        """The terms left out of exp(i b L t) in Chebyshev polynomials are 2 J_n(bL)."""
+        left_out = scipy.special.jv(range(nodes_needed(half_range, bandwidth), 1000), half_range * bandwidth)
+        assert 2 * abs(left_out).sum() < 1e-5
+
+    def test_feature_surveyed_psfs_carry_those_of_every_defocus(self):
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
+        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, CameraSurvey(optics, 3).geometry(Fidelity()).bandwidth))
+        psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
+        with torch.no_grad():
+            direct, known = (optics.psf_bank(3, None, at).psfs for at in (psi, tuple(nodes.tolist())))
+        surveyed = torch.einsum("an,ncpq->acpq", chebyshev_weights(torch.tensor(psi).double(), nodes), known.double())
+        assert float((surveyed - direct).abs().sum((-2, -1)).max()) < 1e-4
+
+    def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
+        """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
+        optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
+        assert 1.05**2 * 530 / 470 <= CameraSurvey(optics, 1).geometry(Fidelity()).bandwidth <= 1.2 * 530 / 470
+
+
+class TestPower(BaseTester):
+    @settings(max_examples=20, deadline=None)
+    @given(st.integers(9, 24), st.integers(9, 24), st.sampled_from([1, 3, 5]), st.integers(0, 1000))
+    def test_property_power_times_filter_is_the_mean_square(self, height, width, side, seed):
+        generator = torch.Generator().manual_seed(seed)
+        light = torch.rand(2, 1, height, width, dtype=torch.float64, generator=generator)
+        kernel = torch.randn(side, side, dtype=torch.float64, generator=generator)
+        kernel -= kernel.mean()
+        blurred = [scipy.ndimage.convolve(plane[0].numpy(), kernel.numpy(), mode="wrap") for plane in light]
+        expected = sum((plane**2).mean() for plane in blurred) / 2
+        size = 2 * side + 1  # no shift of the kernel against itself reaches round
+        response = torch.fft.rfft2(kernel, s=(size, size)).abs().square()
+        self.assert_close(
+            (power_spectrum(light, "circular", size) * response).sum(), torch.tensor(expected), atol=1e-12
+        )
+
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "zero"])
+    def test_feature_borders_are_accounted_for(self, border):
+        """A small image and a wide blur, where half of the light is made up."""
+        generator = torch.Generator().manual_seed(0)
+        light = torch.rand(1, 1, 30, 30, dtype=torch.float64, generator=generator)
+        kernel = torch.ones(15, 15, dtype=torch.float64) / 225
+        kernel[7, 7] -= 1
+        mode = {"reflect": "mirror", "replicate": "nearest", "zero": "constant"}[border]
+        measured = (scipy.ndimage.convolve(light[0, 0].numpy(), kernel.numpy(), mode=mode) ** 2).mean()
+        response = torch.fft.rfft2(kernel, s=(31, 31)).abs().square()
+        assert 0.9 < float((power_spectrum(light, border, 31) * response).sum()) / measured < 1.6
+
+    def test_feature_large_images_are_read_in_blocks(self, monkeypatch):
+        light = torch.rand(1, 1, 64, 48, dtype=torch.float64)
+        whole = power_spectrum(light, "reflect", 7)
+        monkeypatch.setattr("kornia_tidy.planning.scene_light._BLOCK", 32)
+        self.assert_close(power_spectrum(light, "reflect", 7).sum(), whole.sum(), rtol=0.05, atol=0)
+
+    def test_feature_a_typical_photograph_has_its_contrast_and_slope(self):
+        power = natural_power(2, 64)
+        assert float(power[0].sum()) == pytest.approx(CONTRAST**2)
+        assert float(power[1, 0, 4] / power[1, 0, 8]) == pytest.approx(4)
+
+    @pytest.mark.parametrize("border", ["reflect", "circular"])
+    def test_feature_a_veil_leaves_the_mean_and_takes_what_varies(self, border):
+        """What a veil of a tenth changes in an image: a tenth of its deviation from its mean, however slow."""
+        light = torch.linspace(0, 1, 60, dtype=torch.float64).expand(1, 1, 60, 60)
+        light_there = one_depth(power_spectrum(light, border, 64))
+        error = change_error((0.0,), -0.1 * torch.ones(1, 1, 1, 1), light_there)
+        assert error == pytest.approx(0.1 * float(light.std(correction=0)), rel=0.05)
+
+    @pytest.mark.parametrize("sizes", [(20, 10), (21, 10), (21, 9), (15, 12)])
+    def test_feature_a_coarser_grid_is_that_of_the_image(self, sizes):
+        """On white noise without any correlation, whose covariance at all other shifts is small on both grids."""
+        light = torch.rand(1, 2, 48, 48, dtype=torch.float64)
+        fine, coarse = (power_spectrum(light, "reflect", size) for size in sizes)
+        self.assert_close(coarser(fine, sizes[1]), coarse, atol=1e-12, rtol=1e-9)
+
+    def test_feature_one_depth_is_the_image_and_two_have_outlines(self):
+        """Of white light, which one depth leaves alone."""
+        white = torch.ones(1, 1, 20, 20)
+        for defocus, least, most in ((torch.zeros(1, 1, 20, 20), -1e-6, 1e-6), (torch.rand(1, 1, 20, 20), 0.1, 1)):
+            depths = Depths(defocus, -20, 20, "circular")
+            (energies,) = SceneLight.seen(white, depths, "circular", 15, "scatter").energies
+            assert least < float(torch.einsum("cjbb->", energies)) < most
+
+
+class TestLayers(BaseTester):
+    @pytest.mark.parametrize("layers", ["nearest", "linear", "cubic", "bandlimited"])
+    def test_feature_a_pixel_takes_what_the_camera_gives_it(self, layers):
+        """Against the capture of a point: the PSF that the camera makes of its layers."""
+        fidelity = Fidelity(window=15, layers=layers, layer_spacing=1.0, stray_light="discard", double=True)
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, color_space="linear", border="zero")
+        survey, psi = CameraSurvey(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
+        weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, survey.band)
+        point = torch.zeros(1, 3, 15, 15, dtype=torch.float64)
+        point[..., 7, 7] = 1
+        with torch.no_grad():
+            psf = torch.einsum("an,ncpq->acpq", weights, optics.psf_bank(3, torch.float64, tuple(at)).psfs)
+            bank = optics.scene_bank(3, torch.float64, psi)
+            mode = "nearest" if layers == "nearest" else "linear"
+            coded = render(point, psi.expand(1, 1, 15, 15), bank, layers=mode, border="zero")
+        self.assert_close(coded, psf, atol=1e-12, rtol=0)
+
+    def test_feature_differences_are_those_of_convolved_images(self):
+        """Two constant PSFs, of which the scene takes different shares."""
+        generator = torch.Generator().manual_seed(0)
+        light = torch.rand(1, 1, 24, 24, dtype=torch.float64, generator=generator)
+        psfs = torch.randn(2, 1, 3, 3, generator=generator)
+        errors = LayerErrors(torch.tensor([-1.0, 1.0]), psfs, one_depth(power_spectrum(light, "circular", 64)))
+        ours, theirs = torch.tensor([[0.3, 0.7]]).double(), torch.tensor([[0.6, 0.4]]).double()
+        kernel = torch.einsum("an,ncpq->pq", ours - theirs, psfs.double())
+        varying = light[0, 0] - light.mean()
+        expected = (scipy.ndimage.convolve(varying.numpy(), kernel.numpy(), mode="wrap") ** 2).mean() ** 0.5
+        assert errors(ours, theirs) == pytest.approx(expected, rel=0.05)  # a tenth of the shape is a photograph's

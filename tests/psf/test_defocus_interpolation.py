@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import CubicHermiteSpline
+
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.psf.defocus_interpolation import (
+    defocus_band,
+    fine_layer_matrix,
+    fine_nodes,
+    interpolated_bank,
+    interpolation_matrix,
+)
+from kornia_tidy.psf.psf_bank import PSFBank
+from tests.base import BaseTester
+
+BAND = defocus_band(1.0, 470e-9, 530e-9)
+
+
+class TestInterpolationMatrix(BaseTester):
+    @pytest.mark.parametrize("band", [None, BAND])
+    def test_property_white_stays_white_and_samples_stay_themselves(self, band):
+        targets = tuple(np.random.default_rng(0).uniform(10, 30, 50).tolist())
+        weights = np.array(interpolation_matrix(0.0, 2.0, 21, targets, band))
+        assert np.abs(weights.sum(1) - 1).max() < 1e-12
+        on_node = np.array(interpolation_matrix(0.0, 2.0, 21, (14.0, 20.0), band))
+        assert np.abs(on_node - np.eye(21)[[7, 10]]).max() < 2e-3
+
+    def test_feature_cubic_is_the_hermite_spline_with_central_slopes(self):
+        samples = np.random.default_rng(1).normal(size=12)
+        spline = CubicHermiteSpline(np.arange(12), samples, np.gradient(samples))
+        targets = np.random.default_rng(2).uniform(1, 10, 30)
+        got = np.array(interpolation_matrix(0.0, 1.0, 12, tuple(targets.tolist()), None)) @ samples
+        assert np.abs(got - spline(targets)).max() < 1e-12
+
+    def test_feature_waves_within_the_band_are_met(self):
+        nodes, targets = np.arange(-30, 31, 2.0), np.random.default_rng(3).uniform(-15, 15, 40)
+        weights = np.array(interpolation_matrix(-30.0, 2.0, 31, tuple(targets.tolist()), BAND))
+        for share in (0.1, 0.5, 0.9):
+            error = weights @ np.exp(1j * share * BAND * nodes) - np.exp(1j * share * BAND * targets)
+            assert np.abs(error).max() < 5e-3
+        beyond = weights @ np.exp(2.5j * BAND * nodes) - np.exp(2.5j * BAND * targets)
+        assert np.abs(beyond).max() > 0.5
+
+    def test_gradcheck_reaches_the_bank(self):
+        nodes = tuple(float(i) for i in range(12))
+
+        def energies(psfs):
+            bank = PSFBank(psfs, torch.tensor(nodes, dtype=psfs.dtype), psfs.sum((2, 3)))
+            return interpolated_bank(bank, nodes, (14 / 3, 5.0), BAND).psfs
+
+        self.gradcheck(energies, (torch.rand(12, 1, 3, 3),))
+
+
+class TestFineLayerMatrix(BaseTester):
+    @pytest.mark.parametrize("spacing", [1.0, 0.9, 0.5])
+    def test_property_lines_between_layers_meet_waves_to_a_sixteenth_of_the_bend(self, spacing):
+        """Lines through points of the wave itself are off by an eighth of its bend times their length^2."""
+        samples, wave = -10 + spacing * np.arange(60), lambda x: np.exp(0.9j * BAND * x)
+        layers = np.array([x for x in fine_nodes(samples.tolist()) if -5 < x < 20])
+        weights = np.array(fine_layer_matrix(-10.0, spacing, 60, tuple(layers.tolist()), BAND))
+        psi = np.random.default_rng(5).uniform(-4, 19, 400)
+        found = np.interp(psi, layers, weights @ wave(samples))
+        bend = (0.9 * BAND * (layers[1] - layers[0])) ** 2
+        error = np.abs(found - wave(psi))
+        assert 0.9 * bend / 16 < error.max() < 1.1 * bend / 16
+        assert np.sqrt((error**2).mean()) < 0.05 * bend
+
+
+class TestContinuousDepth(BaseTester):
+    """L1 error of the PSF a pixel gets, for a random mask, against the PSF computed for its own depth."""
+
+    LIMITS = (  # layers, spacing, mean, worst
+        ("nearest", 2.0, 0.13, 0.22),
+        ("linear", 2.0, 0.05, 0.08),
+        ("cubic", 2.0, 0.02, 0.035),
+        ("cubic", 1.0, 2e-3, 4e-3),
+        ("bandlimited", 2.0, 2e-3, 3.5e-3),
+        ("bandlimited", 1.0, 7e-4, 1.3e-3),
+    )
+
+    @pytest.mark.parametrize(("layers", "spacing", "mean", "worst"), LIMITS)
+    @torch.no_grad()
+    def test_feature_psf_error_of_each_kind_of_layers(self, layers, spacing, mean, worst):
+        torch.manual_seed(1)
+        masks = PixelwiseMask(2)
+        fidelity = Fidelity(layers=layers, layer_spacing=spacing, window=31, stray_light="discard")
+        optics = TiDyOptics(masks, sensor=None, color_space="linear", fidelity=fidelity)
+        point = torch.zeros(1, 3, 61, 61)
+        point[..., 30, 30] = 1
+        errors = []
+        for psi in np.random.default_rng(4).uniform(-20, 20, 20):
+            depth = 1 / (psi * 530e-9 / (np.pi * optics.camera.aperture_radius**2) + 1 / 0.595)
+            got = optics(point, torch.full((1, 1, 61, 61), depth))[..., 15:46, 15:46]
+            expected = optics.psf_bank(defocus=(float(psi),)).psfs
+            errors.append((got - expected).abs().sum((2, 3)) / expected.sum((2, 3)))
+        assert float(torch.stack(errors).mean()) < mean
+        assert float(torch.stack(errors).max()) < worst
+
+    def test_exception_samples_too_far_apart_for_the_band(self):
+        with pytest.raises(ValueError, match=r"layer_spacing below 2\.79 rad for this aperture and 470 nm, got 3\.0"):
+            TiDyOptics(fidelity=Fidelity(layers="bandlimited", layer_spacing=3.0))
+
+    def test_dynamo_a_band_limited_capture_is_one_graph(self):
+        fidelity = Fidelity(layers="bandlimited", window=5)
+        optics = TiDyOptics(PixelwiseMask(1), DefocusRange(-2, 2), sensor=None, fidelity=fidelity)
+        image, depth = torch.rand(1, 3, 12, 14), torch.rand(1, 1, 12, 14)
+        compiled = torch.compile(optics, fullgraph=True, backend="eager")
+        self.assert_close(compiled(image, depth), optics(image, depth))

@@ -1,0 +1,254 @@
+"""The matrix transform against analytic optics, lentil and SciPy. All in float64."""
+
+from __future__ import annotations
+
+import math
+
+import lentil
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+from scipy.special import j0, j1
+
+from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.psf.propagation import (
+    cell_integrals,
+    gauss_legendre,
+    gauss_legendre_order,
+    pixel_energies,
+    pixel_frequencies,
+    sensor_kernels,
+)
+from tests.base import BaseTester
+
+DISC_CELLS, DISC_PITCH = 512, 2.02 / 512
+
+
+def point_intensity(field: torch.Tensor, psi: float, frequency: torch.Tensor, pitch: float) -> torch.Tensor:
+    """Intensity at points, not pixels: |K field K^T|^2."""
+    highest = float(frequency.abs().max())
+    kernel = cell_integrals([psi], frequency, highest, field.shape[-1], pitch)[0]
+    return (kernel @ field.to(torch.complex128) @ kernel.mT).abs().square()
+
+
+class TestGaussLegendre(BaseTester):
+    @pytest.mark.parametrize("half_range", [0.0, 0.5, 3.0, 40.0])
+    def test_feature_integrates_waves_within_the_tolerance(self, half_range):
+        for tolerance in (1e-2, 1e-9):
+            nodes, weights = gauss_legendre(gauss_legendre_order(half_range, tolerance))
+            b = torch.linspace(0, half_range, 101, dtype=torch.float64)
+            mean = (torch.cos(2 * b[:, None] * nodes) * weights).sum(-1)
+            assert float((mean - torch.sinc(b / math.pi)).abs().max()) <= 2 * tolerance
+
+    def test_feature_one_point_is_enough_for_a_constant(self):
+        assert gauss_legendre_order(0.0, 1e-9) == 1
+
+
+class TestCellIntegrals(BaseTester):
+    @pytest.mark.parametrize("psi", [0.0, 7.0, -60.0, 2000.0])
+    def test_feature_equals_adaptive_quadrature(self, psi):
+        frequency = torch.tensor([-13.7, 0.0, 4.2], dtype=torch.float64)
+        got = cell_integrals([psi], frequency, 13.7, 5, 0.4)[0]
+        for i, u in enumerate(frequency.tolist()):
+            for n in range(5):
+                lo, hi = (n - 2.5) * 0.4, (n - 1.5) * 0.4
+                real, imag = (
+                    quad(lambda x, u=u, f=f: f(psi * x * x - 2 * math.pi * u * x), lo, hi, limit=2000, epsabs=1e-11)[0]
+                    for f in (math.cos, math.sin)
+                )
+                assert abs(complex(got[i, n]) - complex(real, imag)) < 1e-9
+
+    def test_gradcheck_in_frequency(self):
+        frequency = torch.tensor([-3.0, 0.1, 2.0])
+        self.gradcheck(lambda u: torch.view_as_real(cell_integrals([5.0, -2.0], u, 3.1, 6, 0.3)), (frequency,))
+
+
+@pytest.fixture(scope="module")
+def disc() -> torch.Tensor:
+    return circular_aperture(DISC_CELLS, DISC_PITCH, edges="area")
+
+
+class TestAgainstAnalyticOptics(BaseTester):
+    def test_feature_airy_pattern_and_its_zeros(self, disc):
+        v = torch.cat([torch.linspace(0.01, 6, 120), torch.tensor([1.21967, 2.23313, 3.23832])]).double()
+        intensity = point_intensity(disc, 0.0, torch.cat([torch.zeros(1).double(), v / 2]), DISC_PITCH)
+        slice_x = intensity[0, 1:] / intensity[0, 0]
+        airy = torch.from_numpy((2 * j1(np.pi * v.numpy()) / (np.pi * v.numpy())) ** 2)
+        assert float((slice_x - airy).abs().max()) < 1e-4
+        assert float(slice_x[-3:].max()) < 1e-4
+        diagonal = intensity.diagonal()[1:] / intensity[0, 0]
+        airy = torch.from_numpy((2 * j1(np.pi * 2**0.5 * v.numpy()) / (np.pi * 2**0.5 * v.numpy())) ** 2)
+        assert float((diagonal - airy).abs().max()) < 1e-4
+
+    def test_feature_encircled_energies_of_the_airy_rings(self, disc):
+        step, window = 0.02, 181
+        kernels = sensor_kernels([0.0], step, window, DISC_CELLS, DISC_PITCH, 1.0, 1e-6)
+        light = pixel_energies(disc[None].to(torch.complex128), torch.ones(1), kernels)[0]
+        light = light / (disc.square().sum() * DISC_PITCH**2)
+        for v, expected in ((1.21967, 0.837785), (2.23313, 0.909931), (3.23832, 0.937647)):
+            inside = circular_aperture(window, step, radius=v / 2, edges="area")
+            assert abs(float((light * inside).sum()) - expected) < 2e-3
+            assert abs(expected - (1 - j0(np.pi * v) ** 2 - j1(np.pi * v) ** 2)) < 1e-5
+
+    @pytest.mark.parametrize("psi", [0.5, 1.0, 3.0, 2 * math.pi, 10.0, 20.0])
+    def test_feature_on_axis_intensity_with_defocus(self, disc, psi):
+        axis = torch.zeros(1, dtype=torch.float64)
+        got = point_intensity(disc, psi, axis, DISC_PITCH) / point_intensity(disc, 0.0, axis, DISC_PITCH)
+        assert abs(float(got) - (math.sin(psi / 2) / (psi / 2)) ** 2) < 1e-4
+
+    @pytest.mark.parametrize("psi", [0.0, 3.0, 20.0])
+    def test_feature_defocus_otf_of_a_square_pupil(self, psi):
+        """Goodman, section 6.4: (1 - s) sinc(4 psi / pi s (1 - s)) on each axis, s the share of the cut-off."""
+        u = torch.arange(-500, 501, dtype=torch.float64) * 0.2
+        cells = 23
+        kernel = cell_integrals([psi], u, 100.0, cells, 2 / cells)[0]
+        line = (kernel @ torch.ones(cells, dtype=torch.complex128)).abs().square() * 0.2 / 2
+        for s in (0.1, 0.25, 0.5, 0.75, 0.9):
+            otf = float((line * torch.cos(2 * math.pi * 2 * s * u)).sum())
+            assert abs(otf - (1 - s) * np.sinc(4 * psi / math.pi * s * (1 - s))) < 1e-4
+
+    def test_feature_cubic_mask_keeps_its_mtf_through_focus(self):
+        """Dowski and Cathey 1995, with 90 (x^3 + y^3) and a square pupil, which makes each axis a problem of its own.
+
+        The MTF at a shift of t pupil radii is |int exp(i (3 a t x^2 + 2 psi t x)) dx| / 2 over |x| < 1 - t/2. The ends
+        of that integral make ripples, of 12 % at single frequencies, which the average over frequencies does not have.
+        """
+        cells, step = 2048, 0.2
+        u = torch.arange(-700, 701, dtype=torch.float64) * step
+        x = (torch.arange(cells, dtype=torch.float64) - (cells - 1) / 2) * (2 / cells)
+        shift = torch.arange(0.2, 1.2, 0.02, dtype=torch.float64)
+        wave = torch.exp(-2j * math.pi * shift[:, None] * u)
+
+        def mtf(psi: float, pupil: torch.Tensor) -> torch.Tensor:
+            line = (cell_integrals([psi], u, 140.0, cells, 2 / cells)[0] @ pupil).abs().square()
+            return ((wave * line).sum(-1) / line.sum()).abs()
+
+        def exact(psi: float, t: float) -> float:
+            x = np.linspace(t / 2 - 1, 1 - t / 2, 20001)
+            return abs(np.trapezoid(np.exp(1j * (3 * 90 * t * x**2 + 2 * psi * t * x)), x)) / 2
+
+        cubic, clear = torch.exp(90j * x**3), torch.ones(cells, dtype=torch.complex128)
+        focus, at = mtf(0.0, cubic), int((shift - 0.6).abs().argmin())
+        assert abs(float(focus[at]) / math.sqrt(math.pi / (12 * 90 * 0.6)) - 1) < 0.01  # stationary phase
+        for psi in (15.0, 30.0):
+            got = mtf(psi, cubic)
+            assert max(abs(float(g) - exact(psi, float(t))) for g, t in zip(got, shift, strict=True)) < 1e-3
+            assert abs(float(got[at] / focus[at]) - 1) < 0.06
+            assert abs(float(got.mean() / focus.mean()) - 1) < 0.06
+        assert float(mtf(30.0, clear).mean() / mtf(0.0, clear).mean()) < 0.1  # without the mask contrast is lost
+
+    @pytest.mark.parametrize("psi", [60.0, 200.0])
+    def test_feature_geometric_disc_of_strong_defocus(self, psi):
+        """Half of the light of a uniform disc of radius psi / pi cycles lies within that radius / sqrt(2)."""
+        cells, window = 92, 161
+        disc = circular_aperture(cells, 2.3 / cells, edges="area")
+        step = 2.4 * psi / math.pi / window
+        kernels = sensor_kernels([psi], step, window, cells, 2.3 / cells, 1.0, 1e-4)
+        light = pixel_energies(disc[None].to(torch.complex128), torch.ones(1), kernels)[0]
+        light = light / (disc.square().sum() * (2.3 / cells) ** 2)
+        lo, hi = 0.0, 1.2 * psi / math.pi
+        for _ in range(40):
+            middle = (lo + hi) / 2
+            within = float((light * circular_aperture(window, step, radius=middle, edges="area")).sum())
+            lo, hi = (middle, hi) if within < 0.5 else (lo, middle)
+        assert abs(lo * math.sqrt(2) / (psi / math.pi) - 1) < 0.01
+
+
+class TestAgainstLentil(BaseTester):
+    def test_feature_equals_lentil_on_the_same_grid(self):
+        """Lentil samples the pupil at points; the integral over flat cells differs by the cell's sinc, exactly."""
+        size, padded, wavelength, diameter, focal = 65, 260, 530e-9, 2.835e-3, 50e-3
+        pitch = 2 / (size - 1)  # pupil radii
+        x = (np.arange(size) - size // 2) * pitch
+        grid_x, grid_y = np.meshgrid(x, x)
+        open_ = (np.hypot(grid_x, grid_y) <= 1 + 1e-9) * 1.0
+        phase = open_ * (6 * np.hypot(grid_x, grid_y) ** 2 + 1.7 * grid_x**3 + grid_y)
+        dx = diameter / (size - 1)
+        pupil = lentil.Pupil(amplitude=open_, opd=phase * wavelength / (2 * np.pi), pixelscale=dx, focal_length=focal)
+        scale = wavelength * focal / (padded * dx)
+        wave = lentil.Wavefront(wavelength) * pupil
+        theirs = lentil.propagate_dft(wave, pixelscale=scale, shape=(129, 129), oversample=1).intensity
+
+        u = (torch.arange(129, dtype=torch.float64) - 64) / (padded * pitch)
+        field = torch.from_numpy(open_ * np.exp(1j * phase))
+        sinc = torch.sinc(u * pitch).square()
+        ours = point_intensity(field, 0.0, u, pitch) / (sinc[:, None] * sinc) / pitch**4
+        ours, theirs = ours.numpy() / ours.max().item(), theirs / theirs.max()
+        assert np.abs(ours - theirs).max() < 1e-12
+
+
+class TestPixelEnergies(BaseTester):
+    @staticmethod
+    def psf(phase: torch.Tensor, psi: float, window: int = 31, step: float = 0.39) -> torch.Tensor:
+        disc = circular_aperture(phase.shape[-1])
+        kernels = sensor_kernels([psi], step, window, phase.shape[-1], 0.1, 1.05, 1e-6)
+        field = disc * torch.exp(1j * phase.double())
+        light = pixel_energies(
+            field.reshape(-1, *field.shape[-2:]), torch.full((phase[..., 0, 0].numel(),), 1.0), kernels
+        )
+        return light[0] / (disc.sum() * 0.01)
+
+    @pytest.fixture
+    def phase(self):
+        return torch.rand(23, 23, dtype=torch.float64) * 7.1
+
+    @pytest.mark.parametrize("psi", [3.0, 20.0, 60.0])
+    def test_feature_flat_mask_cannot_tell_near_from_far(self, psi):
+        flat = torch.zeros(23, 23)
+        assert float((self.psf(flat, psi) - self.psf(flat, -psi)).abs().max()) < 1e-12
+
+    def test_feature_a_random_mask_can(self, phase):
+        assert float((self.psf(phase, 20.0) - self.psf(phase, -20.0)).abs().sum()) > 0.1
+
+    @pytest.mark.parametrize("psi", [0.0, -13.0])
+    def test_feature_rotating_the_mask_rotates_the_psf(self, phase, psi):
+        rotated = self.psf(torch.rot90(phase), psi)
+        assert float((rotated - torch.rot90(self.psf(phase, psi))).abs().max()) < 1e-12
+
+    def test_feature_conjugate_field_mirrors_the_psf(self, phase):
+        mirrored = self.psf(-phase, -9.0)
+        assert float((mirrored - self.psf(phase, 9.0).flip(0, 1)).abs().max()) < 1e-12
+
+    def test_convention_tilt_along_x_moves_the_psf_to_larger_columns(self):
+        x = (torch.arange(23) - 11) * 0.1
+        step, shift = 0.39, 4
+        tilt = 2 * math.pi * step * shift * x  # radians; the light moves by tilt's slope / 2 pi
+        for phase, where in ((tilt.expand(23, 23), (15, 19)), (tilt[:, None].expand(23, 23), (19, 15))):
+            psf = self.psf(phase, 0.0, step=step)
+            assert divmod(int(psf.argmax()), 31) == where
+
+    def test_feature_states_add_by_weight(self):
+        phases = torch.rand(3, 23, 23, dtype=torch.float64) * 7
+        weights = torch.tensor([0.2, 0.5, 0.3])
+        kernels = sensor_kernels([4.0], 0.39, 21, 23, 0.1, 1.05, 1e-6)
+        fields = torch.exp(1j * phases)
+        together = pixel_energies(fields, weights, kernels)
+        alone = sum(
+            w * pixel_energies(f[None], torch.ones(1), kernels) for w, f in zip(weights.double(), fields, strict=True)
+        )
+        self.assert_close(together, alone, rtol=1e-12, atol=1e-12)
+
+    def test_feature_chunks_do_not_change_the_result_or_its_gradient(self, monkeypatch):
+        fields = torch.exp(1j * torch.rand(2, 23, 23, dtype=torch.float64)).requires_grad_()
+        kernels = sensor_kernels([-4.0, 0.0, 4.0], 0.39, 11, 23, 0.1, 1.05, 1e-3)
+        whole = pixel_energies(fields, torch.ones(2), kernels)
+        (expected,) = torch.autograd.grad(whole.square().sum(), fields)
+        monkeypatch.setattr("kornia_tidy.psf.wave_energy._BLOCK_SAMPLES", 1)
+        monkeypatch.setattr("kornia_tidy.psf.mutual_intensity._BLOCK_NUMBERS", 1)
+        chunked = pixel_energies(fields, torch.ones(2), kernels)
+        (got,) = torch.autograd.grad(chunked.square().sum(), fields)
+        self.assert_close(chunked, whole, rtol=1e-12, atol=0)
+        assert float((got - expected).abs().max() / expected.abs().max()) < 1e-12
+
+    def test_gradcheck(self):
+        kernels = sensor_kernels([3.0], 0.5, 5, 6, 0.3, 0.9, 1e-3)
+        phase = torch.rand(2, 6, 6)
+        weights = torch.tensor([0.4, 0.6])
+        self.gradcheck(lambda p, w: pixel_energies(torch.polar(torch.ones_like(p), p), w, kernels), (phase, weights))
+
+    def test_feature_pixel_frequencies_are_centred_and_spaced(self):
+        u = pixel_frequencies(0.5, 5, 3).reshape(5, 3)
+        self.assert_close(u.mean(1), torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0]))
+        assert bool((u.diff() > 0).all())
+        assert bool((u[:, 2] - u[:, 0] < 0.5).all())

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from kornia_tidy import PSFBank, TiDyOptics
+from kornia_tidy.psf.psf_bank import enclosing_window
+from tests.base import BaseTester
+
+
+@pytest.fixture
+def bank() -> PSFBank:
+    psfs = torch.rand(4, 3, 7, 7) / 60
+    return PSFBank(psfs, torch.linspace(-3, 3, 4), psfs.sum((2, 3)))
+
+
+class TestPSFBank(BaseTester):
+    def test_feature_renormalized_psfs_sum_to_one_and_energy_stays(self, bank):
+        whole = bank.with_stray_light("renormalize")
+        self.assert_close(whole.psfs.sum((2, 3)), torch.ones(4, 3))
+        assert torch.equal(whole.energy, bank.energy)
+        assert whole.veil is None
+
+    def test_feature_veil_keeps_the_light_that_leaves(self, bank):
+        veiled = bank.with_stray_light("veil")
+        self.assert_close(veiled.psfs.sum((2, 3)) + veiled.veil, torch.ones(4, 3))
+        assert bank.with_stray_light("discard").veil is None
+
+    def test_feature_a_psf_without_light_stays_finite(self):
+        dark = PSFBank(torch.zeros(1, 1, 3, 3), torch.zeros(1), torch.zeros(1, 1)).with_stray_light("renormalize")
+        assert float(dark.psfs.abs().max()) == 0
+
+    @pytest.mark.parametrize("kind", ["renormalize", "veil"])
+    def test_feature_saved_and_loaded_it_is_the_same(self, bank, kind, tmp_path):
+        bank = bank.with_stray_light(kind)
+        bank.save(tmp_path / "bank.safetensors")
+        again = PSFBank.load(tmp_path / "bank.safetensors")
+        for name in ("psfs", "defocus", "energy", "veil"):
+            one, two = getattr(bank, name), getattr(again, name)
+            assert (one is None and two is None) or torch.equal(one, two)
+
+    def test_feature_a_bank_with_gradients_can_be_saved(self, tmp_path):
+        TiDyOptics().psf_bank().save(tmp_path / "bank.safetensors")
+        assert PSFBank.load(tmp_path / "bank.safetensors").psfs.requires_grad is False
+
+    def test_exception_unreadable_files(self, bank, tmp_path):
+        path = tmp_path / "bank.safetensors"
+        with pytest.raises(FileNotFoundError, match="no such file"):
+            PSFBank.load(path)
+        path.write_bytes(b"")
+        with pytest.raises(ValueError, match="empty"):
+            PSFBank.load(path)
+        path.write_bytes(b"not a bank, though long enough to have a header")
+        with pytest.raises(ValueError, match="it is no PSF bank or is damaged"):
+            PSFBank.load(path)
+        bank.save(path)
+        path.write_bytes(path.read_bytes()[:-100])
+        with pytest.raises(ValueError, match="it is no PSF bank or is damaged"):
+            PSFBank.load(path)
+        save_file({"weights": torch.ones(3)}, path)
+        with pytest.raises(ValueError, match="is not a PSF bank"):
+            PSFBank.load(path)
+
+    def test_exception_saving_leaves_nothing_behind(self, bank, tmp_path):
+        with pytest.raises(FileNotFoundError, match="no folder"):
+            bank.save(tmp_path / "missing" / "bank.safetensors")
+        assert os.listdir(tmp_path) == []
+
+    @pytest.mark.parametrize(
+        ("psfs", "defocus", "message"),
+        [
+            (torch.ones(2, 3, 4, 4), torch.zeros(2), "P odd"),
+            (torch.ones(2, 3, 5), torch.zeros(2), "P odd"),
+            (torch.ones(2, 3, 5, 5), torch.zeros(3), "defocus must have shape"),
+        ],
+    )
+    def test_exception_shapes(self, psfs, defocus, message):
+        with pytest.raises(ValueError, match=message):
+            PSFBank(psfs, defocus, torch.ones(2, 3))
+
+    def test_feature_measured_psfs_are_scaled(self):
+        bank = PSFBank.from_measured(torch.rand(2, 3, 5, 5) + 1, torch.tensor([-1.0, 2.0]))
+        self.assert_close(bank.psfs.sum((2, 3)), torch.ones(2, 3))
+
+    @pytest.mark.parametrize(
+        ("psfs", "defocus", "message"),
+        [
+            (-torch.ones(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "not negative"),
+            (torch.full((2, 1, 3, 3), torch.nan), torch.tensor([0.0, 1.0]), "finite"),
+            (torch.zeros(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "all zero"),
+            (torch.ones(2, 1, 3, 3), torch.tensor([1.0, 0.0]), "ascend"),
+        ],
+    )
+    def test_exception_measured(self, psfs, defocus, message):
+        with pytest.raises(ValueError, match=message):
+            PSFBank.from_measured(psfs, defocus)
+
+
+class TestEnclosingWindow(BaseTester):
+    def test_feature_equals_the_sum_over_squares(self):
+        psfs = torch.rand(3, 2, 11, 11)
+        psfs = psfs / psfs.sum((2, 3), keepdim=True)
+        for share in (0.05, 0.3, 0.7, 0.99):
+            window = enclosing_window(psfs, share)
+            held = lambda p: float(psfs[..., 5 - p // 2 : 6 + p // 2, 5 - p // 2 : 6 + p // 2].sum((2, 3)).min())  # noqa: E731
+            assert held(window) >= share
+            assert window == 1 or held(window - 2) < share
+
+    def test_feature_none_where_the_light_is_not_there(self):
+        assert enclosing_window(torch.full((1, 3, 3), 0.01), 0.5) is None

@@ -1,0 +1,112 @@
+"""What is remembered between captures: never stale, never in the way of gradients, never more than asked."""
+
+from __future__ import annotations
+
+import pickle
+from unittest.mock import patch
+
+import pytest
+import torch
+
+from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.psf import psf_model as module
+from tests.base import BaseTester
+
+SMALL = Fidelity(window=9, layer_spacing=5.0)
+
+
+@pytest.fixture
+def optics() -> TiDyOptics:
+    return TiDyOptics(PixelwiseMask(2), sensor=None, fidelity=SMALL)
+
+
+def depths_built(optics: TiDyOptics, depth: torch.Tensor) -> int:
+    """Number of depths whose PSFs a capture computes."""
+    image = torch.rand(depth.shape[0], 3, *depth.shape[-2:])
+    built = []
+    real = module.exact_psf_bank
+
+    def spy(*arguments):
+        built.extend(arguments[5])
+        return real(*arguments)
+
+    with patch.object(module, "exact_psf_bank", spy):
+        optics(image, depth)
+    return len(built)
+
+
+class TestOnlyWhatTheSceneRequires(BaseTester):
+    def test_feature_a_flat_scene_needs_the_two_depths_around_it(self, optics):
+        assert len(optics.defocus_nodes) == 9
+        assert depths_built(optics, torch.full((1, 1, 16, 16), 0.5)) == 2
+        assert depths_built(optics, torch.linspace(0.2975, 1e9, 256).reshape(1, 1, 16, 16)) == 9
+
+    @pytest.mark.parametrize("span", [(0.25, 0.26), (0.2975, 0.3), (0.5, 0.595), (0.6, 1.0), (3.0, float("inf"))])
+    def test_feature_present_depths_give_the_capture_of_all_depths(self, optics, span):
+        near, far = span
+        inverse = 1 / far + (1 / near - 1 / far) * torch.rand(1, 1, 20, 24, dtype=torch.float64)
+        image, depth = torch.rand(1, 3, 20, 24, dtype=torch.float64), 1 / inverse
+        optics.check_inputs = False  # no warning of depths beyond the range
+        few = optics(image, depth)
+        with patch.object(module, "nodes_around", lambda nodes, _: nodes):
+            every = optics(image, depth)
+        self.assert_close(few, every, rtol=0, atol=1e-12)
+
+    def test_feature_depth_keeps_its_gradient_on_a_node(self, optics):
+        depth = torch.full((1, 1, 16, 16), 0.595, dtype=torch.float64, requires_grad=True)
+        optics(torch.rand(1, 3, 16, 16, dtype=torch.float64), depth).sum().backward()
+        assert float(depth.grad.abs().max()) > 0
+
+
+class TestBankMemory(BaseTester):
+    @torch.no_grad()
+    def test_feature_without_gradients_each_depth_is_computed_once(self, optics):
+        assert depths_built(optics, torch.full((1, 1, 16, 16), 0.5)) == 2
+        assert depths_built(optics, torch.full((1, 1, 16, 16), 0.5)) == 0
+        assert depths_built(optics, torch.tensor([0.5, 0.7]).reshape(2, 1, 1, 1).expand(2, 1, 16, 16)) == 1
+
+    def test_feature_training_always_computes(self, optics):
+        for _ in range(2):
+            assert depths_built(optics, torch.full((1, 1, 16, 16), 0.5)) == 2
+        with torch.no_grad():
+            optics(torch.rand(1, 3, 16, 16), torch.full((1, 1, 16, 16), 0.5))
+        optics(torch.rand(1, 3, 16, 16), torch.full((1, 1, 16, 16), 0.5)).sum().backward()
+        assert float(optics.masks.phase.grad.abs().max()) > 0
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda o: o.masks.phase.add_(1.0 * torch.rand(23, 23)),
+            lambda o: o.masks.phase.data.mul_(0.5),
+            lambda o: setattr(o, "masks", PixelwiseMask(3)),
+            lambda o: setattr(o, "camera", ThinLensCamera(pixel_pitch=5e-6)),
+            lambda o: setattr(o, "modulator", DwellTimes((1, 4))),
+            lambda o: setattr(o, "fidelity", SMALL.replace(window=11)),
+            lambda o: o.load_state_dict({"masks.phase": torch.rand(2, 23, 23)}),
+        ],
+        ids=["in place", "through data", "masks", "camera", "modulator", "fidelity", "state dict"],
+    )
+    @torch.no_grad()
+    def test_feature_never_stale(self, optics, change):
+        before = optics.psf_bank().psfs
+        change(optics)
+        after = optics.psf_bank().psfs
+        assert after.shape != before.shape or float((after - before).abs().max()) > 1e-4
+        fresh = TiDyOptics(optics.masks, optics.camera, optics.modulator, None, optics.fidelity)
+        self.assert_close(after, fresh.psf_bank().psfs, rtol=0, atol=1e-7)
+
+    def test_feature_what_inference_mode_remembers_serves_training(self, optics):
+        image, depth = torch.rand(1, 3, 16, 16, requires_grad=True), torch.full((1, 1, 16, 16), 0.5)
+        optics.masks.requires_grad_(False)
+        with torch.inference_mode():
+            expected = optics(image, depth)
+        coded = optics(image, depth)
+        coded.sum().backward()
+        assert image.grad is not None
+        self.assert_close(coded, expected)
+
+    @torch.no_grad()
+    def test_feature_it_does_not_travel(self, optics):
+        before = len(pickle.dumps(optics))
+        optics.psf_bank()
+        assert len(pickle.dumps(optics)) < before + 200

@@ -1,0 +1,111 @@
+"""Bands of rows against the whole image, and a camera that takes large pictures within its memory."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.render.bands import padded_band
+from kornia_tidy.render.borders import BORDERS, pad_border
+from kornia_tidy.tradeoff.costs import peak_bytes
+from tests.base import BaseTester
+
+
+class TestPaddedBand(BaseTester):
+    @given(data=st.data())
+    @settings(max_examples=100, deadline=None)
+    def test_property_is_a_part_of_the_padded_image(self, data):
+        radius, border = data.draw(st.integers(0, 4)), data.draw(st.sampled_from(BORDERS))
+        height, width = (data.draw(st.integers(2 * radius + 1, 20)) for _ in range(2))
+        image = torch.rand(2, 3, height, width)
+        whole = pad_border(image, radius, border)
+        top = data.draw(st.integers(0, whole.shape[-2] - 2 * radius - 1))
+        rows = slice(top, data.draw(st.integers(top + 1, whole.shape[-2] - 2 * radius)))
+        band = padded_band(image, rows, radius, border)
+        self.assert_close(band, whole[..., rows.start : rows.stop + 2 * radius, :], rtol=0, atol=0)
+
+
+def make_optics(**options) -> TiDyOptics:
+    torch.manual_seed(3)
+    return TiDyOptics(PixelwiseMask(2), fidelity=Fidelity(window=11, layer_spacing=5.0), **options)
+
+
+def make_scene(height: int, width: int, dtype=torch.float32):
+    image = torch.rand(1, 3, height, width, dtype=dtype)
+    depth = torch.nn.functional.interpolate(torch.rand(1, 1, 9, 9, dtype=dtype) + 0.4, (height, width), mode="bilinear")
+    return image, depth
+
+
+class TestCaptureInBands(BaseTester):
+    @pytest.mark.parametrize("border", BORDERS)
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @torch.no_grad()
+    def test_feature_is_the_capture_at_once(self, border, compositing):
+        optics = make_optics(border=border, compositing=compositing, sensor=SensorNoise(0.02, full_well=5000.0))
+        image, depth = make_scene(301, 67, torch.float64)
+        expected = optics(image, depth, generator=torch.Generator().manual_seed(5))
+        clamped = optics.clamped_pixels
+        optics.memory_budget = 1
+        assert optics._rows_at_once(image, depth) == (None if (compositing, border) == ("occlusion", "zero") else 64)
+        coded = optics(image, depth, generator=torch.Generator().manual_seed(5))
+        self.assert_close(coded, expected, rtol=0, atol=1e-11)
+        assert optics.clamped_pixels == clamped
+
+    @pytest.mark.parametrize("border", BORDERS)
+    @torch.no_grad()
+    def test_feature_stray_light_is_spread_over_the_whole_image(self, border):
+        """Which a band does not know: it goes at once, whatever the budget."""
+        optics = make_optics(border=border, sensor=None)
+        optics = optics.with_fidelity(optics.fidelity.replace(stray_light="veil"))
+        image, depth = make_scene(200, 40, torch.float64)
+        expected = optics(image, depth)
+        optics.memory_budget = 1
+        assert torch.equal(optics(image, depth), expected)
+
+    @torch.no_grad()
+    def test_feature_replayed_noise(self):
+        optics = make_optics()
+        image, depth = make_scene(200, 40, torch.float64)
+        params = optics.draw(image)
+        expected = optics(image, depth, params=params)
+        optics.memory_budget = 1
+        self.assert_close(optics(image, depth, params=params), expected, rtol=0, atol=1e-11)
+
+    @torch.no_grad()
+    def test_feature_an_unbatched_image_and_half_types(self):
+        optics = make_optics(sensor=None)
+        image, depth = make_scene(150, 40)
+        expected = optics(image[0].bfloat16(), depth[0])
+        optics.memory_budget = 1
+        assert torch.equal(optics(image[0].bfloat16(), depth[0]), expected)
+
+    @torch.no_grad()
+    def test_feature_peak_memory_is_within_the_budget(self):
+        optics = make_optics(memory_budget=64 << 20)
+        image, depth = make_scene(3000, 700)
+        optics(image, depth)
+        taken = peak_bytes(lambda: optics(image, depth), image.device)
+        assert taken - 4 * image.numel() <= 64 << 20
+        optics.memory_budget = 1 << 40
+        assert peak_bytes(lambda: optics(image, depth), image.device) > 2 * 64 << 20
+
+    def test_feature_gradients_take_the_image_at_once(self):
+        optics = make_optics(memory_budget=1)
+        image, depth = make_scene(150, 40)
+        assert optics._rows_at_once(image, depth) is None
+        optics(image, depth).sum().backward()
+        assert optics.masks.phase.grad.abs().sum() > 0
+
+    def test_exception_a_wrong_depth_in_the_last_band(self):
+        optics = make_optics(memory_budget=1)
+        image, depth = make_scene(150, 40)
+        depth[..., -1, -1] = -2.0
+        with torch.no_grad(), pytest.raises(ValueError, match=r"depth must be positive metres, got -2\.0"):
+            optics(image, depth)
+
+    def test_exception_the_budget(self):
+        with pytest.raises(ValueError, match="memory_budget must be positive and finite bytes, got 0"):
+            make_optics(memory_budget=0)

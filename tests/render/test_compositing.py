@@ -1,0 +1,284 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import convolve2d
+
+from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.compositing import METHODS, gather, render, scatter
+from tests.base import BaseTester, oracle
+from tests.render.scenes import Bank, brute_render, brute_weights, make_bank, make_scene
+
+COMPOSITINGS = ("gather", "scatter")
+
+
+def one_layer(psf, **options) -> Bank:
+    return Bank(psf[None], torch.zeros(1, dtype=psf.dtype, device=psf.device), **options)
+
+
+class TestRender(BaseTester):
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_smoke_defaults(self, compositing, device, dtype):
+        bank = make_bank(dtype=dtype, device=device)
+        image, defocus = make_scene(bank)
+        coded = render(image, defocus, bank, compositing)
+        assert coded.shape == image.shape
+        assert coded.dtype == dtype
+        assert coded.device == image.device
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize("border", BORDERS)
+    @pytest.mark.parametrize("size", [(7, 8), (8, 7), (16, 5), (9, 9)], ids=str)
+    @pytest.mark.parametrize("channels", [1, 3])
+    def test_cardinality(self, compositing, border, size, channels, device):
+        bank = make_bank(channels=channels, dtype=torch.float32, device=device)
+        lost = 4 if border == "valid" else 0
+        shape = render(*make_scene(bank, 2, *size), bank, compositing, border=border).shape
+        assert shape == (2, channels, size[0] - lost, size[1] - lost)
+
+    # Against models that share no code with the renderer
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize("layers", ["nearest", "linear"])
+    @pytest.mark.parametrize("border", BORDERS)
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_equals_the_sum_over_pixels(self, compositing, layers, border, method, device):
+        for count, channels, size, height, width in ((4, 1, 3, 5, 6), (1, 2, 5, 5, 7), (3, 1, 1, 2, 3)):
+            bank = make_bank(count, channels, size, device=device, light=0.8, veil=True)
+            image, defocus = make_scene(bank, 2, height, width)
+            options = {"compositing": compositing, "layers": layers, "border": border}
+            expected = brute_render(image, defocus, bank, **options)
+            coded = render(image, defocus, bank, method=method, **options)
+            self.assert_close(coded, expected, rtol=0, atol=1e-14)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_equals_the_independent_model(self, compositing, border, method):
+        model = oracle()
+        bank = make_bank(6, 3, 11)
+        image, defocus = make_scene(bank, 1, 33, 40)
+        label = model.nearest(defocus[0, 0].numpy(), bank.defocus.numpy())
+        expected = getattr(model, compositing)(image[0].numpy(), label, bank.psfs.numpy(), border)
+        coded = render(image, defocus, bank, compositing, layers="nearest", border=border, method=method)
+        self.assert_close(coded[0], torch.from_numpy(expected), rtol=0, atol=1e-12)
+
+    def test_feature_correlation_equals_the_independent_model(self):
+        model = oracle()
+        bank = make_bank(6, 3, 11)
+        image, defocus = make_scene(bank, 1, 33, 40)
+        label = model.nearest(defocus[0, 0].numpy(), bank.defocus.numpy())
+        expected = model.gather(image[0].numpy(), label, bank.psfs.numpy(), correlate=True)
+        coded = render(image, defocus, bank, layers="nearest", correlate=True)
+        self.assert_close(coded[0], torch.from_numpy(expected), rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("border", "code"),
+        [
+            ("reflect", cv2.BORDER_REFLECT_101),
+            ("replicate", cv2.BORDER_REPLICATE),
+            ("zero", cv2.BORDER_CONSTANT),
+        ],
+    )
+    def test_feature_gather_equals_opencv_a_layer(self, border, code, device):
+        """OpenCV's filter2D correlates: the PSF is turned for a convolution and left for a correlation."""
+        bank = make_bank(3, 3, 7, device=device)
+        image, defocus = make_scene(bank, 1, 20, 31)
+        planes = image[0].permute(1, 2, 0).cpu().numpy()
+        for correlate in (False, True):
+            expected = np.zeros_like(planes)
+            for d, own in enumerate(brute_weights(defocus[0, 0].cpu().numpy(), bank.defocus.cpu().numpy(), "nearest")):
+                assert own.any()
+                for c in range(3):
+                    psf = bank.psfs[d, c].cpu().numpy()
+                    psf = np.ascontiguousarray(psf if correlate else psf[::-1, ::-1])
+                    expected[..., c] += own * cv2.filter2D(planes[..., c], -1, psf, borderType=code)
+            coded = render(image, defocus, bank, layers="nearest", border=border, correlate=correlate)
+            self.assert_close(coded[0].permute(1, 2, 0).cpu(), torch.from_numpy(expected), rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize(("border", "mode", "boundary"), [("valid", "valid", "fill"), ("circular", "same", "wrap")])
+    def test_feature_equals_scipy_for_one_layer(self, compositing, border, mode, boundary, device):
+        bank = make_bank(1, 2, 9, device=device)
+        image, defocus = make_scene(bank, 1, 12, 15)
+        coded = render(image, defocus, bank, compositing, border=border)
+        for c in range(2):
+            expected = convolve2d(image[0, c].cpu(), bank.psfs[0, c].cpu(), mode=mode, boundary=boundary)
+            self.assert_close(coded[0, c].cpu(), torch.from_numpy(expected), rtol=0, atol=1e-13)
+
+    # Conventions
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize(("correlate", "expected"), [(False, (6, 9)), (True, (4, 5))])
+    def test_convention_a_peak_right_and_below_centre_moves_a_point_right_and_down(
+        self, compositing, correlate, expected, device, dtype
+    ):
+        psf = torch.zeros(1, 5, 5, device=device, dtype=dtype)
+        psf[0, 2 + 1, 2 + 2] = 1
+        image = torch.zeros(1, 1, 11, 13, device=device, dtype=dtype)
+        image[0, 0, 5, 7] = 1
+        coded = render(image, torch.zeros_like(image), one_layer(psf), compositing, correlate=correlate)
+        assert divmod(int(coded.argmax()), 13) == expected
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_convention_an_upper_layer_takes_nearer_pixels(self, compositing, device, dtype):
+        """Layer 0 is black, layer 1 passes light unchanged: only pixels with high defocus are seen."""
+        psfs = torch.zeros(2, 1, 3, 3, device=device, dtype=dtype)
+        psfs[1, 0, 1, 1] = 1
+        bank = Bank(psfs, torch.tensor([-10.0, 10.0], device=device, dtype=dtype))
+        defocus = torch.tensor([-30.0, -10.0, -5.0, 0.0, 10.0, 30.0], device=device, dtype=dtype).view(1, 1, 1, 6)
+        coded = render(torch.ones_like(defocus), defocus, bank, compositing, border="zero")
+        expected = torch.tensor([0, 0, 0.25, 0.5, 1, 1], device=device, dtype=dtype)
+        self.assert_close(coded.flatten(), expected, rtol=0, atol=1e-6)
+
+    # Physics
+
+    @pytest.mark.parametrize("light", [1.0, 0.7])
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "circular", "valid"])
+    def test_property_gather_keeps_white_white(self, light, border, device, dtype):
+        bank = make_bank(6, 3, 7, dtype=dtype, device=device, light=light, veil=light < 1)
+        image, defocus = make_scene(bank, 2, 24, 17)
+        coded = render(torch.ones_like(image), defocus, bank, border=border)
+        atol = 1e-12 if dtype == torch.float64 else 1e-6
+        self.assert_close(coded, torch.ones_like(coded), rtol=0, atol=atol)
+
+    @pytest.mark.parametrize("light", [1.0, 0.7])
+    @pytest.mark.parametrize("layers", ["nearest", "linear"])
+    def test_property_scatter_conserves_flux_on_a_circular_plane(self, light, layers, device, dtype):
+        bank = make_bank(6, 3, 7, dtype=dtype, device=device, light=light, veil=light < 1)
+        image, defocus = make_scene(bank, 2, 24, 17)
+        coded = render(image, defocus, bank, "scatter", layers=layers, border="circular")
+        rtol = 1e-13 if dtype == torch.float64 else 1e-6
+        self.assert_close(coded.mean((-2, -1)), image.mean((-2, -1)), rtol=rtol, atol=0)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @given(a=st.floats(-5, 5), b=st.floats(-5, 5), seed=st.integers(0, 99), border=st.sampled_from(BORDERS))
+    @settings(max_examples=25, deadline=None)
+    def test_property_rendering_is_linear_in_the_image(self, compositing, a, b, seed, border):
+        torch.manual_seed(seed)
+        bank = make_bank(3, 1, 5, light=0.9, veil=True)
+        (first, defocus), (second, _) = make_scene(bank), make_scene(bank)
+        coded = [render(x, defocus, bank, compositing, border=border) for x in (first, second, a * first + b * second)]
+        self.assert_close(coded[2], a * coded[0] + b * coded[1], rtol=0, atol=1e-13)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_property_the_mean_of_renders_is_the_render_of_the_mean_bank(self, compositing, device, dtype):
+        """What lets states be averaged before any image is touched."""
+        banks = [make_bank(6, 3, 7, dtype=dtype, device=device, light=0.8, veil=True) for _ in range(5)]
+        image, defocus = make_scene(banks[0], 2, 24, 17)
+        psfs, veil = (torch.stack([getattr(b, name) for b in banks]).mean(0) for name in ("psfs", "veil"))
+        mean_bank = replace(banks[0], psfs=psfs, veil=veil)
+        mean = torch.stack([render(image, defocus, bank, compositing) for bank in banks]).mean(0)
+        atol = 1e-12 if dtype == torch.float64 else 1e-5
+        self.assert_close(render(image, defocus, mean_bank, compositing), mean, rtol=0, atol=atol)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_property_linear_equals_nearest_on_the_nodes(self, compositing, device, dtype):
+        bank = make_bank(6, 3, 5, dtype=dtype, device=device)
+        image, _ = make_scene(bank)
+        defocus = bank.defocus[torch.randint(6, (2, 1, 9, 12), device=device)]
+        linear, nearest = (render(image, defocus, bank, compositing, layers=mode) for mode in ("linear", "nearest"))
+        self.assert_close(linear, nearest, rtol=0, atol=1e-14 if dtype == torch.float64 else 1e-6)
+
+    # What is skipped, shared and shaped
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize("method", METHODS)
+    def test_feature_absent_layers_are_not_looked_at(self, compositing, method, device, dtype):
+        bank = make_bank(6, 1, 5, dtype=dtype, device=device)
+        image, _ = make_scene(bank)
+        defocus = torch.full((2, 1, 9, 12), -7.0, device=device, dtype=dtype)  # between nodes 1 and 2
+        expected = render(image, defocus, bank, compositing, method=method)
+        bank.psfs[[0, 3, 4, 5]] = float("nan")
+        assert torch.equal(render(image, defocus, bank, compositing, method=method), expected)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_feature_one_defocus_map_serves_all_images(self, compositing, device, dtype):
+        bank = make_bank(dtype=dtype, device=device, light=0.8, veil=True)
+        image, defocus = make_scene(bank, batch=3)
+        together = render(image, defocus[:1], bank, compositing)
+        for b in range(3):
+            alone = render(image[b : b + 1], defocus[:1], bank, compositing)
+            self.assert_close(together[b : b + 1], alone, rtol=0, atol=1e-14 if dtype == torch.float64 else 1e-6)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_feature_any_memory_layout(self, compositing, device, dtype):
+        bank = make_bank(dtype=dtype, device=device)
+        image, defocus = make_scene(bank)
+        expected = render(image, defocus, bank, compositing)
+        strided = image.transpose(2, 3).contiguous().transpose(2, 3)
+        for layout in (image.to(memory_format=torch.channels_last), strided):
+            assert not layout.is_contiguous()
+            other = defocus.transpose(2, 3).contiguous().transpose(2, 3)
+            self.assert_close(render(layout, other, bank, compositing), expected, rtol=0, atol=1e-6)
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_feature_render_is_the_function_it_names(self, compositing, device, dtype):
+        bank = make_bank(dtype=dtype, device=device, light=0.8, veil=True)
+        image, defocus = make_scene(bank)
+        function = {"gather": gather, "scatter": scatter}[compositing]
+        options = {"layers": "nearest", "border": "zero", "correlate": True}
+        expected = function(image, defocus, bank.defocus, bank.psfs, bank.veil, **options)
+        assert torch.equal(render(image, defocus, bank, compositing, **options), expected)
+
+    # Errors
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"image": (3, 9, 12)}, "image must have shape (B, C, H, W), got (3, 9, 12)"),
+            ({"image": (2, 1, 9, 12)}, "image and psfs must have the same channels, got 1 and 3"),
+            ({"defocus": (2, 9, 12)}, "defocus must have shape (B, 1, H, W), got (2, 9, 12)"),
+            ({"defocus": (2, 1, 9, 11)}, "shape (2, 1, 9, 12) or (1, 1, 9, 12), got (2, 1, 9, 11)"),
+            ({"defocus": (2, 3, 9, 12)}, "shape (2, 1, 9, 12) or (1, 1, 9, 12), got (2, 3, 9, 12)"),
+            ({"defocus": (3, 1, 9, 12)}, "shape (2, 1, 9, 12) or (1, 1, 9, 12), got (3, 1, 9, 12)"),
+            ({"psfs": (3, 5, 5)}, "psfs must have shape (D, C, P, P), got (3, 5, 5)"),
+            ({"psfs": (4, 3, 4, 4)}, "psfs must be square with an odd side, which has a centre, got 4x4"),
+            ({"psfs": (4, 3, 5, 3)}, "psfs must be square with an odd side, which has a centre, got 5x3"),
+            ({"nodes": (3,)}, "nodes must have shape (4,), one defocus a PSF layer, got (3,)"),
+            ({"veil": (4,)}, "veil must have shape (4, 3), one value a layer and channel, got (4,)"),
+        ],
+    )
+    @pytest.mark.parametrize("function", [gather, scatter])
+    def test_exception_names_the_shape_that_does_not_fit(self, function, change, message):
+        shapes = {"image": (2, 3, 9, 12), "defocus": (2, 1, 9, 12), "nodes": (4,), "psfs": (4, 3, 5, 5), "veil": (4, 3)}
+        with pytest.raises(ValueError, match=re.escape(message)):
+            function(**{name: torch.zeros(shape) for name, shape in (shapes | change).items()})
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"compositing": "splat"}, "compositing must be one of 'gather', 'scatter', 'occlusion', got 'splat'"),
+            ({"layers": "cubic"}, "layers must be one of 'nearest', 'linear', got 'cubic'"),
+            ({"border": "mirror"}, "border must be one of 'reflect', .* got 'mirror'"),
+        ],
+    )
+    def test_exception_names_the_choices(self, change, message):
+        bank = make_bank()
+        with pytest.raises(ValueError, match=message):
+            render(*make_scene(bank), bank, **change)
+
+    def test_exception_integers_and_unsorted_nodes(self):
+        bank = make_bank()
+        image, defocus = make_scene(bank)
+        with pytest.raises(TypeError, match="image must be floating point"):
+            render((255 * image).byte(), defocus, bank)
+        with pytest.raises(ValueError, match="nodes must ascend strictly"):
+            render(image, defocus, replace(bank, defocus=bank.defocus.flip(0)))
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @pytest.mark.parametrize("border", ["reflect", "circular", "valid"])
+    def test_exception_an_image_too_small_for_the_border(self, compositing, border):
+        bank = make_bank(2, 1, 9)
+        image, defocus = make_scene(bank, 1, 3, 30)
+        message = "pixels a side for PSFs of 9x9, got 3x30; borders that work here: 'replicate', 'zero'"
+        with pytest.raises(ValueError, match=f"border '{border}' needs .* {message}"):
+            render(image, defocus, bank, compositing, border=border)
+        assert render(image, defocus, bank, compositing, border="zero").shape == image.shape
