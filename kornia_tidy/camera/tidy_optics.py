@@ -148,7 +148,7 @@ class TiDyOptics(CodedLens):
             )
         if sensor is not None:
             check_part("sensor", sensor, nn.Module, "a sensor such as SensorNoise(0.01), or None for no noise")
-        self.sensor = sensor
+        self.sensor = SensorNoise(0.01) if sensor is _DEFAULT_SENSOR else sensor  # cameras share no part by default
         self.compositing = compositing
         self.color_space = color_space
         self.border = border

@@ -28,6 +28,12 @@ SMALL = Fidelity(window=9, layer_spacing=5.0)
 
 
 class TestLight(BaseTester):
+    def test_feature_cameras_share_no_part_by_default(self):
+        """What is set on one, as load_state_dict does with take_over=True, would be set on all."""
+        one, other = TiDyOptics(), TiDyOptics()
+        for name in ("masks", "camera", "modulator", "sensor"):
+            assert getattr(one, name) is not getattr(other, name)
+
     def test_feature_white_stays_white_in_gather(self, dtype):
         optics = TiDyOptics(sensor=None, fidelity=Fidelity(window=23))
         depth = 0.3 + 3 * torch.rand(1, 1, 48, 56, dtype=dtype)
