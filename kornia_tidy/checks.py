@@ -16,7 +16,9 @@ from torch import Tensor
 def check_choice(name: str, value: Any, allowed: Collection[Any]) -> None:
     """Raise ``ValueError`` unless ``value`` is one of ``allowed``."""
     if value not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+        text = repr(value)  # which a damaged file can make as long as it likes
+        got = text if len(text) <= 80 else f"{text[:76]} ..."
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {got}")
 
 
 def check_positive(name: str, value: float, unit: str = "") -> None:

@@ -15,6 +15,11 @@ class TestFidelity(BaseTester):
         changed = Fidelity.preset("draft").replace(layers="linear").replace(window=9)
         assert (changed.name, changed.layers, changed.window) == ("draft, changed", "linear", 9)
 
+    def test_exception_a_choice_of_thousands_of_letters_is_cut(self):
+        with pytest.raises(ValueError, match="must be one of") as told:
+            Fidelity.preset("a" * 5000)
+        assert len(str(told.value)) < 200
+
     def test_exception_unknown_preset_lists_them(self):
         with pytest.raises(ValueError, match="'paper', 'draft', 'balanced', 'reference', got 'best'"):
             Fidelity.preset("best")
