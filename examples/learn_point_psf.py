@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.mask_design import objectives as mask_design
+from kornia_tidy.mask_design import objectives
 
 # Light that leaves the window is lost, not given back: a PSF is not rewarded for throwing light far away.
 FIDELITY = Fidelity("point", pixel_tolerance=0.1, layer_spacing=5.0, window=23, stray_light="discard")
@@ -56,14 +56,14 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, list[float]]:
 
 def point_error(optics: TiDyOptics) -> Tensor:
     """Return the squared distance between PSF and unit impulse, averaged over depth, at 530 nm."""
-    return mask_design.point_error(optics.psf_bank(channels=1))
+    return objectives.point_error(optics.psf_bank(channels=1))
 
 
 def learn(count: int, seed: int, iterations: int, lr_metres: float) -> tuple[TiDyOptics, list[float]]:
     """Learn one sequence of masks; return the camera and the error before every step."""
     noise = torch.Generator().manual_seed(seed)
     optics = TiDyOptics(PixelwiseMask(count, generator=noise), fidelity=FIDELITY)
-    history = mask_design.design(optics.masks, lambda: point_error(optics), iterations, lr_metres)
+    history = objectives.design(optics.masks, lambda: point_error(optics), iterations, lr_metres)
     return optics, history
 
 

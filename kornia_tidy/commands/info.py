@@ -18,8 +18,7 @@ import kornia_tidy
 from kornia_tidy.commands.report import tell
 from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
 from kornia_tidy.psf import mutual_intensity
-from kornia_tidy.render.backends import direct
-from kornia_tidy.render.backends import direct_occlusion as occlusion_direct
+from kornia_tidy.render.backends import direct, direct_occlusion
 
 DESCRIPTION = """\
 Tell what kornia_tidy runs on: versions of the packages it uses, processor and threads,
@@ -31,7 +30,7 @@ PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
     *("lightning", "matplotlib", "h5py"),
 )
-SOURCES = (direct.SOURCE, occlusion_direct.SOURCE, mutual_intensity.SOURCE)
+SOURCES = (direct.SOURCE, direct_occlusion.SOURCE, mutual_intensity.SOURCE)
 
 
 def add_parser(subparsers: Any) -> None:

@@ -7,7 +7,7 @@
 // Layers are given as in tiles.py: all light of a pixel to layer `lower`, or a share of it to the next one. PSFs are
 // turned by 180 degrees, so that output pixel (y, x) sees the plane's pixels (y, x) to (y + side - 1, x + side - 1).
 //
-// Compiled by compiled.py with REAL as float or double; exact to rounding, without fast-math.
+// Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
 #include <stdlib.h>
 

@@ -4,7 +4,7 @@
 // intensity J, packed as the sum of real and imaginary part; and its product with each pixel's B. All of it stays in a
 // core's cache. Planes have rows of whole vectors, filled up with zeros.
 //
-// Compiled by compiled.py with REAL as float or double; exact to rounding, without fast-math.
+// Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
 #include <stdlib.h>
 

@@ -10,7 +10,7 @@
 //   each of its ends: looked up in double, since differences do keep only their absolute accuracy.
 // - Weights that are shared by two layers are convolved like light.
 //
-// Compiled by compiled.py with REAL as float or double.
+// Compiled by build.py with REAL as float or double.
 
 #include "direct.c"
 
@@ -22,7 +22,7 @@ typedef REAL part __attribute__((vector_size(DOUBLES * sizeof(REAL))));
 
 static const REAL EPSILON = 1e-6;  // as in occlusion.py
 
-// The fields of `_Panes` in occlusion_direct.py. Widths and heights are those of the output; planes are larger by side - 1.
+// The fields of `_Panes` in direct_occlusion.py. Widths and heights are those of the output; planes are larger by side - 1.
 typedef struct {
     int64_t images, channels, height, width, layers, side, threads;
     int64_t plane_image, plane_channel, plane_row, map_image, map_row;
@@ -399,7 +399,7 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
     }
 }
 
-// What a block of one strip costs, see `direct_cost` in occlusion_direct.py.
+// What a block of one strip costs, see `direct_cost` in direct_occlusion.py.
 enum { ALONE, PAIRS, COLUMNS, EDGES, COUNTS };
 
 static int64_t count_columns(const ray *rays, int64_t side) {

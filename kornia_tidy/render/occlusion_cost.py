@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backends import direct_occlusion as occlusion_direct
+from kornia_tidy.render.backends import direct_occlusion
 from kornia_tidy.render.backends.direct import is_direct_faster
 from kornia_tidy.render.backends.occlusion_tile_plan import CHUNK_BYTES, choose_grid, layers_of_windows, windows_cost
 from kornia_tidy.render.backends.tile_plan import Labels
@@ -58,9 +58,9 @@ def count_windows(labels: Labels, layers: int, window: int) -> Windows:
     here = layers_of_windows(terms, grid, layers)
     scene = torch.empty(labels.lower[:, None].shape), torch.zeros(layers, 1, window, window)
     direct = None
-    if labels.lower.device.type == "cpu" and occlusion_direct.can_go_directly(*scene):
-        counts = occlusion_direct.count(*scene, labels.lower, labels.fraction)
-        direct = occlusion_direct.direct_cost(*counts, max(window, occlusion_direct.SMALLEST_SIDE))
+    if labels.lower.device.type == "cpu" and direct_occlusion.can_go_directly(*scene):
+        counts = direct_occlusion.count(*scene, labels.lower, labels.fraction)
+        direct = direct_occlusion.direct_cost(*counts, max(window, direct_occlusion.SMALLEST_SIDE))
     return Windows(grid.size, here.sum(1), int(here.any(0).sum()), labels.lower.numel(), direct)
 
 

@@ -11,8 +11,7 @@ from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacrev, jvp, vmap
 
 from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
-from kornia_tidy.render.backends import tiled as tiling
-from kornia_tidy.render.backends import tiled_occlusion as occlusion_tiling
+from kornia_tidy.render.backends import tiled, tiled_occlusion
 from kornia_tidy.render.compositing import COMPOSITING
 from tests.base import BaseTester
 
@@ -107,7 +106,7 @@ class TestSecondDerivatives(BaseTester):
     @over_compositing
     def test_gradgradcheck(self, compositing, way, layers, monkeypatch):
         """Of image, defocus, PSFs and veil, by tiles and, where there is a compiler, directly."""
-        for module in (tiling, occlusion_tiling):
+        for module in (tiled, tiled_occlusion):
             if way == "tiled":
                 monkeypatch.setattr(module, "goes_directly", lambda *_: False)
         image, psfs = torch.rand(1, 1, 5, 16).double(), torch.rand(3, 1, 3, 3).double()

@@ -15,11 +15,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
 from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW, mutual_energies
-from kornia_tidy.render.backends import direct
-from kornia_tidy.render.backends import direct_occlusion as occlusion_direct
+from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.backends.dense_occlusion import occlude_dense
 from kornia_tidy.render.backends.tile_plan import Labels
 from kornia_tidy.render.borders import BORDERS, pad_border
+from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies import round_off, written_out
 from tests.rounding import gamma
 
@@ -98,7 +98,7 @@ def correlate(draw: random.Random) -> Call:
 
 
 def occlude(draw: random.Random) -> Call:
-    """``occlude`` and ``count`` of occlusion_direct.c.
+    """``occlude`` and ``count`` of occlusion.c.
 
     Light, layers and what is behind them are sums of positive numbers, each off by gamma of itself; a share that is let
     through is a difference and keeps its absolute error, which grows with each layer, and so does the sum of layers. In
@@ -125,10 +125,11 @@ def occlude(draw: random.Random) -> Call:
     share = None if fraction is None else pad_border(fraction[:, None], radius, border)[:, 0]
     inside = pad_border(torch.ones(1, 1, height, width, dtype=dtype), radius, border)[0] if border == "zero" else None
     mean = None if veil is None else image.mean((-2, -1))
-    assert occlusion_direct.can_go_directly(plane, psfs), about
-    counts = occlusion_direct.count(plane, psfs, below, share)
+    assert direct_occlusion.can_go_directly(plane, psfs), about
+    counts = direct_occlusion.count(plane, psfs, below, share)
     assert min(counts) >= 0, about
-    got = occlusion_direct.occlude_directly(plane, psfs, below, share, mean, veil, inside)
+    seen = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
+    got = direct_occlusion.occlude_directly(plane, psfs, below, share, mean, seen, inside)
 
     def truth() -> tuple[Tensor, float]:
         shared = None if fraction is None else fraction[:, None]
@@ -163,7 +164,7 @@ def energies(draw: random.Random) -> Call:
 KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "direct.c: gather": gather,
     "direct.c: correlate": correlate,
-    "occlusion_direct.c": occlude,
+    "occlusion.c": occlude,
     "mutual_intensity.c": energies,
 }
 

@@ -75,12 +75,11 @@ def call(shapes: int, seed: int, kernel: str) -> None:
 
     from kornia_tidy.kernels.build import compiled
     from kornia_tidy.psf import mutual_intensity
-    from kornia_tidy.render.backends import direct
-    from kornia_tidy.render.backends import direct_occlusion as occlusion_direct
+    from kornia_tidy.render.backends import direct, direct_occlusion
     from tests.kernels.kernel_shapes import CHEAP, DTYPES, KERNELS
 
     chosen = {name: function for name, function in KERNELS.items() if name.startswith(kernel)}
-    for source in (direct.SOURCE, occlusion_direct.SOURCE, mutual_intensity.SOURCE):
+    for source in (direct.SOURCE, direct_occlusion.SOURCE, mutual_intensity.SOURCE):
         for dtype in DTYPES if any(name.startswith(source.name) for name in chosen) else ():
             assert compiled(source, dtype) is not None, f"{source.name} was not compiled with: {os.environ['CC']}"
     for name, function in chosen.items():

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from kornia_tidy.raw import decoding as raw_decoding
+from kornia_tidy.raw import decoding
 from kornia_tidy.raw.decoding import DECODER, decode_raw
 from tests.base import BaseTester
 from tests.raw.dng import dng
@@ -42,7 +42,7 @@ class TestDecodeRaw(BaseTester):
         def install(program):
             path = tmp_path / "decoder.py"
             path.write_text("import os, signal, sys, time\n" + program)
-            monkeypatch.setattr(raw_decoding, "DECODER", path)
+            monkeypatch.setattr(decoding, "DECODER", path)
 
         return install
 

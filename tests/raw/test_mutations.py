@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kornia_tidy.raw import decoder as raw_decoder
-from kornia_tidy.raw import decoding as raw_decoding
+from kornia_tidy.raw import decoder, decoding
 from kornia_tidy.raw.capture import RawCapture
 from tests.base import BaseTester, shared
 
@@ -64,8 +63,8 @@ def mutated(seed):
 def forked_decoding():
     """Let RawCapture.open decode in forks; limits, decoder and the reading of what it wrote stay as they are."""
     command = [sys.executable, "-I", "-S", Path(__file__).with_name("decoding_forks.py"), json.dumps(sys.path)]
-    command.append(raw_decoding.DECODER.parent)
-    before = raw_decoding._run
+    command.append(decoding.DECODER.parent)
+    before = decoding._run
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
 
         def run(file, result, timeout, memory_limit):
@@ -75,13 +74,13 @@ def forked_decoding():
             status = json.loads(server.stdout.readline())
             if status is None:
                 raise subprocess.TimeoutExpired("decoder", timeout)
-            return status, raw_decoder.LOADED  # its server loaded all before it forked
+            return status, decoder.LOADED  # its server loaded all before it forked
 
-        raw_decoding._run = run
+        decoding._run = run
         try:
             yield
         finally:
-            raw_decoding._run = before
+            decoding._run = before
             server.stdin.close()
 
 

@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.render.backends import occlusion_tile_plan as occlusion_tiles
-from kornia_tidy.render.backends import tiled_occlusion as occlusion_tiling
+from kornia_tidy.render.backends import occlusion_tile_plan, tiled_occlusion
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, lay_over, weight_behind
 from kornia_tidy.render.backends.occlusion_tile_plan import choose_grid, make_plan
 from kornia_tidy.render.borders import BORDERS
@@ -28,15 +27,15 @@ ATOL = {torch.float32: 2e-5, torch.float64: 1e-12}
 @pytest.fixture
 def tiles_only(monkeypatch):
     """Direct convolution has tests of its own."""
-    monkeypatch.setattr(occlusion_tiling, "goes_directly", lambda *_: False)
+    monkeypatch.setattr(tiled_occlusion, "goes_directly", lambda *_: False)
 
 
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Tiles so small, and chunks of so few, that a small scene has many of both."""
-    monkeypatch.setattr(occlusion_tiles, "SIZES", (8, 12, 16))
-    monkeypatch.setitem(occlusion_tiles.CHUNK_BYTES, "cpu", 40_000)
-    monkeypatch.setattr(occlusion_tiles, "CHUNK_BYTES_ACCELERATOR", 40_000)
+    monkeypatch.setattr(occlusion_tile_plan, "SIZES", (8, 12, 16))
+    monkeypatch.setitem(occlusion_tile_plan.CHUNK_BYTES, "cpu", 40_000)
+    monkeypatch.setattr(occlusion_tile_plan, "CHUNK_BYTES_ACCELERATOR", 40_000)
 
 
 def steps(bank, height, width, side=11):
@@ -343,7 +342,7 @@ class TestTiledOcclusion(RenderTester):
     @pytest.mark.parametrize("kind", ["an odd number of tiles of one layer", "depths on the nodes"])
     @pytest.mark.usefixtures("small_tiles")
     def test_feature_gradients_of_hard_scenes_equal_those_of_the_dense_render(self, kind, device, monkeypatch):
-        monkeypatch.setattr(occlusion_tiles, "SIZES", (12,))  # 8 x 8 pixels a tile: 3 tiles
+        monkeypatch.setattr(occlusion_tile_plan, "SIZES", (12,))  # 8 x 8 pixels a tile: 3 tiles
         bank = make_bank(4, 1, 5, device=device)
         image, _ = make_scene(bank, 1, 8, 24)
         odd = kind.startswith("an odd")
@@ -399,8 +398,8 @@ class TestTiledOcclusion(RenderTester):
         defocus = torch.empty(1, 1, 128, 128, device=device).uniform_(-20, 20).requires_grad_()
         largest = LargestTensor()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(occlusion_tiles.CHUNK_BYTES, "cpu", 200_000)
-            patch.setattr(occlusion_tiles, "CHUNK_BYTES_ACCELERATOR", 200_000)
+            patch.setitem(occlusion_tile_plan.CHUNK_BYTES, "cpu", 200_000)
+            patch.setattr(occlusion_tile_plan, "CHUNK_BYTES_ACCELERATOR", 200_000)
             with largest:
                 render(image, defocus, bank, "occlusion").sum().backward()
         assert largest.bytes < 1_600_000  # two tiles of 20 layers at least; the planes of all layers are 5 MB and more

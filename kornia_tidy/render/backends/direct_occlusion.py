@@ -3,7 +3,7 @@
 A block of 8 x 16 pixels (in float32) meets the layers in its window, each only in the rows and columns where it is. All
 that is added up is positive, so float32 is enough: no sum is off by more than a share of itself, however small the
 divisor that it becomes. Whole weights along runs of pixels are not even convolved: their blur is known from where runs
-begin and end. The work is done in C (``occlusion_direct.c``), see :mod:`kornia_tidy.kernels.build`; where that cannot
+begin and end. The work is done in C (``occlusion.c``), see :mod:`kornia_tidy.kernels.build`; where that cannot
 be, everything goes by tiles.
 """
 
@@ -21,14 +21,14 @@ from kornia_tidy.render.backends.occlusion_tile_plan import candidates
 from kornia_tidy.render.backends.tile_plan import SAMPLE, Labels
 
 SOURCE = KERNELS / "occlusion.c"
-BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion_direct.c
+BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
 SMALLEST_SIDE = BAND - 1  # px, of PSFs; smaller ones are made as large
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 COUNTED = 12  # bands of blocks, of which costs are known
 
 
 class _Panes(ctypes.Structure):
-    """The struct ``panes`` in occlusion_direct.c."""
+    """The struct ``panes`` in occlusion.c."""
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
@@ -151,7 +151,7 @@ def _library(dtype: torch.dtype) -> ctypes.CDLL:
 def _panes(
     plane: Tensor, psfs: Tensor, lower: Tensor, fraction: Tensor | None, inside: Tensor | None
 ) -> tuple[_Panes, list[Tensor]]:
-    """Return what occlusion_direct.c is told of a scene, and the tensors whose memory it names."""
+    """Return what occlusion.c is told of a scene, and the tensors whose memory it names."""
     lower = lower.to(plane.dtype)
     if fraction is not None:  # what lies in one layer alone lies in `lower`
         full = fraction == 1

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends import tiled as tiling
+from kornia_tidy.render.backends import tiled
 from kornia_tidy.render.backends.direct import (
     SOURCE,
     STRIP_ROWS,
@@ -43,7 +43,7 @@ def directly():
         return ways[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiling, "goes_directly", possible)
+        patch.setattr(tiled, "goes_directly", possible)
         yield ways
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends import tiled_occlusion as occlusion_tiling
+from kornia_tidy.render.backends import tiled_occlusion
 from kornia_tidy.render.backends.direct_occlusion import SOURCE, can_go_directly, goes_directly, occlude_directly
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
@@ -36,7 +36,7 @@ def directly(monkeypatch):
         ways.append(can_go_directly(plane, psfs))
         return ways[-1]
 
-    monkeypatch.setattr(occlusion_tiling, "goes_directly", goes)
+    monkeypatch.setattr(tiled_occlusion, "goes_directly", goes)
     yield
     assert ways, "no scene was rendered"
     assert all(ways), "a scene went by tiles"
@@ -107,7 +107,7 @@ class TestDirectOcclusion(RenderTester):
         options = {"layers": draw(st.sampled_from(["nearest", "linear"])), "border": border}
         expected = render(image, psi, bank, "occlusion", method="dense", **options)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(occlusion_tiling, "goes_directly", lambda plane, psfs, *_: can_go_directly(plane, psfs))
+            patch.setattr(tiled_occlusion, "goes_directly", lambda plane, psfs, *_: can_go_directly(plane, psfs))
             coded = render(image, psi, bank, "occlusion", **options)
         self.assert_close(coded, expected, rtol=0, atol=1e-11)
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kornia_tidy.render.backends import tile_plan as tiles
-from kornia_tidy.render.backends import tiled as tiling
+from kornia_tidy.render.backends import tile_plan, tiled
 from kornia_tidy.render.backends.tile_plan import Labels, choose_grid, make_plan
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
@@ -25,16 +24,16 @@ ATOL = {torch.float32: 2e-6, torch.float64: 1e-12}
 def by_transforms():
     """Not directly, which these PSFs would be; see test_direct.py for that."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiling, "goes_directly", lambda *_: False)
+        patch.setattr(tiled, "goes_directly", lambda *_: False)
         yield
 
 
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Tiles so small, and chunks of so few pairs, that a small scene has many of both."""
-    monkeypatch.setattr(tiles, "SIZES", (8, 12, 16))
-    monkeypatch.setitem(tiles.CHUNK_BYTES, "cpu", 40_000)
-    monkeypatch.setattr(tiles, "CHUNK_BYTES_ACCELERATOR", 40_000)
+    monkeypatch.setattr(tile_plan, "SIZES", (8, 12, 16))
+    monkeypatch.setitem(tile_plan.CHUNK_BYTES, "cpu", 40_000)
+    monkeypatch.setattr(tile_plan, "CHUNK_BYTES_ACCELERATOR", 40_000)
 
 
 def depth_map(kind, bank, height, width):
@@ -186,7 +185,7 @@ class TestTiledRender(RenderTester):
         image, defocus = make_scene(bank, 2, 31, 46)
         results = []
         for by_slices in (True, False):
-            monkeypatch.setattr(tiling, "_by_slices", lambda _, choice=by_slices: choice)
+            monkeypatch.setattr(tiled, "_by_slices", lambda _, choice=by_slices: choice)
             inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs)]
             coded = render(*inputs[:2], Bank(inputs[2], bank.defocus), compositing)
             results.append((coded, *torch.autograd.grad(coded.square().sum(), inputs)))
@@ -239,8 +238,8 @@ class TestTiledRender(RenderTester):
         defocus = torch.empty(1, 1, 256, 256, device=device).uniform_(-20, 20)
         largest = LargestTensor()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(tiles.CHUNK_BYTES, "cpu", 200_000)
-            patch.setattr(tiles, "CHUNK_BYTES_ACCELERATOR", 200_000)
+            patch.setitem(tile_plan.CHUNK_BYTES, "cpu", 200_000)
+            patch.setattr(tile_plan, "CHUNK_BYTES_ACCELERATOR", 200_000)
             with largest:
                 render(image, defocus, bank, compositing).sum().backward()
         assert largest.bytes < 2 * 300 * 300 * 8  # int64 labels of the padded plane; all layers' planes are 10 MB
@@ -315,4 +314,4 @@ class TestPlan(BaseTester):
         assert all(side - 23 + 1 >= 23 - 1 for side in sides)
 
     def test_property_sizes_transform_fast(self):
-        assert all((2 * 3) ** 16 * 5**2 * 7 % size == 0 for size in tiles.SIZES)
+        assert all((2 * 3) ** 16 * 5**2 * 7 % size == 0 for size in tile_plan.SIZES)
