@@ -60,7 +60,7 @@ WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths on
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
 POINT_SAFETY = 1.6  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
 OCCLUSION = 1.3  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
-OCCLUSION_WINDOW = 1.3  # of a window likewise
+OCCLUSION_WINDOW = 1.3  # of a window likewise, and up to twice that where every pixel lies on an outline: up to 2.5
 ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; on photographs up to 1.9e-3
 OUTLINE_ERROR = 2e-2  # the same for the square root of the share of pixels on outlines; on checkerboards up to 1.9e-2
 _OUTLINE = 1.0  # rad between neighbours: an outline, not a slope
@@ -211,7 +211,9 @@ class PlannedScene:
         )
 
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
-        share, of_window = (OCCLUSION, OCCLUSION_WINDOW) if self._occlusion else (1.0, 1.0)
+        share, of_window = 1.0, 1.0
+        if self._occlusion:  # what a narrow window leaves out of a PSF is hidden by others than what it keeps
+            share, of_window = OCCLUSION, OCCLUSION_WINDOW * (1 + self._outlines)
         share, of_window = (factor / self._share_in_frame for factor in (share, of_window))
         narrower = window_side(fidelity) < window_side(self.reference)
         ways = (fidelity.stray_light, *(["outlines"] if self._occlusion and narrower else []))
@@ -224,6 +226,12 @@ class PlannedScene:
             ("wavelengths", SAFETY * share * self._wavelength_error(fidelity.wavelengths)),
             ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self._level),
         ]
+
+    @cached_property
+    def _outlines(self) -> float:
+        """Return the share of the pixels that have a neighbour at another depth."""
+        nearest, farthest = (max_pool2d(sign * self._defocus, 3, 1, 1) for sign in (1, -1))
+        return float((nearest + farthest > _OUTLINE).double().mean())
 
     @cached_property
     def _share_in_frame(self) -> float:
@@ -254,10 +262,7 @@ class PlannedScene:
         own, theirs = self._rendered(fidelity), self._rendered(self.reference)
         if own == theirs:
             return 0.0
-        if "outlines" not in self._known:
-            nearest, farthest = (max_pool2d(sign * self._defocus, 3, 1, 1) for sign in (1, -1))
-            self._known["outlines"] = float((nearest + farthest > _OUTLINE).double().mean())
-        each = max(ORDER_ERROR, OUTLINE_ERROR * self._known["outlines"] ** 0.5)
+        each = max(ORDER_ERROR, OUTLINE_ERROR * self._outlines**0.5)
         return each * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
 
     def _dark_error(self, fidelity: Fidelity) -> float:
