@@ -60,7 +60,7 @@ WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths on
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
 POINT_SAFETY = 1.6  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
 OCCLUSION = 1.3  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
-OCCLUSION_WINDOW = 1.3  # of a window likewise, and up to twice that where every pixel lies on an outline: up to 2.5
+OCCLUSION_WINDOW = 1.3  # of a window likewise
 ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; on photographs up to 1.9e-3
 OUTLINE_ERROR = 2e-2  # the same for the square root of the share of pixels on outlines; on checkerboards up to 1.9e-2
 _OUTLINE = 1.0  # rad between neighbours: an outline, not a slope
@@ -117,10 +117,13 @@ class PlannedScene:
         if light is None:  # whose colours, if they matter, may differ as much as its pixels
             self._light, self._level = SceneLight.unseen(self._depths, survey.channels, size), 0.5
             self._contrast = CONTRAST
+            self._apart = torch.full((survey.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
             self._colours = [self._light for _ in colours]
         else:
             self._light, self._level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
             self._contrast = float(light.double().std(correction=0))
+            means = self._depths.means(light)  # of the light at each depth, less that of all
+            self._apart = means / self._depths.share - means.sum(1, keepdim=True)
             self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
         self._layers = LayerErrors(*survey.layer_survey(window_side(self.reference)), self._light)
         self._rows = self._layer_rows(self.reference)
@@ -211,9 +214,7 @@ class PlannedScene:
         )
 
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
-        share, of_window = 1.0, 1.0
-        if self._occlusion:  # what a narrow window leaves out of a PSF is hidden by others than what it keeps
-            share, of_window = OCCLUSION, OCCLUSION_WINDOW * (1 + self._outlines)
+        share, of_window = (OCCLUSION, OCCLUSION_WINDOW) if self._occlusion else (1.0, 1.0)
         share, of_window = (factor / self._share_in_frame for factor in (share, of_window))
         narrower = window_side(fidelity) < window_side(self.reference)
         ways = (fidelity.stray_light, *(["outlines"] if self._occlusion and narrower else []))
@@ -221,7 +222,7 @@ class PlannedScene:
         layer_error = SAFETY * share * self._layer_error(fidelity)
         return [
             ("layers", layer_error + self._order_error(fidelity) + self._dark_error(fidelity)),
-            ("window", WINDOW_SAFETY * window_error),
+            ("window", WINDOW_SAFETY * window_error + self._spread_error(fidelity)),
             ("points a pixel", POINT_SAFETY * share * self._point_error(fidelity.pixel_tolerance)),
             ("wavelengths", SAFETY * share * self._wavelength_error(fidelity.wavelengths)),
             ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self._level),
@@ -278,6 +279,21 @@ class PlannedScene:
             held = _cropped(psfs, window_side(fidelity)).sum((-2, -1)).amin(1).double()
             lost = EPSILON / (interpolation(self._depths.psi, nodes) @ held) - EPSILON
             self._known[key] = 2 * self._level * float((self._depths.share @ lost.square()).sqrt())
+        return self._known[key]
+
+    def _spread_error(self, fidelity: Fidelity) -> float:
+        """Return the error of stray light that takes on the image's mean, where things hide others.
+
+        A layer's own light is renormalised to what is seen of it, so its stray light should have the layer's mean.
+        """
+        if not self._occlusion or fidelity.stray_light != "veil":
+            return 0.0
+        key = ("spread", fidelity.window)
+        if key not in self._known:
+            nodes, psfs = self._survey.window_survey(window_side(self.reference))
+            lost = psfs.sum((-2, -1)) - _cropped(psfs, window_side(fidelity)).sum((-2, -1))
+            lost = interpolation(self._depths.psi, nodes) @ lost.double() * self._apart.T
+            self._known[key] = float((self._depths.share @ lost.square()).mean().clamp(min=0).sqrt())
         return self._known[key]
 
     def _is_reference(self, fidelity: Fidelity) -> bool:

@@ -57,8 +57,8 @@ class TestAdversarialScenes(BaseTester):
         outcome = judge(case)
         assert outcome.measured <= min(outcome.predicted, case.tolerance), outcome
 
-    def test_feature_narrow_windows_where_every_pixel_lies_on_an_outline(self):
-        """What 5 px leave out of a PSF is hidden by others than what they keep: off 1.05 times before."""
+    def test_feature_stray_light_is_not_the_mean_where_layers_are_renormalised(self):
+        """Of a checkerboard in depth each half keeps its own light: off 1.05 times before."""
         outcome = judge(Case.of_seed(2819))
         assert (outcome.case.kind, outcome.case.compositing) == ("checkerboard", "occlusion")
         assert outcome.measured <= min(outcome.predicted, outcome.case.tolerance), outcome
