@@ -58,8 +58,9 @@ class TestCost(BaseTester):
         assert rendering_seconds(tiles, 1, fidelity.replace(double=True)) == pytest.approx(2 * one)
         assert one < rendering_seconds(replace(tiles, pairs=240), 1, fidelity) < 2 * one
 
-    def test_feature_the_faster_way_counts(self):
-        """By transforms or directly; who spreads light cannot go directly."""
+    def test_feature_the_faster_way_counts(self, monkeypatch):
+        """By transforms or directly, on one core; who spreads light cannot go directly."""
+        monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
         rows = torch.linspace(-10, 10, 128).view(1, 1, -1, 1).expand(1, 1, 128, 128)
         nodes = tuple(float(psi) for psi in range(-20, 21, 2))
         labels = label_pixels(rows, 2, nodes, "nearest")
