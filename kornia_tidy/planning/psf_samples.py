@@ -19,7 +19,7 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.spectral_binning import fewer_wavelengths
 from kornia_tidy.render.borders import largest_window
-from kornia_tidy.render.cost_model import BankGeometry
+from kornia_tidy.planning.bank_cost import BankGeometry
 
 _TOLERANCE = 0.3  # of pixels: differences of PSFs need not be known better than to some per cent
 _WAVELENGTHS = 7  # nor better than at so many: PSFs are off by half a per cent

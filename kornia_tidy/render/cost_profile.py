@@ -251,5 +251,37 @@ def _rates(name: str, numbers: Any) -> Rates:
     return kind(**numbers)
 
 
-# One core of a 2.5 GHz Xeon with vectors of 512 bits, idle. Its dense rates are those of EPYC, scaled like its tiles.
-RATES: dict[str, type[Rates]] = {}
+RATES: dict[str, type[Rates]] = {
+    "direct": DirectRates,
+    "tiled": TiledRates,
+    "dense": DenseRates,
+    "occlusion_direct": DirectOcclusionRates,
+    "occlusion_tiled": TiledOcclusionRates,
+    "occlusion_dense": DenseRates,
+    "bank": BankRates,
+}
+
+# One core of an idle 2.5 GHz Xeon. What it has no measurement for is EPYC's: dense rates, and planes beyond the cache.
+XEON = CostProfile(
+    name="xeon-2.5",
+    direct=DirectRates(1.0, 0, 0, 70, 0, 0.95),
+    tiled=TiledRates(0.5, 0, 0, 8.5, 0.099, 1.98, 1.65, 1.3, 2200),
+    dense=DenseRates(0.5, 2e5, 2, 0.13, 0.03, 0.1, 1.1),
+    occlusion_direct=DirectOcclusionRates(1.0, 0, 0, 250, 3.7, 320, 3, 2.3, 12, 30),
+    occlusion_tiled=TiledOcclusionRates(0.5, 0, 0, 6.9, 19.6, 8, 30, 15000),
+    occlusion_dense=DenseRates(0.5, 0, 0, 0.33, 0.08, 0, 0),
+    bank=BankRates(0.5, 0, 1 / 52, 1 / 57, 1 / 90, 1 / 115),
+)
+
+# One core of a 2.6 GHz EPYC (Zen 4), fitted to 256 to 1024 pixels, windows of 5 to 129 and 1 to 21 layers. The bank's
+# rates are XEON's.
+EPYC = CostProfile(
+    name="epyc-2.6",
+    direct=DirectRates(0.95, 0, 1.26, 77, 14.3, 1.67),
+    tiled=TiledRates(0.85, 2e6, 0, 6.1, 0.232, 0, 0.632, 1.33, 9500),
+    dense=DenseRates(0.8, 1.9e5, 2, 0.145, 0.031, 0.134, 1.26),
+    occlusion_direct=DirectOcclusionRates(0.95, 0, 1.6, 334, 4.9, 445, 0, 2.66, 6.5, 29),
+    occlusion_tiled=TiledOcclusionRates(0.6, 1.9e6, 5.4, 7.8, 24.7, 0.11, 29.6, 9800),
+    occlusion_dense=DenseRates(0.7, 0, 0, 0.362, 0.083, 0, 0),
+    bank=BankRates(0.5, 0, 1 / 52, 1 / 57, 1 / 90, 1 / 115),
+)
