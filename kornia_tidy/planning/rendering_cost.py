@@ -1,4 +1,4 @@
-"""What rendering a scene costs before it is rendered: the work of each backend, the time and the memory of the cheapest.
+"""The cost of rendering a scene, before it is rendered: the work of each backend, time and memory of the fastest.
 
 The backends count as they do for :mod:`kornia_tidy.render.dispatch`, from the labels of the pixels alone. Time is
 priced by :mod:`kornia_tidy.render.cost_model`.

@@ -14,7 +14,6 @@ from typing import ClassVar, Protocol
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.cost_profile import CostProfile, Rates
 
-
 # Bytes of a tile's planes from which on they leave the processor's cache, or are fetched from the system each time.
 TILE_CACHE, OCCLUSION_CACHE = 16 << 20, 64 << 20
 

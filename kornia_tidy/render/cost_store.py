@@ -59,7 +59,7 @@ def is_tuning_off() -> bool:
 
 
 def settled() -> StoredProfile:
-    """Return the profile that this process starts from, for as many threads as torch has: from the cache, or shipped."""
+    """Return the profile that this process starts from, for torch's threads: from the cache, or as shipped."""
     threads = torch.get_num_threads()
     if threads not in _settled:
         with profile_lock:
@@ -78,13 +78,18 @@ def measured_profile(kind: str) -> CostProfile | None:
     return _measured.get((torch.get_num_threads(), kind))
 
 
-def settle_measured(kind: str, profile: CostProfile) -> None:
-    """Fix the profile of a kind of compositing for the rest of the process, and keep it for others.
+def settle_measured(kind: str, profile: CostProfile, *, keep: bool = True) -> None:
+    """Fix the profile of a kind of compositing for the rest of the process.
 
-    Where the cache cannot be written to, it serves this process alone.
+    Args:
+        kind: of compositing, a key of :data:`KINDS`.
+        profile: measured.
+        keep: for other processes too. Where the cache cannot be written to, it serves this process alone.
     """
     threads = torch.get_num_threads()
     _measured[threads, kind] = profile
+    if not keep:
+        return
     with suppress(OSError):
         kept = read_profile(threads) or settled()
         both = {name: getattr(profile, name).__dict__ for name in KINDS[kind]}

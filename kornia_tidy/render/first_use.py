@@ -7,7 +7,7 @@ compositing. ``KORNIA_TIDY_TUNE=off`` in the environment forbids it.
 
 from __future__ import annotations
 
-import math
+import statistics
 import time
 from collections.abc import Collection
 from dataclasses import replace
@@ -30,8 +30,11 @@ from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.scene_samples import sample_scene
 
 SMALL = 128 * 128  # px of an image: up to this all backends are fast, and nothing is measured
-SECONDS = 0.4  # that a measurement may take, for one kind of compositing, beside the first rendering of each scene
+SECONDS = 0.4  # after which no more rounds are made, for one kind of compositing
+LONGEST = 1.0  # s, after which a measurement is given up
 ROUNDS = 5
+REPEATED = 1.5  # a time counts if another round took at most this many times as long
+FINEST = 1e-6  # s, resolution that the clock of a thread must have
 SCALED = ", scaled on first use"
 SAMPLES = {  # side of the image and of the PSFs
     "gather": ((192, 15), (192, 41)),
@@ -60,6 +63,9 @@ def profile_for(compositing: str, pixels: int, able: Collection[str], backends: 
         known = measured_profile(compositing)
         if known is None:
             factors = measure_factors(compositing, backends, start.profile)
+            if factors is None:  # the next process may find the machine idle
+                settle_measured(compositing, start.profile, keep=False)
+                return start.profile
             known = start.profile.scaled(f"{start.profile.name.removesuffix(SCALED)}{SCALED}", factors)
             settle_measured(compositing, known)
     return known
@@ -70,38 +76,48 @@ def _may_not_measure() -> bool:
     return is_tuning_off() or get_worker_info() is not None
 
 
-def measure_factors(kind: str, backends: Collection[Backend], profile: CostProfile) -> dict[str, float]:
+def measure_factors(kind: str, backends: Collection[Backend], profile: CostProfile) -> dict[str, float] | None:
     """Return how many times as long as predicted each backend takes, by the name of its rates.
 
     Args:
         kind: of compositing, a key of :data:`KINDS`.
         backends: to be measured.
         profile: the prediction.
+
+    Returns:
+        None if the machine is too busy to tell: a time could not be repeated.
     """
-    threads = torch.get_num_threads()
-    ratios: dict[str, list[float]] = {name: [] for name in KINDS[kind]}
-    deadline = time.perf_counter() + SECONDS
+    start, threads = time.perf_counter(), torch.get_num_threads()
     scenes = [sample_scene(side, psf_size, compositing=kind) for side, psf_size in SAMPLES[kind]]
-    times: dict[tuple[int, str], float] = {}
-    for round_ in range(ROUNDS + 1):  # the first one is not counted
-        for number, scene in enumerate(scenes):
-            for backend in backends:
-                if round_ > 1 and time.perf_counter() > deadline:
-                    break
-                took = time_rendering(backend, scene)
-                if round_:
-                    times[number, backend.name] = min(took, times.get((number, backend.name), math.inf))
-    for number, scene in enumerate(scenes):
-        for backend in backends:
-            work = backend.work(scene)
-            ratios[work.rates].append(times[number, backend.name] / seconds_of(work, profile, threads))
-    return {name: math.exp(sum(map(math.log, own)) / len(own)) for name, own in ratios.items() if own}
+    cases = [(scene, backend) for scene in scenes for backend in backends]
+    times: list[list[float]] = [[] for _ in cases]
+    for number in range(ROUNDS + 1):
+        for own, (scene, backend) in zip(times, cases, strict=True):
+            took = time_rendering(backend, scene)
+            if number:  # in the first round caches are cold
+                own.append(took)
+        if number > 1 and time.perf_counter() - start > SECONDS:
+            break
+        if time.perf_counter() - start > LONGEST:
+            return None
+    if any(sorted(own)[1] > REPEATED * min(own) for own in times):
+        return None
+    ratios: dict[str, list[float]] = {}
+    for own, (scene, backend) in zip(times, cases, strict=True):
+        work = backend.work(scene)
+        ratios.setdefault(work.rates, []).append(min(own) / seconds_of(work, profile, threads))
+    return {name: statistics.geometric_mean(own) for name, own in ratios.items()}
 
 
 def time_rendering(backend: Backend, scene: LayeredScene) -> float:
-    """Return the seconds that a backend takes to render a scene whose labels are not known yet."""
+    """Return the seconds that a backend takes to render a scene whose labels are not known yet.
+
+    On one thread it is the time of the processor, which does not run while something else does.
+    """
     fresh = replace(scene, found={})
-    start = time.perf_counter()
+    alone = torch.get_num_threads() == 1 and time.get_clock_info("thread_time").resolution <= FINEST
+    clock = time.thread_time if alone else time.perf_counter
+    start = clock()
     with torch.no_grad():
         backend.render(fresh)
-    return time.perf_counter() - start
+    return clock() - start

@@ -21,7 +21,6 @@ from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.cost_store import settled_profile
 from kornia_tidy.render.layers import SAMPLE, Labels
 
-
 TileWork = TiledWork | TiledOcclusionWork
 
 
