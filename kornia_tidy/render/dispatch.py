@@ -101,14 +101,15 @@ class Explanation:
     objections: dict[str, str]
 
     def __str__(self) -> str:
-        words = {name: f"about {1e3 * self.seconds[name]:.3g} ms" for name in sorted(self.seconds, key=self.seconds.get)}
+        by_time = sorted(self.seconds.items(), key=lambda item: item[1])
+        words = {name: f"about {1e3 * seconds:.3g} ms" for name, seconds in by_time}
         for name, why in self.objections.items():
             words[name] = f"{words[name]}, but {why}" if name in words else why
         return "\n".join([f"{self.scene}: {self.backend}", *(f"  {name}: {why}" for name, why in words.items())])
 
 
 def explain(scene: LayeredScene) -> Explanation:
-    """Return which backend ``method="auto"`` takes for a scene, what each would cost and why others are not taken.
+    """Return the choice of ``method="auto"`` for a scene, with the estimated times and the objections to the others.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.

@@ -1,4 +1,4 @@
-"""The layered scene: what the renderer is given, checked once and with the layers of every pixel found once."""
+"""The layered scene: the renderer's input, checked, with every pixel assigned to its layers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 
 @dataclass(frozen=True)
 class LayeredScene:
-    """An image whose pixels lie in defocus layers, and the PSF of each layer. See :func:`layered_scene`.
+    """An image, the defocus layers of its pixels, and the PSF of each layer. See :func:`layered_scene`.
 
     Args:
         image: (B, C, H, W) linear light in float32 or float64.
@@ -48,7 +48,7 @@ class LayeredScene:
         lost = self.psf_size - 1 if self.border == "valid" else 0
         return self.image.shape[-2] - lost, self.image.shape[-1] - lost
 
-    # What follows is made when it is first asked for. functools.cached_property has a lock, which torch.compile refuses.
+    # Derived planes are made on first use, without functools.cached_property, whose lock torch.compile refuses.
 
     @property
     def plane(self) -> Tensor:

@@ -18,7 +18,7 @@ from kornia_tidy.render.borders import from_spectrum, next_fast_size, padded_siz
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
-LARGEST_PLANE = 32 << 20  # bytes of the image in all channels, up to which method="auto" takes this backend
+LARGEST_PLANE = 32 << 20  # bytes of all channels of an image; method="auto" takes this backend for no larger one
 
 
 class DenseBackend:
@@ -95,10 +95,10 @@ def scatter_dense(plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, laye
 def differentiable_gradients(
     render: Callable[..., Tensor], inputs: Sequence[Tensor | None], grad: Tensor, wanted: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of what a function renders, where they are wanted, as differentiable as the function.
+    """Return gradients of a rendered image that can be differentiated in turn.
 
     Args:
-        render: function of the inputs.
+        render: function of the inputs that returns the image.
         inputs: tensors, or None.
         grad: gradient of what it returns.
         wanted: of which inputs.

@@ -196,8 +196,8 @@ class TestChoice(BaseTester):
     def test_feature_small_psfs_go_directly_and_large_ones_by_transforms(self):
         psi = torch.arange(8.0)[torch.arange(400) // 50][:, None].expand(1, 1, 400, 600)
         image, sides = torch.rand(1, 1, 400, 600), range(1, 131, 6)
-        psfs = {side: torch.rand(8, 1, side, side) for side in sides}
-        direct = [side for side in sides if choose(layered_scene(image, psi, torch.arange(8.0), psfs[side])).name == "direct"]
+        scenes = {side: layered_scene(image, psi, torch.arange(8.0), torch.rand(8, 1, side, side)) for side in sides}
+        direct = [side for side in sides if choose(scenes[side]).name == "direct"]
         assert direct[0] == 1
         assert 13 < direct[-1] < 100
         assert direct == list(range(1, direct[-1] + 1, 6))

@@ -12,10 +12,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
+from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
-from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
 from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
