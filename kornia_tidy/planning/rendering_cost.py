@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends import direct, direct_occlusion
+from kornia_tidy.render.backends.dense import LARGEST_PLANE
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, cheapest_grid
 from kornia_tidy.render.cost_model import (
     DenseOcclusionWork,
@@ -161,7 +162,12 @@ def rendering_bytes(scene: SceneWork, channels: int, *, double: bool = False, th
 def _fastest(scene: SceneWork, channels: int, double: bool, threads: int | None) -> tuple[float, str, Any]:
     """Return the time of the fastest backend, its name and its work."""
     profile, threads = scene.profile, threads or torch.get_num_threads()
-    works = [(name, _as_rendered(work, channels, double)) for name, work in scene.works.items()]
+    plane = scene.pixels * channels * (8 if double or scene.compositing == "occlusion" else 4)
+    works = [
+        (name, _as_rendered(work, channels, double))
+        for name, work in scene.works.items()
+        if name != "dense" or plane <= LARGEST_PLANE
+    ]
     times = [(seconds_of(work, profile, threads), name, work) for name, work in works]
     return min(times, key=lambda entry: entry[0])
 

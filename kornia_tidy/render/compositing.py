@@ -1,4 +1,4 @@
-"""Compositing: the image of a scene whose pixels lie in different defocus layers, one PSF a layer.
+"""Compositing of a scene with many defocus layers, each with its PSF.
 
 Each function makes a layered scene of its arguments (:mod:`kornia_tidy.render.scene`) and hands it to a backend
 (:mod:`kornia_tidy.render.dispatch`). All backends give the same image. Light is linear throughout.
@@ -141,8 +141,8 @@ def gather(
         >>> (coded[0, 0, 2] * 100).round().int().tolist()
         [0, 0, 25, 75, 0]
     """
-    options = {"layers": layers, "border": border, "correlate": correlate, "method": method}
-    return _composite(image, defocus, nodes, psfs, veil, compositing="gather", **options)
+    options = {"compositing": "gather", "layers": layers, "border": border}
+    return _composite(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 def scatter(
@@ -181,8 +181,8 @@ def scatter(
 
     Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
     """
-    options = {"layers": layers, "border": border, "correlate": correlate, "method": method}
-    return _composite(image, defocus, nodes, psfs, veil, compositing="scatter", **options)
+    options = {"compositing": "scatter", "layers": layers, "border": border}
+    return _composite(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 def occlusion(
@@ -238,8 +238,8 @@ def occlusion(
         >>> (coded[0, 0, 0] * 100).round().int().tolist()
         [0, 33, 67, 100]
     """
-    options = {"layers": layers, "border": border, "correlate": correlate, "method": method}
-    return _composite(image, defocus, nodes, psfs, veil, compositing="occlusion", **options)
+    options = {"compositing": "occlusion", "layers": layers, "border": border}
+    return _composite(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": scatter, "occlusion": occlusion}
@@ -252,10 +252,15 @@ def _composite(
     psfs: Tensor,
     stray_light: Tensor | None,
     *,
+    compositing: str,
+    layers: str,
+    border: str,
+    correlate: bool,
     method: str,
-    **options: str,
 ) -> Tensor:
     """Render in float32 or better, whatever autocast says, and return the image's type."""
+    options = {"compositing": compositing, "layers": layers, "border": border}
     with torch.autocast(image.device.type, enabled=False):
-        coded = render_scene(layered_scene(image, defocus, nodes, psfs, stray_light, **options), method)
+        scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
+        coded = render_scene(scene, method)
     return coded.to(image.dtype)

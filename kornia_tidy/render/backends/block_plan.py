@@ -80,7 +80,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class BlockPlan:
-    """What is computed for one scene.
+    """The pairs of blocks and layers of one scene, in chunks.
 
     Args:
         grid: the blocks.

@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends.dense_occlusion import occlude_dense, occlusion_planes
-from kornia_tidy.render.borders import from_spectrum, to_spectrum
+from kornia_tidy.render.borders import from_spectrum, padded_size, to_spectrum
 from kornia_tidy.render.cost_model import DenseOcclusionWork, DenseWork, Work
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
+
+LARGEST_PLANE = 32 << 20  # bytes of all channels of an image; method="auto" takes this backend for no larger one
 
 
 class DenseBackend:
@@ -29,8 +31,7 @@ class DenseBackend:
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work for the layers in a sample of the scene's pixels."""
-        present = torch.cat([layer.flatten() for layer in scene.labels.every().terms()]).unique()
-        return _work(scene, len(present))
+        return _work(scene, scene.sampled_layers)
 
     def least_work(self, scene: LayeredScene) -> Work:
         """Return the work for a scene of one layer."""
@@ -94,10 +95,10 @@ def scatter_dense(plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, laye
 def differentiable_gradients(
     render: Callable[..., Tensor], inputs: Sequence[Tensor | None], grad: Tensor, wanted: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of what a function renders, where they are wanted, as differentiable as the function.
+    """Return gradients of a rendered image that can be differentiated in turn.
 
     Args:
-        render: function of the inputs.
+        render: function of the inputs that returns the image.
         inputs: tensors, or None.
         grad: gradient of what it returns.
         wanted: of which inputs.
@@ -116,8 +117,19 @@ def differentiable_gradients(
     return [next(found) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
+def memory_objection(scene: LayeredScene) -> str | None:
+    """Return why the memory for a scene would not be bounded, as that of other backends is, or None if it is small."""
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
+        return "for gradients it keeps a spectrum for each layer"
+    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
+    plane = scene.image.numel() * itemsize
+    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
+
+
 def _work(scene: LayeredScene, layers: int) -> Work:
-    batch, channels, height, width = scene.plane.shape
+    batch, channels, height, width = scene.image.shape
+    height, width = padded_size(height, width, scene.psf_size, scene.border)
     pixels = batch * math.prod(scene.output_size)
     if scene.compositing == "occlusion":
         return DenseOcclusionWork(height, width, layers, pixels, batch, channels)

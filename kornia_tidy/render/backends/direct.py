@@ -31,7 +31,7 @@ SOURCE = KERNELS / "direct.c"
 STRIP_ROWS, STRIP_BYTES = 4, 64  # a strip of pixels, see direct.c
 EVERY = 4  # columns of strips are counted in every fourth row of them
 SLABS = 4  # sums of a correlation that each thread makes in turn: enough for all to end together
-SLAB_BYTES = 64 << 20  # and what all of them may take
+SLAB_BYTES = 64 << 20  # most memory of all these sums
 
 
 class _Scene(ctypes.Structure):
@@ -200,12 +200,12 @@ def _library(dtype: torch.dtype) -> ctypes.CDLL:
 
 
 def _rows(plane: Tensor) -> Tensor:
-    """Return a plane whose rows lie in one piece."""
+    """Return a plane with the pixels of a row side by side in memory."""
     return plane if plane.stride(-1) == 1 else plane.contiguous()
 
 
 def _scene(plane: Tensor, shape: torch.Size, labels: Labels) -> tuple[_Scene, list[Tensor]]:
-    """Return what direct.c is told, and the tensors whose memory it names."""
+    """Return the struct that direct.c reads, and the tensors that own its memory."""
     index = _rows(labels.layer_index)
     weight = None if labels.layer_weight is None else _rows(labels.layer_weight.to(plane.dtype))
     scene = _Scene(

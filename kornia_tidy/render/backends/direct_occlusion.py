@@ -30,7 +30,7 @@ SOURCE = KERNELS / "occlusion.c"
 BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
 SMALLEST_SIDE = BAND - 1  # px, of PSFs; smaller ones are made as large
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
-COUNTED = 12  # bands of blocks, of which costs are known
+COUNTED = 12  # bands of blocks in the sample that costs are estimated from
 
 
 class _Scene(ctypes.Structure):
@@ -172,9 +172,9 @@ def _library(dtype: torch.dtype) -> ctypes.CDLL:
 def _scene(
     plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, inside: Tensor | None
 ) -> tuple[_Scene, list[Tensor]]:
-    """Return what occlusion.c is told of a scene, and the tensors whose memory it names."""
+    """Return the struct that occlusion.c reads, and the tensors that own its memory."""
     index, weight = layer_index.to(plane.dtype), layer_weight
-    if weight is not None:  # what lies in one layer alone has the index of this layer
+    if weight is not None:  # a pixel of one layer alone gets the index of this layer
         full = weight == 1
         index, weight = index + full, weight.detach().to(plane.dtype).masked_fill(full, 0)
     if inside is not None:

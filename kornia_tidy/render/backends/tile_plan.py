@@ -26,7 +26,7 @@ TileWork = TiledWork | TiledOcclusionWork
 
 @dataclass(frozen=True)
 class TileKind:
-    """What all tiles of one kind have in common.
+    """Sizes and limits of the tiles of gather and scatter, or of occlusion.
 
     Args:
         sizes: sides of windows to choose from, in samples.
@@ -49,8 +49,8 @@ class TileKind:
         return self.chunk_bytes if device.type == "cpu" else self.accelerator_bytes
 
 
-# Sides of transforms whose samples take the least time. A block is two tiles: the left window is the real and the right
-# one the imaginary part of a complex plane, so that one transform serves both. Bytes are those of one channel.
+# A block is two tiles: the left window is the real and the right one the imaginary part of a complex plane, so that one
+# transform serves both. The sizes are those with the fastest transforms. Bytes are those of one channel.
 BLOCKS = TileKind(
     sizes=(
         *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
@@ -61,7 +61,7 @@ BLOCKS = TileKind(
     windowed=False,
     chunk_bytes=5 << 20,
 )
-# With occlusion, light may be hidden by, or come from, what lies beside a tile. Bytes are those of all channels.
+# With occlusion the neighbours of a tile emit and hide light in it. Bytes are those of all channels.
 WINDOWS = TileKind(
     sizes=(16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024),
     candidates=17,

@@ -108,7 +108,7 @@ class TileWorkspace:
             left = chunk.x.start + half * tile
             across = plane[chunk.batch, :, left : left + (columns - 1) * 2 * tile + size]
             # Of every second tile, windows overlap with the row above and below only, by less than a tile: first the
-            # tiles, then what hangs over, so that no pixel is met twice in one addition.
+            # tiles, then the overhang, so that no pixel is met twice in one addition.
             for start, stop in ((0, tile), (tile, size)):
                 if start < stop:
                     top = chunk.y.start + start

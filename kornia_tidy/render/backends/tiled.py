@@ -66,7 +66,7 @@ class TiledBackend:
         """Return the rendered light."""
         keep_memory()
         labels, layers, kind = scene.labels, len(scene.psfs), self._kind(scene)
-        grid = scene.found.get(self.name) or choose_grid(labels, layers, scene.psf_size, kind)
+        grid = scene.found.get(kind) or choose_grid(labels, layers, scene.psf_size, kind)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
         weight = scene.sorted_layers[1]

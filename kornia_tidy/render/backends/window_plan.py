@@ -35,7 +35,7 @@ class WindowChunk(NamedTuple):
 
 
 class WindowPlan(NamedTuple):
-    """What is computed for one scene: tiles in chunks, and the (D',) layers that are present at all."""
+    """The tiles of one scene in chunks, and the (D',) layers that are present in it."""
 
     grid: Grid
     present: Tensor
