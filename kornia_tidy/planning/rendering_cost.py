@@ -29,7 +29,7 @@ from kornia_tidy.render.cost_model import (
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.dispatch import BACKENDS
 from kornia_tidy.render.first_use import profile_for
-from kornia_tidy.render.layers import Labels, assign_layers
+from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 
 OCCLUSION_PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.99 to 1.46 of what was measured
 DENSE_PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy
@@ -88,7 +88,7 @@ def count_work(labels: Labels, layers: int, window: int, compositing: str = "gat
         1
     """
     batch, height, width = labels.layer_index.shape
-    sample = torch.cat([layer.flatten() for layer in labels.every().terms()])
+    sample = torch.cat([layer.flatten() for layer in labels.every(SAMPLE).terms()])
     present, pixels = len(sample.unique()), labels.layer_index.numel()
     blended, extra = 1 if labels.layer_weight is None else 2, window - 1
     occlusion = compositing == "occlusion"
@@ -100,7 +100,7 @@ def count_work(labels: Labels, layers: int, window: int, compositing: str = "gat
         return SceneWork(compositing, works, present, pixels, height * width)
     output = (height - extra) * (width - extra)
     if not occlusion:
-        works["dense"] = DenseWork(height, width, present, pixels, blended, batch)
+        works["dense"] = DenseWork(height, width, present, batch * output, blended, batch)
         return SceneWork(compositing, works, present, pixels, output)
     works["dense"] = DenseOcclusionWork(height, width, present, batch * output, batch)
     scene = torch.empty(labels.layer_index[:, None].shape), torch.zeros(layers, 1, window, window)

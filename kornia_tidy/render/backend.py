@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 from torch import Tensor
@@ -29,8 +30,8 @@ class Backend(Protocol):
         """
         ...
 
-    def least_work(self, scene: LayeredScene) -> Work:
-        """Return a lower bound of :meth:`work` that takes no time: it depends on shapes alone."""
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield lower bounds of :meth:`work`: one that takes no time, then closer ones that take less time than it."""
         ...
 
     def render(self, scene: LayeredScene) -> Tensor:

@@ -73,10 +73,13 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     if len(able) == 1:
         return able[0]
     best, least, profile, threads = able[0], math.inf, _profile(scene), torch.get_num_threads()
-    bounds = {backend.name: seconds_of(backend.least_work(scene), profile, threads) for backend in able}
-    for backend in sorted(able, key=lambda backend: bounds[backend.name]):
-        if bounds[backend.name] >= least:  # all that follow cannot be faster either
-            break
+    bounds = {backend.name: backend.bounds(scene) for backend in able}
+    first = {name: seconds_of(next(own), profile, threads) for name, own in bounds.items()}
+    for backend in sorted(able, key=lambda backend: first[backend.name]):
+        # To count takes time: what cannot be faster is not counted.
+        closer = (seconds_of(work, profile, threads) for work in bounds[backend.name])
+        if first[backend.name] >= least or any(seconds >= least for seconds in closer):
+            continue
         if (seconds := seconds_of(backend.work(scene), profile, threads)) < least:
             best, least = backend, seconds
     return best

@@ -100,7 +100,7 @@ def measure(
     found: dict[tuple[Case, int], list[Measurement]] = {}
     shuffled = random.Random(0)  # noqa: S311
     try:
-        for number in range(ROUNDS):
+        for _ in range(ROUNDS):
             shuffled.shuffle(order)
             for case, count in order:
                 passed = time.perf_counter() - start

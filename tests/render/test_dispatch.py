@@ -11,6 +11,8 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.backends.dense import LARGEST_PLANE
 from kornia_tidy.render.compositing import COMPOSITING, render
+from kornia_tidy.render.cost_model import seconds_of
+from kornia_tidy.render.cost_profile import EPYC
 from kornia_tidy.render.dispatch import BACKENDS, METHODS, choose, explain, render_with
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
@@ -45,7 +47,9 @@ class TestChoose(BaseTester):
                 scene = scene_of(compositing, layers, psf_size, 80, 120)
                 for backend in BACKENDS.values():
                     if backend.refusal(scene) is None:
-                        assert 0 <= backend.least_seconds(scene) <= backend.seconds(scene) * (1 + 1e-6)
+                        own = seconds_of(backend.work(scene), EPYC)
+                        for bound in backend.bounds(scene):
+                            assert 0 <= seconds_of(bound, EPYC) <= own * (1 + 1e-6)
 
     @pytest.mark.parametrize("method", METHODS)
     @over_compositing

@@ -7,7 +7,7 @@ differentiated in turn is made from these functions instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -33,9 +33,9 @@ class DenseBackend:
         """Return the work for the layers in a sample of the scene's pixels."""
         return _work(scene, scene.sampled_layers)
 
-    def least_work(self, scene: LayeredScene) -> Work:
-        """Return the work for a scene of one layer."""
-        return _work(scene, 1)
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield the work for a scene of one layer."""
+        yield _work(scene, 1)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64."""

@@ -10,6 +10,7 @@ pixels of many layers.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -66,9 +67,9 @@ class DirectBackend:
         channels, itemsize = scene.image.shape[1], scene.image.element_size()
         return DirectWork(scene.labels.layer_index.numel(), strips, scene.psf_size, channels, itemsize)
 
-    def least_work(self, scene: LayeredScene) -> Work:
-        """Return no work: to count is cheap."""
-        return DirectWork(0, 0, scene.psf_size)
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield no work: to count is cheap."""
+        yield DirectWork(0, 0, scene.psf_size)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""

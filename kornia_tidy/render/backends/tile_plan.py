@@ -191,6 +191,19 @@ def least_work(shape: tuple[int, ...], psf_size: int, blended: int, kind: TileKi
     return _cheapest(works, grids, profile)[0]
 
 
+def least_windows(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> TileWork:
+    """Return the work where larger windows hold no more layers than the smallest ones do on average."""
+    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
+    held = float(grids[0].present(labels.every(SAMPLE), layers, SAMPLE).sum(1).double().mean())
+    few = max(1, int(held))  # some windows hold so many, the rest one more
+    works = []
+    for grid in grids:
+        more = int((held - few) * grid.blocks) if held > few else 0
+        counts = (*(0 for _ in range(few)), grid.blocks - more, more)
+        works.append(TiledOcclusionWork(grid.size, counts, grid.batch * grid.height * grid.width))
+    return _cheapest(works, grids, settled_profile())[0]
+
+
 def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -> list[Grid]:
     """Return the grids to choose from, for labels of a shape."""
     batch, height, width = shape

@@ -6,7 +6,7 @@ are made by the functions of :mod:`kornia_tidy.render.backends.dense`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from kornia_tidy.render.backends.tile_plan import (
     TileKind,
     cheapest_grid,
     choose_grid,
+    least_windows,
     least_work,
 )
 from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
@@ -57,10 +58,12 @@ class TiledBackend:
         work, scene.found[self.name] = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, self._kind(scene))
         return _of_scene(work, scene)
 
-    def least_work(self, scene: LayeredScene) -> Work:
-        """Return the work for a scene with one layer in each tile."""
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield the work for a scene with one layer in each tile; for windows then with as many as small ones hold."""
         shape, blended = tuple(scene.labels.layer_index.shape), 1 if scene.layer_weight is None else 2
-        return _of_scene(least_work(shape, scene.psf_size, blended, self._kind(scene), settled_profile()), scene)
+        yield _of_scene(least_work(shape, scene.psf_size, blended, self._kind(scene), settled_profile()), scene)
+        if scene.compositing == "occlusion":
+            yield _of_scene(least_windows(scene.labels, len(scene.psfs), scene.psf_size, self.windows), scene)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
