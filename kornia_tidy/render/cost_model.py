@@ -302,10 +302,9 @@ class BankWork:
 
 
 def _transform(height: int, width: int) -> tuple[int, float, float]:
-    """Return the samples of a transform of a plane, the factors of two of a sample, and how many of them are odd."""
+    """Return the samples of a plane's transform, the factors of two of their number, and those along odd sides."""
     sides = next_fast_size(height), next_fast_size(width)
-    samples = math.prod(sides)
-    return samples, math.log2(samples), sum(math.log2(side // (side & -side)) for side in sides)
+    return math.prod(sides), sum(map(math.log2, sides)), sum(math.log2(side) for side in sides if side % 2)
 
 
 def _spill(planes: float, cache: int) -> float:

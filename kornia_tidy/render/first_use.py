@@ -87,9 +87,10 @@ def measure_factors(kind: str, backends: Collection[Backend], profile: CostProfi
     Returns:
         None if the machine is too busy to tell: a time could not be repeated.
     """
-    start, threads = time.perf_counter(), torch.get_num_threads()
     scenes = [sample_scene(side, psf_size, compositing=kind) for side, psf_size in SAMPLES[kind]]
-    cases = [(scene, backend) for scene in scenes for backend in backends]
+    # A backend that has to be compiled is compiled by this question.
+    cases = [(scene, backend) for scene in scenes for backend in backends if backend.refusal(scene) is None]
+    start, threads = time.perf_counter(), torch.get_num_threads()
     times: list[list[float]] = [[] for _ in cases]
     for number in range(ROUNDS + 1):
         for own, (scene, backend) in zip(times, cases, strict=True):

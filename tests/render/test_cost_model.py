@@ -110,7 +110,7 @@ class TestProfile(BaseTester):
 
     @pytest.mark.parametrize("document", [[], {}, {**EPYC.as_json(), "more": 1}, {**EPYC.as_json(), "name": 1}])
     def test_exception_documents_that_are_no_profile(self, document):
-        with pytest.raises(ValueError, match="of a cost profile|a cost profile has"):
+        with pytest.raises(ValueError, match=r"of a cost profile|a cost profile has"):
             CostProfile.from_json(document)
 
     def test_exception_rates_that_are_incomplete(self):

@@ -30,7 +30,7 @@ SOURCE = KERNELS / "occlusion.c"
 BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
 SMALLEST_SIDE = BAND - 1  # px, of PSFs; smaller ones are made as large
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
-COUNTED = 12  # bands of blocks in the sample that costs are estimated from
+COUNTED, FEWEST_COUNTED = 12, 3  # bands of blocks that are counted to know the work
 
 
 class _Scene(ctypes.Structure):
@@ -120,7 +120,9 @@ class _OccludeDirectly(torch.autograd.Function):
 def count(plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None) -> list[int]:
     """Return the counts of a :class:`~kornia_tidy.render.cost_model.DirectOcclusionWork`, from every few bands."""
     scene, kept = _scene(plane, psfs, layer_index, layer_weight, None)
-    every = max(1, scene.images * scene.height // (BAND * COUNTED))
+    # Small PSFs are rendered in little more time than it takes to count, and are the fastest by far.
+    counted = min(COUNTED, max(FEWEST_COUNTED, scene.side // 4))
+    every = max(1, scene.images * scene.height // (BAND * counted))
     counts = (ctypes.c_int64 * 4)()
     if _library(plane.dtype).count(ctypes.byref(scene), ctypes.c_int64(every), counts):
         raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
