@@ -18,8 +18,6 @@ from kornia_tidy.render.borders import from_spectrum, next_fast_size, padded_siz
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
-LARGEST_PLANE = 32 << 20  # bytes of all channels of an image; method="auto" takes this backend for no larger one
-
 
 class DenseBackend:
     """Convolution of the whole plane for every layer. See :class:`kornia_tidy.render.backend.Backend`."""
@@ -135,19 +133,9 @@ def dense_cost(samples: int, layers: int, transforms: int) -> float:
     return samples * (layers * (transforms * transform + 4.5) + transform)
 
 
-def memory_objection(scene: LayeredScene) -> str | None:
-    """Return why the memory for a scene would not be bounded, as that of other backends is, or None if it is small."""
-    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
-    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
-        return "for gradients it keeps a spectrum for each layer"
-    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
-    plane = scene.image.numel() * itemsize
-    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
-
-
 def _seconds(scene: LayeredScene, layers: int) -> float:
     batch, channels, height, width = scene.image.shape
-    height, width = padded_size(height, width, scene.psf_size, scene.border)
+    height, width = padded_size(height, width, scene.psfs.shape[-1], scene.border)
     samples = batch * next_fast_size(height) * next_fast_size(width)
     # For occlusion a layer's light, its alpha and the cumulative alpha are transformed and back, in float64.
     occlusion = scene.compositing == "occlusion"

@@ -76,7 +76,7 @@ def scene_cost(scene: LayeredScene) -> float:
     """Return the time that a scene takes in nanoseconds a channel, see :func:`direct_cost`."""
     index, weight = scene.sorted_layers
     counts = count(scene.plane, scene.psfs, index, weight)
-    return direct_cost(*counts, max(scene.psf_size, SMALLEST_SIDE))
+    return direct_cost(*counts, max(scene.psfs.shape[-1], SMALLEST_SIDE))
 
 
 def occlude_scene(planes: OcclusionPlanes, labels: Labels) -> Tensor:
