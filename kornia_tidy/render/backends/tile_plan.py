@@ -92,6 +92,11 @@ class Grid:
     rows: int
     columns: int
 
+    @property
+    def blocks(self) -> int:
+        """Blocks of all images."""
+        return self.batch * self.rows * self.columns
+
     def number(self, images: Tensor, y: Tensor, x: Tensor) -> Tensor:
         """Return the block of pixels, (images, y, x), by their indices along each axis."""
         rows, columns = y // self.tile, x // (self.across * self.tile)
@@ -158,7 +163,7 @@ def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) ->
 def least_cost(shape: tuple[int, ...], psf_size: int, kind: TileKind) -> float:
     """Return the cost of labels of a shape with one layer in each block, in nanoseconds a channel."""
     grids = candidates(shape, psf_size, kind)
-    held = [torch.ones(grid.batch * grid.rows * grid.columns, dtype=torch.int64) for grid in grids]
+    held = [torch.ones(grid.blocks, dtype=torch.int64) for grid in grids]
     return min(_costs(grids, held, kind))
 
 
