@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends import direct, direct_occlusion
-from kornia_tidy.render.backends.dense import LARGEST_PLANE
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, cheapest_grid
 from kornia_tidy.render.cost_model import (
     DenseOcclusionWork,
@@ -27,7 +26,7 @@ from kornia_tidy.render.cost_model import (
     seconds_of,
 )
 from kornia_tidy.render.cost_profile import CostProfile
-from kornia_tidy.render.dispatch import BACKENDS
+from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE
 from kornia_tidy.render.first_use import profile_for
 from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 

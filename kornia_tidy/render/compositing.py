@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
@@ -82,18 +81,9 @@ def render(
         torch.Size([4, 3, 28, 44])
     """
     check_choice("compositing", compositing, COMPOSITING)
-    return _composite(
-        image,
-        defocus,
-        bank.defocus,
-        bank.psfs,
-        bank.veil,
-        compositing=compositing,
-        layers=layers,
-        border=border,
-        correlate=correlate,
-        method=method,
-    )
+    options = {"compositing": compositing, "layers": layers, "border": border}
+    scene = layered_scene(image, defocus, bank.defocus, bank.psfs, bank.veil, correlate=correlate, **options)
+    return render_scene(scene, method)
 
 
 def gather(
@@ -142,7 +132,7 @@ def gather(
         [0, 0, 25, 75, 0]
     """
     options = {"compositing": "gather", "layers": layers, "border": border}
-    return _composite(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
+    return render_scene(layered_scene(image, defocus, nodes, psfs, veil, correlate=correlate, **options), method)
 
 
 def scatter(
@@ -182,7 +172,7 @@ def scatter(
     Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
     """
     options = {"compositing": "scatter", "layers": layers, "border": border}
-    return _composite(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
+    return render_scene(layered_scene(image, defocus, nodes, psfs, veil, correlate=correlate, **options), method)
 
 
 def occlusion(
@@ -239,28 +229,7 @@ def occlusion(
         [0, 33, 67, 100]
     """
     options = {"compositing": "occlusion", "layers": layers, "border": border}
-    return _composite(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
+    return render_scene(layered_scene(image, defocus, nodes, psfs, veil, correlate=correlate, **options), method)
 
 
 COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": scatter, "occlusion": occlusion}
-
-
-def _composite(
-    image: Tensor,
-    defocus: Tensor,
-    nodes: Tensor,
-    psfs: Tensor,
-    stray_light: Tensor | None,
-    *,
-    compositing: str,
-    layers: str,
-    border: str,
-    correlate: bool,
-    method: str,
-) -> Tensor:
-    """Render in float32 or better, whatever autocast says, and return the image's type."""
-    options = {"compositing": compositing, "layers": layers, "border": border}
-    with torch.autocast(image.device.type, enabled=False):
-        scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
-        coded = render_scene(scene, method)
-    return coded.to(image.dtype)

@@ -2,57 +2,63 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.render.backend import Backend
-from kornia_tidy.render.backends.dense import DenseBackend, memory_objection
+from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.first_use import profile_for
+from kornia_tidy.render.layers import SAMPLE
 from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_followed
 
 BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
 METHODS = ("auto", *BACKENDS)
+LARGEST_PLANE = 32 << 20  # bytes of all channels of an image, up to which "auto" may take dense
+REMEMBERED = 256  # choices, each of some 500 bytes and a grid
+
+_choices: dict[tuple[Hashable, ...], tuple[Backend, dict[Any, Any]]] = {}
 
 
-def render_scene(scene: LayeredScene, method: str = "auto") -> Tensor:
-    """Render a layered scene by the cheapest backend, or by one that is named.
+def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
+    """Render a layered scene by the cheapest backend, or by one that is named or given.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``.
+        method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``, or a backend.
 
     Returns:
-        (B, C, h, w) light in the scene's dtype.
+        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says.
 
     Raises:
         ValueError: if the method is not known, or does not support the scene.
     """
-    return render_with(choose(scene, method), scene)
-
-
-def render_with(backend: Backend, scene: LayeredScene) -> Tensor:
-    """Render a layered scene by a backend, with its stray light."""
-    coded = backend.render(scene)
-    if scene.stray_light is None or scene.compositing == "occlusion":
-        return coded
-    return coded + stray_light_of(scene)
+    with torch.autocast(scene.image.device.type, enabled=False):
+        backend = choose(scene, method) if isinstance(method, str) else method
+        coded = backend.render(scene)
+        if scene.stray_light is not None and scene.compositing != "occlusion":
+            coded = coded + stray_light_of(scene)
+    return coded.to(scene.dtype)
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """Return the backend that :func:`render_scene` takes.
 
     Of those that support the scene it is the one with the least estimated time. Dense rendering is taken only while
-    its memory stays small, or if nothing else supports the scene.
+    its memory stays small, or if nothing else supports the scene. The choice for a sample of layers is remembered: it
+    takes as long as to render a small image.
 
     Args:
         scene: to be rendered.
@@ -67,22 +73,52 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return BACKENDS[method]
+    key = _fingerprint(scene)
+    if key in _choices and refusal(_choices[key][0], scene) is None:
+        best, grids = _choices[key]
+        scene.grids.update(grids)
+        return best
     able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
     if len(able) > 1 and memory_objection(scene) is not None:
         able.remove(BACKENDS["dense"])
-    if len(able) == 1:
-        return able[0]
+    best = _fastest(able, scene) if len(able) > 1 else able[0]
+    if key is not None:
+        if len(_choices) >= REMEMBERED:
+            _choices.clear()
+        _choices[key] = best, dict(scene.grids)
+    return best
+
+
+def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
+    """Return the backend with the least estimated time. To count takes time: what cannot be faster is not counted."""
     best, least, profile, threads = able[0], math.inf, _profile(scene), torch.get_num_threads()
     bounds = {backend.name: backend.bounds(scene) for backend in able}
     first = {name: seconds_of(next(own), profile, threads) for name, own in bounds.items()}
     for backend in sorted(able, key=lambda backend: first[backend.name]):
-        # To count takes time: what cannot be faster is not counted.
         closer = (seconds_of(work, profile, threads) for work in bounds[backend.name])
         if first[backend.name] >= least or any(seconds >= least for seconds in closer):
             continue
         if (seconds := seconds_of(backend.work(scene), profile, threads)) < least:
             best, least = backend, seconds
     return best
+
+
+def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
+    """Return what a choice depends on, with a digest of the sample of layers that costs are estimated from.
+
+    None on an accelerator, which one would have to wait for, and where torch compiles or transforms the renderer.
+    """
+    labels = scene.labels
+    if labels.layer_index.device.type != "cpu" or is_followed():
+        return None
+    digest = hashlib.blake2b(digest_size=16)
+    for layer in labels.every(SAMPLE).terms():
+        digest.update(layer.contiguous().numpy())
+    # With occlusion the values of PSFs matter too.
+    refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
+    objected, threads, shape = memory_objection(scene), torch.get_num_threads(), labels.layer_index.shape
+    shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
+    return scene.compositing, *shapes, refused, objected, threads, digest.digest()
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:
@@ -93,6 +129,16 @@ def refusal(backend: Backend, scene: LayeredScene) -> str | None:
     if backend.name != "dense" and is_followed():
         return "torch.compile, torch.func and forward-mode derivatives need plain operations of torch"
     return backend.refusal(scene)
+
+
+def memory_objection(scene: LayeredScene) -> str | None:
+    """Return why the memory of dense rendering is too large for a scene, or None if it is small."""
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
+        return "for gradients it keeps a spectrum for each layer"
+    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
+    plane = scene.image.numel() * itemsize
+    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
 
 
 @dataclass(frozen=True)
@@ -133,10 +179,10 @@ def explain(scene: LayeredScene) -> Explanation:
         >>> sorted(explanation.seconds), explanation.objections
         (['dense', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
     """
-    (height, width), (batch, channels) = scene.output_size, scene.image.shape[:2]
+    (height, width), (batch, channels), side = scene.output_size, scene.image.shape[:2], scene.psfs.shape[-1]
     words = (
         f"{scene.compositing} of {batch} x {channels} channels of {height}x{width} px, {scene.sampled_layers} of "
-        f"{len(scene.psfs)} layers, PSFs of {scene.psf_size}x{scene.psf_size} px, {torch.get_num_threads()} threads"
+        f"{len(scene.psfs)} layers, PSFs of {side}x{side} px, {torch.get_num_threads()} threads"
     )
     objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
     profile, threads = _profile(scene), torch.get_num_threads()

@@ -111,11 +111,11 @@ def measure_factors(kind: str, backends: Collection[Backend], profile: CostProfi
 
 
 def time_rendering(backend: Backend, scene: LayeredScene) -> float:
-    """Return the seconds that a backend takes to render a scene whose labels are not known yet.
+    """Return the seconds that a backend takes to render a scene of which nothing is known yet.
 
     On one thread it is the time of the processor, which does not run while something else does.
     """
-    fresh = replace(scene, found={})
+    fresh = replace(scene, found={}, grids={})
     alone = torch.get_num_threads() == 1 and time.get_clock_info("thread_time").resolution <= FINEST
     clock = time.thread_time if alone else time.perf_counter
     start = clock()

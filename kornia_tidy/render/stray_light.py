@@ -94,10 +94,10 @@ def stray_light_of(scene: LayeredScene) -> Tensor:
     assert scene.stray_light is not None
     if scene.compositing == "scatter":
         strayed = blend_of_layers(scene.stray_light, scene.layer_index, scene.layer_weight) * scene.image
-        return spread_evenly(strayed, scene.psf_size, scene.border)
+        return spread_evenly(strayed, scene.psfs.shape[-1], scene.border)
     index, weight = scene.sorted_layers
     taken = blend_of_layers(scene.stray_light, index[:, None], None if weight is None else weight[:, None])
-    return taken * spread_evenly(scene.image, scene.psf_size, scene.border)
+    return taken * spread_evenly(scene.image, scene.psfs.shape[-1], scene.border)
 
 
 def normalised_share(stray_light: Tensor, psfs: Tensor, shape: Sequence[int], border: str) -> Tensor:

@@ -19,7 +19,7 @@ from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
 from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.scene import scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies import round_off, written_out
 from tests.rounding import gamma
@@ -134,7 +134,7 @@ def occlude(draw: random.Random) -> Call:
 
     def truth() -> tuple[Tensor, float]:
         shared = None if fraction is None else fraction[:, None]
-        scene = LayeredScene(image, lower[:, None], shared, psfs, veil, border, "occlusion")
+        scene = scene_of_layers(image, lower[:, None], shared, psfs, veil, border, "occlusion", dtype)
         expected = DenseBackend().render(scene)
         apart = 1 if dtype == torch.float32 else 1 + 3 * side**2
         return expected, 6 * layers * (layers + 1) * apart * gamma(side**2 + 16, dtype)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_tidy.kernels import build
-from kornia_tidy.render import cost_store
+from kornia_tidy.render import cost_store, dispatch
 from kornia_tidy.render.cost_profile import EPYC, XEON
 from kornia_tidy.render.cost_store import (
     KINDS,
@@ -35,6 +35,7 @@ def cache(tmp_path, monkeypatch):
     """An empty cache, as on a new machine, in a process that has not asked yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv(cost_store.TUNE)
+    monkeypatch.setattr(dispatch, "_choices", {})
     build.cache_folder.cache_clear()
     forget_in_process()
     yield tmp_path / "kornia_tidy"

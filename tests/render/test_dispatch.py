@@ -9,11 +9,10 @@ import torch
 
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.render.backends import direct, direct_occlusion
-from kornia_tidy.render.backends.dense import LARGEST_PLANE
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import EPYC
-from kornia_tidy.render.dispatch import BACKENDS, METHODS, choose, explain, render_with
+from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE, METHODS, choose, explain, render_scene
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
@@ -60,7 +59,7 @@ class TestChoose(BaseTester):
         expected = explain(scene).backend if method == "auto" else method
         if expected in explain(scene).objections:
             pytest.skip("this scene cannot be rendered directly")
-        coded = render_with(BACKENDS[expected], scene).to(image.dtype)
+        coded = render_scene(scene, BACKENDS[expected])
         assert torch.equal(render(image, defocus, bank, compositing, method=method), coded)
 
     def test_exception_unknown_method(self):
@@ -87,9 +86,9 @@ class TestChoose(BaseTester):
         """Dense is passed over where gradients are wanted, and for large images."""
         scene = scene_of("scatter", 2, 31, 32, 32)
         assert choose(scene).name == "dense"
-        assert choose(replace(scene, psfs=scene.psfs.clone().requires_grad_(), found={})).name == "tiled"
+        assert choose(replace(scene, psfs=scene.psfs.clone().requires_grad_(), grids={})).name == "tiled"
         with torch.no_grad():
-            assert choose(replace(scene, psfs=scene.psfs.clone().requires_grad_(), found={})).name == "dense"
+            assert choose(replace(scene, psfs=scene.psfs.clone().requires_grad_(), grids={})).name == "dense"
         large = scene_of("scatter", 1, 1, LARGEST_PLANE // 12 // 2048 + 1, 2048)
         assert "a dozen planes" in explain(large).objections["dense"]
         assert choose(large).name == "tiled"
@@ -102,7 +101,7 @@ class TestChoose(BaseTester):
     @over_compositing
     def test_feature_backends_agree(self, compositing):
         scene = scene_of(compositing)
-        coded = [render_with(b, scene).double() for b in BACKENDS.values() if b.refusal(scene) is None]
+        coded = [render_scene(scene, b).double() for b in BACKENDS.values() if b.refusal(scene) is None]
         assert len(coded) == (2 if compositing == "scatter" else 3)
         for other in coded[1:]:
             self.assert_close(other, coded[0], rtol=0, atol=2e-5)

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from kornia_tidy.render import cost_store, first_use
+from kornia_tidy.render import cost_store, dispatch, first_use
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import EPYC
 from kornia_tidy.render.cost_store import StoredProfile, read_profile, shipped_profile, write_profile
@@ -115,6 +115,7 @@ class TestProfileFor(BaseTester):
         monkeypatch.setenv(cost_store.TUNE, "off")
         assert choose(sample_scene(200, 15)).name == "direct"
         monkeypatch.delenv(cost_store.TUNE)
+        monkeypatch.setattr(dispatch, "_choices", {})
         cost_store.forget_in_process()
         assert choose(sample_scene(200, 15)).name == "tiled"
         assert choose(sample_scene(100, 15)).name == "direct"

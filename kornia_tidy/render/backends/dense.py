@@ -18,8 +18,6 @@ from kornia_tidy.render.cost_model import DenseOcclusionWork, DenseWork, Work
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
-LARGEST_PLANE = 32 << 20  # bytes of all channels of an image; method="auto" takes this backend for no larger one
-
 
 class DenseBackend:
     """Convolution of the whole plane for every layer. See :class:`kornia_tidy.render.backend.Backend`."""
@@ -117,19 +115,9 @@ def differentiable_gradients(
     return [next(found) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
-def memory_objection(scene: LayeredScene) -> str | None:
-    """Return why the memory for a scene would not be bounded, as that of other backends is, or None if it is small."""
-    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
-    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
-        return "for gradients it keeps a spectrum for each layer"
-    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
-    plane = scene.image.numel() * itemsize
-    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
-
-
 def _work(scene: LayeredScene, layers: int) -> Work:
     batch, channels, height, width = scene.image.shape
-    height, width = padded_size(height, width, scene.psf_size, scene.border)
+    height, width = padded_size(height, width, scene.psfs.shape[-1], scene.border)
     pixels = batch * math.prod(scene.output_size)
     if scene.compositing == "occlusion":
         return DenseOcclusionWork(height, width, layers, pixels, batch, channels)

@@ -93,7 +93,7 @@ def occlusion_planes(scene: LayeredScene) -> OcclusionPlanes:
     """Return the planes that a scene with occlusion is rendered from."""
     image, stray_light, inside = scene.image, scene.stray_light, None
     if scene.border == "zero":
-        inside = pad_border(torch.ones_like(image[:1, 0]), scene.psf_size // 2, "zero")
+        inside = pad_border(torch.ones_like(image[:1, 0]), scene.psfs.shape[-1] // 2, "zero")
     mean = None if stray_light is None else image.mean((-2, -1))
     if stray_light is not None:
         stray_light = normalised_share(stray_light, scene.psfs, image.shape[-2:], scene.border)

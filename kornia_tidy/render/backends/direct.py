@@ -57,7 +57,7 @@ class DirectBackend:
             return "direct convolution gathers light and does not scatter it"
         if scene.compositing == "occlusion":
             return direct_occlusion.refusal(scene.output_size, scene.psfs)
-        return refusal(scene.output_size, scene.image)
+        return refusal(scene.labels, scene.image.dtype)
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work: the pairs of strips and layers, or what occlusion has in their place."""
@@ -65,11 +65,11 @@ class DirectBackend:
             return direct_occlusion.scene_work(scene)
         strips = count_pairs(scene.labels, scene.image.dtype)
         channels, itemsize = scene.image.shape[1], scene.image.element_size()
-        return DirectWork(scene.labels.layer_index.numel(), strips, scene.psf_size, channels, itemsize)
+        return DirectWork(scene.labels.layer_index.numel(), strips, scene.psfs.shape[-1], channels, itemsize)
 
     def bounds(self, scene: LayeredScene) -> Iterator[Work]:
         """Yield no work: to count is cheap."""
-        yield DirectWork(0, 0, scene.psf_size)
+        yield DirectWork(0, 0, scene.psfs.shape[-1])
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
@@ -81,31 +81,30 @@ class DirectBackend:
         return _GatherDirectly.apply(scene.plane, scene.psfs, weight, scene.labels)
 
 
-def refusal(output_size: tuple[int, int], image: Tensor) -> str | None:
-    """Return why an output of a size cannot be gathered directly, or None if it can.
+def refusal(labels: Labels, dtype: torch.dtype) -> str | None:
+    """Return why light cannot be gathered directly, or None if it can.
 
     Args:
-        output_size: height and width.
-        image: light, of which device and type count.
+        labels: the layers of the output's pixels.
+        dtype: of the light.
     """
-    device, dtype = image.device.type, image.dtype
-    if device != "cpu":
-        return f"direct convolution runs on processors, and the image is on {device!r}"
+    index = labels.layer_index
+    if index.device.type != "cpu":
+        return f"direct convolution runs on processors, and the image is on {index.device.type!r}"
     if dtype not in REALS:
         return f"direct convolution is in float32 or float64, and the image in {dtype}"
-    smallest = (STRIP_ROWS, 2 * STRIP_BYTES // dtype.itemsize)
-    if output_size[0] < smallest[0] or output_size[1] < smallest[1]:
-        size = "x".join(map(str, output_size))
-        return f"direct convolution needs an output of at least {smallest[0]}x{smallest[1]} pixels, got {size}"
+    (height, width), smallest = index.shape[-2:], (STRIP_ROWS, 2 * STRIP_BYTES // dtype.itemsize)
+    if height < smallest[0] or width < smallest[1]:
+        least = "x".join(map(str, smallest))
+        return f"direct convolution needs an output of at least {least} pixels, got {height}x{width}"
     if compiled(SOURCE, dtype) is None:
         return "direct convolution needs a C compiler (see `kornia-tidy info`)"
     return None
 
 
 def can_go_directly(labels: Labels, dtype: torch.dtype) -> bool:
-    """Return whether labels of the output's pixels can be gathered directly, see :func:`refusal`."""
-    height, width = labels.layer_index.shape[-2:]
-    return refusal((height, width), torch.empty((), dtype=dtype, device=labels.layer_index.device)) is None
+    """Return whether light can be gathered directly, see :func:`refusal`."""
+    return refusal(labels, dtype) is None
 
 
 class _GatherDirectly(torch.autograd.Function):

@@ -79,7 +79,7 @@ def scene_work(scene: LayeredScene) -> DirectOcclusionWork:
     index, weight = scene.sorted_layers
     counts = count(scene.plane, scene.psfs, index, weight)
     (batch, channels), pixels = scene.image.shape[:2], math.prod(scene.output_size)
-    side, itemsize = max(scene.psf_size, SMALLEST_SIDE), scene.image.element_size()
+    side, itemsize = max(scene.psfs.shape[-1], SMALLEST_SIDE), scene.image.element_size()
     return DirectOcclusionWork(batch * pixels, *counts, side, len(scene.psfs), channels, itemsize)
 
 

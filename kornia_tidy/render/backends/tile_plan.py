@@ -44,10 +44,6 @@ class TileKind:
     chunk_bytes: int
     accelerator_bytes: int = 256 << 20
 
-    def bytes_on(self, device: torch.device) -> int:
-        """Return the bytes that the planes of a chunk may take on a device."""
-        return self.chunk_bytes if device.type == "cpu" else self.accelerator_bytes
-
 
 # A block is two tiles: the left window is the real and the right one the imaginary part of a complex plane, so that one
 # transform serves both. The sizes are those with the fastest transforms. Bytes are those of one channel.
@@ -83,6 +79,8 @@ class Grid:
         tile: side of a tile in pixels.
         across: tiles that stand side by side in a block.
         reach: pixels beyond its lower and right end in which a layer counts as a block's own.
+        rows: blocks from top to bottom; the last ones may reach beyond the plane.
+        columns: blocks from left to right.
     """
 
     batch: int
@@ -90,28 +88,10 @@ class Grid:
     width: int
     size: int
     tile: int
-    across: int = 2
-    reach: int = 0
-
-    @property
-    def rows(self) -> int:
-        """Blocks from top to bottom."""
-        return math.ceil(self.height / self.tile)
-
-    @property
-    def columns(self) -> int:
-        """Blocks from left to right."""
-        return math.ceil(self.width / (self.across * self.tile))
-
-    @property
-    def covered_height(self) -> int:
-        """Height of all blocks: the last ones may reach beyond the plane."""
-        return self.rows * self.tile
-
-    @property
-    def covered_width(self) -> int:
-        """Width of all blocks."""
-        return self.columns * self.across * self.tile
+    across: int
+    reach: int
+    rows: int
+    columns: int
 
     @property
     def blocks(self) -> int:
@@ -132,23 +112,23 @@ class Grid:
 
     def present(self, labels: Labels, layers: int, step: int = 1) -> Tensor:
         """Return (blocks, layers) bool: which of the layers a block contains. Labels are of every ``step``-th pixel."""
-        device = labels.layer_index.device
+        device, blocks = labels.layer_index.device, self.batch * self.rows * self.columns
         images = torch.arange(self.batch, device=device)
-        y, x = (torch.arange(0, side + self.reach, step, device=device) for side in (self.height, self.width))
+        y = torch.arange(0, self.height + self.reach, step, device=device)
+        x = torch.arange(0, self.width + self.reach, step, device=device)
         row, column = self.number(images, y, x[:1]) * layers, self.number(images[:1], y[:1], x) * layers
-        reached_y = self._reached(y, self.tile, self.rows)
-        reached_x = self._reached(x, self.across * self.tile, self.columns)
-        present = torch.zeros(self.blocks * layers, dtype=torch.bool, device=device)
+        present = torch.zeros(blocks * layers, dtype=torch.bool, device=device)
         for first in range(0, len(y), 64):  # in a processor's cache
             part = slice(first, first + 64)
             for layer in labels.terms(slice(None), part):
                 keys = (layer + column).add_(row[:, part])
                 present.index_fill_(0, keys.reshape(-1), True)
                 if self.reach:
-                    left, above = keys[..., reached_x] - layers, reached_y[part]
-                    present.index_fill_(0, left.reshape(-1), True)
-                    for reaching in (keys, left):  # the blocks above
-                        present.index_fill_(0, reaching[:, above].sub_(self.columns * layers).reshape(-1), True)
+                    above = keys[:, self._reached(y[part], self.tile, self.rows)] - self.columns * layers
+                    present.index_fill_(0, above.reshape(-1), True)
+                    before = self._reached(x, self.across * self.tile, self.columns)
+                    for own in (keys, above):
+                        present.index_fill_(0, own[..., before].sub_(layers).reshape(-1), True)
         return present.view(-1, layers)
 
     def _reached(self, pixels: Tensor, block: int, blocks: int) -> Tensor:
@@ -217,12 +197,12 @@ def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -
 
 def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: TileKind) -> Grid:
     """Return the grid of the fewest blocks; where overlap is free, in tiles no larger than needed."""
-    tile = size - psf_size + 1
-    if kind.windowed:
-        return Grid(batch, height, width, size, tile, kind.across, psf_size - 1)
+    tile, reach = size - psf_size + 1, psf_size - 1 if kind.windowed else 0
     rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
-    needed = max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2)
-    return Grid(batch, height, width, size, min(tile, needed), kind.across)
+    if not kind.windowed:
+        tile = min(tile, max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2))
+        rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
+    return Grid(batch, height, width, size, tile, kind.across, reach, rows, columns)
 
 
 def _works(grids: list[Grid], present: list[Tensor], blended: int, kind: TileKind) -> list[TileWork]:

@@ -20,7 +20,6 @@ from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.tile_plan import (
     BLOCKS,
     WINDOWS,
-    Grid,
     TileKind,
     cheapest_grid,
     choose_grid,
@@ -55,21 +54,24 @@ class TiledBackend:
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work with the best tiles for the scene."""
-        work, scene.found[self.name] = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, self._kind(scene))
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        work, scene.grids[kind] = cheapest_grid(scene.labels, len(scene.psfs), scene.psfs.shape[-1], kind)
         return _of_scene(work, scene)
 
     def bounds(self, scene: LayeredScene) -> Iterator[Work]:
         """Yield the work for a scene with one layer in each tile; for windows then with as many as small ones hold."""
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
         shape, blended = tuple(scene.labels.layer_index.shape), 1 if scene.layer_weight is None else 2
-        yield _of_scene(least_work(shape, scene.psf_size, blended, self._kind(scene), settled_profile()), scene)
+        yield _of_scene(least_work(shape, scene.psfs.shape[-1], blended, kind, settled_profile()), scene)
         if scene.compositing == "occlusion":
-            yield _of_scene(least_windows(scene.labels, len(scene.psfs), scene.psf_size, self.windows), scene)
+            yield _of_scene(least_windows(scene.labels, len(scene.psfs), scene.psfs.shape[-1], self.windows), scene)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
         keep_memory()
-        labels, layers, kind = scene.labels, len(scene.psfs), self._kind(scene)
-        grid = scene.found.get(kind) or choose_grid(labels, layers, scene.psf_size, kind)
+        labels, layers = scene.labels, len(scene.psfs)
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
         weight = scene.sorted_layers[1]
@@ -77,10 +79,10 @@ class TiledBackend:
         plan = plan_blocks(labels, layers, grid, kind)
         if scene.compositing == "scatter":
             return _Scatter.apply(scene.plane, scene.psfs, weight, plan)
-        return _Gather.apply(_plane_with_spare(scene, grid), scene.psfs, weight, plan)
-
-    def _kind(self, scene: LayeredScene) -> TileKind:
-        return self.windows if scene.compositing == "occlusion" else self.blocks
+        # Room below and on the right for tiles that hang over, where the border can fill it.
+        spare = (grid.rows * grid.tile - grid.height, grid.columns * grid.across * grid.tile - grid.width)
+        plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, spare)
+        return _Gather.apply(plane, scene.psfs, weight, plan)
 
 
 def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work:
@@ -90,12 +92,6 @@ def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work
     return replace(work, channels=scene.image.shape[1], itemsize=scene.image.element_size())
 
 
-def _plane_with_spare(scene: LayeredScene, grid: Grid) -> Tensor:
-    """Return the plane with room below and on the right for tiles that hang over, where its border can fill it."""
-    spare = (grid.covered_height - grid.height, grid.covered_width - grid.width)
-    return pad_border(scene.image, scene.psf_size // 2, scene.border, spare)
-
-
 class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, plan: BlockPlan) -> Tensor:
@@ -103,10 +99,12 @@ class _Gather(torch.autograd.Function):
         ctx.plan = plan
         work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
         blended = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
-        for chunk, offsets, c in work.steps():
-            light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-            blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-            work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
+        for chunk in plan.chunks:
+            offsets = work.offsets(chunk)
+            for c in range(psfs.shape[1]):
+                light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+                blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
+                work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
         return blended
 
     @staticmethod
@@ -133,18 +131,20 @@ def gather_gradients(
     work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
     gradients = TileGradients(wanted, plane, work)
     full = work.tiled_plane(plane) if gradients.plane else None
-    for chunk, offsets, c in work.steps():
-        if gradients.plane or gradients.psfs is not None:
-            own = torch.fft.fft2(work.scatter_to_planes(grad[:, c][chunk.pixels], offsets, chunk))
-        if gradients.layer_weight is not None or gradients.psfs is not None:
-            light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-        if gradients.layer_weight is not None:
-            blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-            gradients.add_layer_weight(blurred, grad[:, c][chunk.pixels], offsets, chunk)
-        if gradients.psfs is not None:
-            gradients.add_psfs(light, own, chunk, c)
-        if full is not None:
-            work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.conjugate[c], chunk)), chunk)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            if gradients.plane or gradients.psfs is not None:
+                own = torch.fft.fft2(work.scatter_to_planes(grad[:, c][chunk.pixels], offsets, chunk))
+            if gradients.layer_weight is not None or gradients.psfs is not None:
+                light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+            if gradients.layer_weight is not None:
+                blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
+                gradients.add_layer_weight(blurred, grad[:, c][chunk.pixels], offsets, chunk)
+            if gradients.psfs is not None:
+                gradients.add_psfs(light, own, chunk, c)
+            if full is not None:
+                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.conjugate[c], chunk)), chunk)
     if full is not None:
         full = full[..., : plane.shape[-2], : plane.shape[-1]]
     return full, gradients.of_psfs(psfs, conjugate=False), gradients.layer_weight
@@ -157,9 +157,11 @@ class _Scatter(torch.autograd.Function):
         ctx.plan = plan
         work = TileWorkspace(plan, psfs, 0)
         full = work.tiled_plane(plane)
-        for chunk, offsets, c in work.steps():
-            own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
-            work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
+        for chunk in plan.chunks:
+            offsets = work.offsets(chunk)
+            for c in range(psfs.shape[1]):
+                own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
+                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
         return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
 
     @staticmethod
@@ -172,18 +174,20 @@ class _Scatter(torch.autograd.Function):
         gradients = TileGradients(wanted, plane, work)
         gathered = torch.empty_like(plane) if gradients.plane else None
         full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
-        for chunk, offsets, c in work.steps():
-            light = torch.fft.fft2(work.windows(full[:, c], chunk))
-            pixels = plane[:, c][chunk.pixels]
-            if gradients.psfs is not None:
-                own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
-                gradients.add_psfs(light, own, chunk, c)
-            if gathered is not None or gradients.layer_weight is not None:
-                blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
-                if gradients.layer_weight is not None:
-                    gradients.add_layer_weight(blurred, pixels, offsets, chunk)
-                if gathered is not None:
-                    work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
+        for chunk in plan.chunks:
+            offsets = work.offsets(chunk)
+            for c in range(psfs.shape[1]):
+                light = torch.fft.fft2(work.windows(full[:, c], chunk))
+                pixels = plane[:, c][chunk.pixels]
+                if gradients.psfs is not None:
+                    own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
+                    gradients.add_psfs(light, own, chunk, c)
+                if gathered is not None or gradients.layer_weight is not None:
+                    blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
+                    if gradients.layer_weight is not None:
+                        gradients.add_layer_weight(blurred, pixels, offsets, chunk)
+                    if gathered is not None:
+                        work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
         return gathered, gradients.of_psfs(psfs, conjugate=True), gradients.layer_weight, None
 
 

@@ -132,7 +132,7 @@ def _gradients(
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients with respect to light, PSFs, layer weight, mean and stray light, where they are wanted."""
     padded, grid = _padded(planes, plan), plan.grid
-    grad = pad(grad, (0, grid.covered_width - grid.width, 0, grid.covered_height - grid.height))
+    grad = pad(grad, (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height))
     gradients = {
         name: torch.zeros_like(source, memory_format=torch.contiguous_format)
         for name, source, want in zip(Inputs._fields, padded[:5], wanted, strict=True)
@@ -179,7 +179,7 @@ def _padded(planes: OcclusionPlanes, plan: WindowPlan) -> Planes:
     """Return planes as large as all tiles: where the last ones hang over there is nothing new to be computed."""
     light, psfs, weight, mean, stray_light, index, inside = planes
     grid, batch = plan.grid, len(light)
-    rest = (0, grid.covered_width - grid.width, 0, grid.covered_height - grid.height)
+    rest = (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height)
     spectra = torch.fft.fft2(psfs.index_select(0, plan.present).double(), s=(grid.size, grid.size))
     return Planes(
         pad(light, rest, mode="replicate"),

@@ -22,7 +22,7 @@ from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
 from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.scene import LayeredScene, layered_scene
+from kornia_tidy.render.scene import layered_scene, scene_of_layers
 from tests.base import BaseTester
 from tests.render.backends.test_tiled import ATOL, KINDS, depth_map
 from tests.render.render_tester import RenderTester
@@ -210,7 +210,7 @@ class TestChoice(BaseTester):
         ],
     )
     def test_exception_names_why_a_scene_is_refused(self, size, where, compositing, message):
-        scene = LayeredScene(
+        scene = scene_of_layers(
             torch.zeros(1, 1, *size, device=where),
             torch.zeros(1, 1, *size, device=where, dtype=torch.int64),
             None,
@@ -218,6 +218,7 @@ class TestChoice(BaseTester):
             None,
             "reflect",
             compositing,
+            torch.float32,
         )
         assert message in (refusal(BACKENDS["direct"], scene) or "")
         with pytest.raises(ValueError, match=f"method 'direct' does not support this scene: .*{message}"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -173,7 +174,7 @@ class TestTiledRender(RenderTester):
         for by_slices in (True, False):
             work = TileWorkspace(replace(plan, by_slices=by_slices), bank.psfs, 4)
             gradients, found = TileGradients((False, True, False), plane, work), []
-            for chunk, _, c in work.steps():
+            for chunk, c in product(plan.chunks, range(2)):
                 light = torch.fft.fft2(work.windows(plane[:, c], chunk))
                 pairs = work.blur(light, work.spectra[c], chunk)
                 gradients.add_psfs(light, pairs, chunk, c)
