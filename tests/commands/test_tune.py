@@ -7,7 +7,7 @@ import pytest
 
 from kornia_tidy import cli
 from kornia_tidy.commands import tune
-from kornia_tidy.render import cost_store
+from kornia_tidy.render import cost_store, tuning
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_store import KINDS, StoredProfile, read_profile, shipped_profile, write_profile
 from kornia_tidy.render.tuning import Case, measure
@@ -27,10 +27,11 @@ class TestTune(BaseTester):
             progress(1.0)
             return [
                 replace(one, seconds=2 * seconds_of(one.work, shipped_profile(), one.threads))
-                for one in measure(cases, 0.1, threads=(THREADS,))
+                for one in measure(cases, 60, threads=(THREADS,))
                 if math.isfinite(one.seconds)
             ]
 
+        monkeypatch.setattr(tuning, "ROUNDS", 1)
         monkeypatch.setattr(tune, "tuning_cases", lambda: FEW)
         monkeypatch.setattr(tune, "measure", twice)
 
