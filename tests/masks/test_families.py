@@ -1,4 +1,4 @@
-"""What holds for every family of masks."""
+"""Contract of every mask family: shapes, limits, states, copies, gradients, half precision, compilation."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class TestEveryFamily(BaseTester):
             assert float(parameter.grad.abs().max()) > 0
 
     def test_feature_the_camera_learns_it(self, family):
-        """One Adam step moves every parameter by the learning rate in metres, and lowers the loss."""
+        """One Adam step changes every parameter by the learning rate in metres, and lowers the loss."""
         optics = TiDyOptics(family(), fidelity=FIDELITY)
         (group,) = optics.parameter_groups(lr_metres=1e-10)
         assert group["params"] == list(optics.masks.parameters())

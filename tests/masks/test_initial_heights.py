@@ -16,14 +16,14 @@ def drawn(start, seed=0):
 
 class TestFisherMask(BaseTester):
     def test_feature_is_what_the_design_finds(self):
-        """The numbers in the file are rounded to four places: 1e-11 m of height."""
+        """Against the design itself; the constants are rounded to four decimals, which is 1e-11 m of height."""
         mask, bound = design_fisher_mask(seed=3)
         heights = mask.heights()[0].detach()
         self.assert_close(fisher_mask(), heights - heights.min(), rtol=0, atol=2e-10)
         assert bound < 0.067  # rad; the mask published with PhaseCam3D has 0.0785
 
     def test_feature_finer_grids_hold_the_same_surface(self):
-        """69 pixels are three to each of 23: the middle ones lie at the same places."""
+        """69 pixels are three for each of 23, and the middle ones have the same centres."""
         fine, coarse = fisher_mask(69)[1::3, 1::3], fisher_mask()
         self.assert_close(fine - fine[11, 11], coarse - coarse[11, 11], rtol=0, atol=1e-15)
 
