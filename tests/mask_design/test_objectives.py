@@ -92,9 +92,7 @@ class TestFisherDesign(BaseTester):
         nodes = np.linspace(-10, 10, 11)
         ours = crlb(lens_with(PixelwiseMask(initial=fisher_mask())), nodes).detach()
         noise = crlb(lens_with(PixelwiseMask(1)), nodes).detach()
-        plain = crlb(
-            lens_with(PixelwiseMask(1, initial="flat")), [-0.5, 0.5]
-        ).detach()  # nearly none in focus
+        plain = crlb(lens_with(PixelwiseMask(1, initial="flat")), [-0.5, 0.5]).detach()  # nearly none in focus
         assert ours.mean() < 0.6 * noise.mean()
         assert ours.max() < 1.25 * ours.min()
         assert ours.max() < 0.5 * plain.min()

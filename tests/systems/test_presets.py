@@ -177,9 +177,7 @@ class TestPhysics(BaseTester):
     @pytest.mark.parametrize("name", ["tidy-1", "phasecam3d", "ikoma2021", "chang2019", "sitzmann2018"])
     def test_feature_with_a_flat_mask_the_focus_is_sharpest(self, name):
         optics = preset(name, masks=PixelwiseMask(1, 46 if SYSTEMS[name].smooth_iris else 23, "flat"))
-        expected = -optics.camera.chromatic_defocus(
-            optics.spectrum.wavelengths[1]
-        )  # 0 but for singlets
+        expected = -optics.camera.chromatic_defocus(optics.spectrum.wavelengths[1])  # 0 but for singlets
         assert sharpest(optics, [float(psi) for psi in range(-9, 10)]) == pytest.approx(expected, abs=0.5)
 
     def test_feature_a_fresnel_lens_moves_each_colour_by_its_wavelength(self):

@@ -43,11 +43,11 @@ class TestResolvePSF(BaseTester):
         offsets = places(8)
         images = airy_like(offsets, 0.8)
         found = resolve_psf(images, offsets, torch.full_like(images, 1e-10), cutoff=1.2)
-        seen, slopes = found.seen_from(offsets)
+        seen, slopes = found.images_at(offsets)
         self.assert_close(seen[:, 4:-4, 4:-4], images[:, 4:-4, 4:-4], rtol=0, atol=5e-3)
         step = 1e-4
         for axis in range(2):
-            ahead = found.seen_from(offsets + step * torch.eye(2, dtype=torch.float64)[axis])[0]
+            ahead = found.images_at(offsets + step * torch.eye(2, dtype=torch.float64)[axis])[0]
             self.assert_close((ahead - seen) / step, slopes[:, axis], rtol=0, atol=1e-3)
 
     def test_feature_the_variance_is_that_of_repeated_measurements(self):
