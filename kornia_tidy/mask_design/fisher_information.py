@@ -9,7 +9,7 @@ the background. No unbiased estimate of the parameters :math:`\theta` has a cova
 The derivatives of the PSF are computed under its integrals, not by finite differences: see :func:`defocus_response`.
 
 Source: Ober, Ram and Ward, Biophysical Journal 86, 1185 (2004), for the information; Shechtman, Sahl, Backer and
-Moerner, Physical Review Letters 113, 133902 (2014), for the bound as the measure of a mask.
+Moerner, Physical Review Letters 113, 133902 (2014), for the bound as an objective of mask design.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) ->
 
     .. math:: \partial_\psi W = i (K'' U K^T + K U K''^T), \qquad \partial_x W = 2\pi i\, s\, K U K'^T
 
-    Propagation is always the exact one, even if the lens has another.
+    Propagation is always exact, even if the fidelity of the lens asks for another.
 
     Args:
         lens: gives masks, modulator, camera, spectrum, window and pixel tolerance. Light outside the window is lost.

@@ -86,7 +86,7 @@ class SLMFrames:
 
     @property
     def background(self) -> int:
-        """Grey level of panel pixels outside the mask: the one whose phase is nearest to 0."""
+        """Grey level nearest to phase 0, for panel pixels outside the mask."""
         return int(nearest_level(torch.zeros(1, dtype=torch.float64), self.level_phases))
 
     def heights(self) -> Tensor:

@@ -18,7 +18,7 @@ from kornia_tidy.checks import check_choice, check_positive
 
 Edges = Literal["binary", "area"]
 
-TOLERANCE = 1e-9  # pupil radii; rounding must not close a cell whose centre lies on the rim, as at (0.6, 0.8)
+TOLERANCE = 1e-9  # pupil radii; keeps cells open if their centre is on the rim, such as (0.6, 0.8), despite rounding
 ROUND_OFF = 1e-12  # covered fractions closer to 0 or 1 than this are set to 0 or 1
 
 

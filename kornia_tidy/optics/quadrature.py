@@ -47,7 +47,7 @@ def gauss_legendre(order: int, device: torch.device | None = None) -> tuple[Tens
 
     Args:
         order: number of nodes.
-        device: of the result.
+        device: device of the result.
 
     Returns:
         Nodes and weights, (order,) float64 each.

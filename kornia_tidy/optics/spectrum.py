@@ -29,7 +29,7 @@ class Spectrum:
         wavelengths: the W samples in metres.
         weights: C rows of W numbers, the response of channel c at each wavelength, in any common unit.
         basis: C rows of W numbers, the reflectance spectrum of a scene point with the value 1 in one channel and 0 in
-            the others. None: every scene point reflects all wavelengths of a channel alike. See
+            the others. None: every scene point reflects all wavelengths of a channel equally. See
             :func:`smoothest_reflectances`.
 
     Raises:
@@ -97,7 +97,7 @@ class Spectrum:
         return tuple(tuple(w * r for w, r in zip(row, basis, strict=True)) for row in rows for basis in self.basis)
 
     def flat(self) -> Spectrum:
-        """Return this spectrum without its reflectance basis, for scenes that reflect all wavelengths alike."""
+        """Return this spectrum without its reflectance basis, for scenes that reflect all wavelengths equally."""
         return Spectrum(self.wavelengths, self.weights)
 
     @classmethod

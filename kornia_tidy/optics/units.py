@@ -137,15 +137,15 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
     lens = cast("ThinLensCamera", camera)
     nearest, farthest = (float(lens.depth(psi).detach()) for psi in (highest, lowest))
     first, last = lens.depth_range
-    alike = math.pi * lens.aperture_radius**2 / 530e-9 / SAME_FOCUS  # m; beyond, the focus is that of infinity
-    last = min(last, alike)
+    like_infinity = math.pi * lens.aperture_radius**2 / 530e-9 / SAME_FOCUS  # m; beyond, all depths have one focus
+    last = min(last, like_infinity)
     if nearest <= last or farthest > FARTHEST:
         return None
     for factor, unit in UNITS:
         if first <= nearest * factor <= last:
             return (
                 f"the nearest pixel is {nearest:.4g} m away, where this camera sees no difference from "
-                f"{'infinity' if last == alike else f'{last:.3g} m'}: are these {unit}? Multiply depth by {factor:g} "
+                f"{'infinity' if last == like_infinity else f'{last:.3g} m'}: are these {unit}? Multiply depth by {factor:g} "
                 f"(on the command line: --depth-scale {factor:g})"
             )
     return None

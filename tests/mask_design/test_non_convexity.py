@@ -98,7 +98,7 @@ class TestAutocorrelationBound(BaseTester):
 class TestWeights(BaseTester):
     @staticmethod
     def opposite() -> Tensor:
-        """Return two masks whose autocorrelations at the extreme points have opposite signs."""
+        """Return two masks with opposite autocorrelations at the extreme points."""
         phase = torch.zeros(2, 5, 5, dtype=torch.float64)
         phase[1, 0, 0] = math.pi
         return phase

@@ -62,7 +62,7 @@ class TestInitialHeights(BaseTester):
         assert not (noise[:clean].abs() > 1e-20).any()
         self.assert_close(noise[clean:].mean((1, 2)), torch.full((5 - clean,), 5.35e-7), rtol=0, atol=5e-8)
         self.assert_close(noise[clean:].std((1, 2)), torch.full((5 - clean,), 3.05e-7), rtol=0, atol=3e-8)
-        assert len({round(float(one.sum()), 12) for one in noise[clean:]}) == 5 - clean  # each its own
+        assert len({round(float(one.sum()), 12) for one in noise[clean:]}) == 5 - clean  # all differ
 
     def test_feature_fishers_that_are_alike_but_for_little_noise(self):
         noise = drawn("like fishers") - fisher_mask()
@@ -75,7 +75,7 @@ class TestInitialHeights(BaseTester):
         for heights in drawn("focal sweep"):
             psfs = CodedLens(PixelwiseMask(initial=heights[None])).psf_bank(1, defocus=depths).psfs
             sharpest.append(depths[int(psfs.amax((1, 2, 3)).argmax())])
-        self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; noise
+        self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; the noise shifts them
 
     def test_exception_unknown_start(self):
         with pytest.raises(ValueError, match=r"start must be one of 'noise', 'fisher, noise', .*, got 'tetrapod'"):

@@ -26,7 +26,7 @@ from tests.base import BaseTester
 
 
 def turns_apart(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Signed difference in radians, modulo 2 pi."""
+    """Return the signed phase difference in radians, modulo 2 pi."""
     return (a - b + math.pi).remainder(2 * math.pi) - math.pi
 
 

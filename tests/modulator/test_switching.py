@@ -168,7 +168,7 @@ class TestRandomStates(BaseTester):
 
 class TestResponse(BaseTester):
     def test_feature_exponential_solves_the_equation_of_relaxation(self):
-        """tau r' = 1 - r with r(0) = 0 and the time constant of the rise time, by SciPy."""
+        """Against SciPy's solution of tau r' = 1 - r with r(0) = 0 and tau from the rise time."""
         rise = 5e-3
         swap, tau = settling_time(rise), rise / (math.log(0.9) - math.log(0.1))
         response, _ = sampled_response("exponential", 7)

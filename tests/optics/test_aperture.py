@@ -212,7 +212,7 @@ class TestPolygonAperture(BaseTester):
         assert torch.equal(polygon_aperture(23, 0.1, **SQUARE), (expected > 0).double())  # the rim is inside
 
     def test_feature_many_sides_approach_the_disc(self):
-        """The sagitta of a side is 1 - cos(π/1000) = 5e-6, at a pitch of 0.1 that is 5e-5 of a cell's width."""
+        """The sagitta of a side is 1 - cos(π/1000) = 5e-6; at a pitch of 0.1 this is 5e-5 of a cell's width."""
         polygon = polygon_aperture(23, 0.1, 1000, edges="area")
         self.assert_close(polygon, circular_aperture(23, edges="area"), rtol=0, atol=1.5e-4)
 

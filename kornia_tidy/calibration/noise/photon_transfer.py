@@ -103,7 +103,7 @@ class PhotonTransfer:
         return (least / self.line.gain) ** 2 + ROUNDING >= RESOLVED
 
     def sensor_noise(self) -> SensorNoise:
-        """Return the sensor with this camera's noise, whose full scale is the count of saturation.
+        """Return a sensor with this camera's noise, in units where full scale is the count of saturation.
 
         Example:
             >>> line = TransferLine(2.0, 0.01, 6.0, 0.1, 0.0, 0.999, 10000)

@@ -156,7 +156,7 @@ def resolve_psf(
 
 
 def most_aliases(cutoff: float) -> int:
-    """Return the largest number of frequencies that are aliased onto one; as many images are needed to separate them.
+    """Return the largest number of frequencies aliased onto one, which is the number of images that resolve them.
 
     Args:
         cutoff: highest frequency that the lens passes, in cycles per sample.

@@ -43,7 +43,7 @@ class TestPointImages(BaseTester):
 
     @pytest.mark.parametrize("place", [(40.0, 50.0), (41.0, 51.0), (40.4, 51.3)])
     def test_feature_planes_of_a_mosaic_agree_on_one_place(self, place):
-        """Positions are in pixels of a plane, whose first pixel is the sensor's first."""
+        """Positions are in pixels of a plane; its first pixel is the first of the sensor."""
         mosaic = planes(spot(*place, channels=3, spread=24), RGGB)
         (image,) = point_images(mosaic[None], ONCE, SENSOR, 31, tile=RGGB)
         assert image.place == pytest.approx((place[0] / 2, place[1] / 2), abs=0.01)
