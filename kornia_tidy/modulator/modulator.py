@@ -282,7 +282,7 @@ class SpatialLightModulator(Modulator):
         efficiencies = [part for part in self.parts if isinstance(part, DiffractionEfficiency)]
         for part in self.parts:
             if part not in efficiencies:
-                shown = self._apply(part, shown)
+                shown = self._apply_part(part, shown)
         if isinstance(shown, Tensor):
             if not efficiencies:
                 raise TypeError(
@@ -294,7 +294,7 @@ class SpatialLightModulator(Modulator):
             shown = shown.with_undiffracted(1 - part.efficiency)
         return shown
 
-    def _apply(self, part: nn.Module, shown: Tensor | Timeline) -> Tensor | Timeline:
+    def _apply_part(self, part: nn.Module, shown: Tensor | Timeline) -> Tensor | Timeline:
         """Apply one part to the masks, or to the timeline once a timing part has given one."""
         if isinstance(shown, Tensor):
             if isinstance(part, Modulator):

@@ -143,10 +143,10 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
         return None
     for factor, unit in UNITS:
         if first <= nearest * factor <= last:
+            limit = "infinity" if last == like_infinity else f"{last:.3g} m"
             return (
-                f"the nearest pixel is {nearest:.4g} m away, where this camera sees no difference from "
-                f"{'infinity' if last == like_infinity else f'{last:.3g} m'}: are these {unit}? Multiply depth by {factor:g} "
-                f"(on the command line: --depth-scale {factor:g})"
+                f"the nearest pixel is {nearest:.4g} m away, where this camera sees no difference from {limit}: are "
+                f"these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"
             )
     return None
 
