@@ -125,6 +125,10 @@ class TestSpatialLightModulator(BaseTester):
         assert float((after - before).abs().max()) > 1e-4
         self.assert_close(after, fresh, rtol=0, atol=1e-7)
 
+    def test_feature_a_cast_reaches_the_parts(self):
+        modulator = SpatialLightModulator(GreyLevels(8), LearnableDwellTimes((1, 3))).double()
+        assert {parameter.dtype for parameter in modulator.parameters()} == {torch.float64}
+
     def test_smoke_repr_tells_the_panel(self):
         modulator = SpatialLightModulator(
             GreyLevels(8), Switching(4e-3, dwell=LearnableDwellTimes((1, 3))), fill_factor=0.93
