@@ -241,10 +241,7 @@ class ThinLensCamera(nn.Module):
         """Return this camera for images resized by ``scale``: the pixel pitch changes, so PSFs keep their metric size.
 
         Args:
-            scale: new image side over old; 0.5 halves the sides and doubles the pitch.
-
-        Raises:
-            ValueError: if the scale is not positive and finite.
+            scale: new image side over old, positive; 0.5 halves the sides and doubles the pitch.
 
         Example:
             >>> ThinLensCamera(pixel_pitch=8e-6).resized(0.5).pixel_pitch
@@ -373,11 +370,8 @@ class DefocusRange(nn.Module):
         """Return the defocus map of a normalised disparity map.
 
         Args:
-            depth: normalised disparity in [0, 1], any shape.
+            depth: normalised disparity in [0, 1], any shape; the result has the same shape and dtype.
             check_inputs: refuse NaN and values outside [0, 1].
-
-        Returns:
-            Radians at 530 nm, same shape and dtype.
 
         Raises:
             ValueError: if a value is NaN or outside [0, 1].

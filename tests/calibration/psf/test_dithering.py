@@ -39,16 +39,16 @@ class TestResolvePSF(BaseTester):
         assert error < 0.01
         assert naive > 5 * error
 
-    def test_feature_it_sees_the_images_it_was_made_of(self):
+    def test_feature_its_samples_are_the_images_that_it_was_resolved_from(self):
         offsets = places(8)
         images = airy_like(offsets, 0.8)
         found = resolve_psf(images, offsets, torch.full_like(images, 1e-10), cutoff=1.2)
-        seen, slopes = found.images_at(offsets)
-        self.assert_close(seen[:, 4:-4, 4:-4], images[:, 4:-4, 4:-4], rtol=0, atol=5e-3)
+        image, gradient = found.images_at(offsets)
+        self.assert_close(image[:, 4:-4, 4:-4], images[:, 4:-4, 4:-4], rtol=0, atol=5e-3)
         step = 1e-4
         for axis in range(2):
             ahead = found.images_at(offsets + step * torch.eye(2, dtype=torch.float64)[axis])[0]
-            self.assert_close((ahead - seen) / step, slopes[:, axis], rtol=0, atol=1e-3)
+            self.assert_close((ahead - image) / step, gradient[:, axis], rtol=0, atol=1e-3)
 
     def test_feature_the_variance_is_that_of_repeated_measurements(self):
         offsets, generator = places(6), torch.Generator().manual_seed(1)
