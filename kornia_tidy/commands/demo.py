@@ -64,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Simulate the captures, reconstruct, draw the pictures and write all."""
+    """Simulate captures, reconstruct images and depth, and write the two figures."""
     if (args.image is None) != (args.depth is None):
         raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
     require_matplotlib()
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
             systems = {name: load_pretrained(which) for name, which in SYSTEMS.items()}
             optics = systems["K = 5"].optics
             camera = optics.camera
-            assert isinstance(camera, ThinLensCamera)  # which the systems were trained with
+            assert isinstance(camera, ThinLensCamera)  # as in the training of the systems
             scene = _scene(args, camera)
             near = nearness(camera, scene.depth)
         estimates = {}
@@ -167,7 +167,7 @@ def _estimate(name: str, system: TrainedSystem, scene: Scene, noise: int) -> Est
 
 
 def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:
-    """Return a scene in colour whose depths fill the camera's range."""
+    """Return a colour scene with depths stretched over the camera's range."""
     if args.image is None:
         return DeadLeaves(1, args.size, args.size, depth_range=camera.depth_range, seed=args.seed).read(0)
     image, depth, valid = read_scene(args)
@@ -181,7 +181,7 @@ def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:
 
 
 def stretched(depth: Tensor, valid: Tensor, camera: ThinLensCamera) -> Tensor:
-    """Move the depths of a scene so that they fill a camera's range, evenly in dioptres.
+    """Stretch the depths of a scene, linearly in dioptres, over a camera's range.
 
     Example:
         >>> depth = torch.tensor([[[2.0, 3.0, 6.0]]])

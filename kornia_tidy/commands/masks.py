@@ -1,4 +1,4 @@
-"""`kornia-tidy masks`: masks to the panel of a modulator or to a printer, and back."""
+"""`kornia-tidy masks`: export of masks to SLM frames, heights or STL, and import of frames."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show_masks(args: argparse.Namespace) -> None:
-    """Say what masks a file holds."""
+    """Print the masks of a file with their size and heights."""
     heights = read_heights(args.masks, MATERIALS[args.material])
     tell("masks", _in_words(heights))
     for k, one in enumerate(heights):
@@ -133,7 +133,7 @@ def show_masks(args: argparse.Namespace) -> None:
 
 
 def export_masks(args: argparse.Namespace) -> None:
-    """Write SLM frames, heights or STL."""
+    """Export masks as SLM frames, heights or STL, by the name of the output."""
     kind = Path(args.output).suffix.lower()
     check_choice("the suffix of what to write", kind, ("", ".npy", ".stl"))
     _check_absent(args.output, args.force, args.masks, folder=not kind)
@@ -150,7 +150,7 @@ def export_masks(args: argparse.Namespace) -> None:
 
 
 def import_masks(args: argparse.Namespace) -> None:
-    """Read SLM frames back."""
+    """Import SLM frames, check them, and write their heights."""
     if args.output is not None:
         check_choice("the suffix of what to write", Path(args.output).suffix.lower(), (".npy", ".safetensors"))
         _check_absent(args.output, args.force)
@@ -271,7 +271,7 @@ def _panel_size(text: str) -> tuple[int, int]:
 
 
 def _numbers(path: str) -> list[float]:
-    """Return the numbers of a text file, whatever separates them."""
+    """Return the numbers of a text file, separated by white space, commas or semicolons."""
     try:
         return [float(word) for word in re.split(r"[\s,;]+", read_bytes(path).decode()) if word]
     except ValueError as error:
@@ -279,11 +279,11 @@ def _numbers(path: str) -> list[float]:
 
 
 def _check_absent(path: str, force: bool, source: str | None = None, folder: bool = False) -> None:
-    """Refuse what may not be replaced, before any work.
+    """Check before any work that the output may be written.
 
     Raises:
-        FileExistsError: if it is there and not to be replaced.
-        FileNotFoundError: if the folder it is to lie in does not exist.
+        FileExistsError: if it exists and is not to be replaced.
+        FileNotFoundError: if its parent folder does not exist.
     """
     target = Path(path)
     if not target.absolute().parent.is_dir():

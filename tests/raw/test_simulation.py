@@ -129,7 +129,7 @@ class TestSensorCounts(BaseTester):
             sensor_counts(light, camera(None))
         with pytest.raises(ValueError, match="color must be one of 'camera', 'channels', got 'raw'"):
             sensor_counts(light, camera(), color="raw")
-        with pytest.raises(ValueError, match="carries no matrix: choose color='channels'"):
+        with pytest.raises(ValueError, match="has no colour matrix: choose color='channels'"):
             sensor_counts(light, camera())
         with pytest.raises(ValueError, match="color='channels' needs a camera of red, green and blue, this has 'GMCY'"):
             sensor_counts(light, camera("GMYC"), color="channels")
