@@ -1,4 +1,4 @@
-"""Mosaics through whole numbers: bands of rows give what the whole picture gives, and nothing else is lost."""
+"""Quantised demosaicing: bands of rows give the same result as the whole picture, and only quantisation is lost."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class TestMeasure(BaseTester):
 class TestSweep(BaseTester):
     @pytest.fixture
     def measured(self, monkeypatch):
-        """Count what is measured, and make it up."""
+        """Replace measurements by invented rows, and count them."""
         calls = []
 
         def made_up(optics, image, depth, fidelity, truth, *, repeats, training):
