@@ -69,7 +69,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what JSON says.
+    """Parse a text of JSON.
 
     Raises:
         ValueError: if it is not JSON, or is nested too deep.

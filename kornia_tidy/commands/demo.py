@@ -1,4 +1,4 @@
-"""`kornia-tidy demo`: from a scene to a coded capture and back, as two pictures."""
+"""`kornia-tidy demo`: demonstration of capture and reconstruction, as two figures."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 DESCRIPTION = """\
-Photograph a scene with a camera whose five phase masks were learnt together with a network, and let the network
-reconstruct from that one capture an image in focus everywhere and the depth of every pixel; beside it the same with one
-mask and with a plain lens, and what five masks give that were learnt for the image alone (EDoF). Without IMAGE and
-DEPTH the scene is made by the library. The depths of IMAGE are stretched, in dioptres, over the range for which the
-masks were learnt.
+Photograph a scene with a camera with five phase masks, and reconstruct an all-in-focus image and the depth of every
+pixel from this one capture with the network that was trained together with the masks. For comparison the same is done
+with one mask, with a plain lens, and with five masks learnt for the image alone (EDoF). Without IMAGE and DEPTH the
+scene is generated. The depths of IMAGE are stretched, in dioptres, over the range for which the masks were learnt.
 """
 
 SYSTEMS = {"plain": "joint-0", "K = 1": "joint-1", "K = 5": "joint-5", "K=5 EDoF": "edof-5"}

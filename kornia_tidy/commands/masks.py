@@ -32,21 +32,21 @@ MATERIALS = {
 }
 
 DESCRIPTION = """\
-Phase masks, out of the library and back. MASKS is a file of heights in metres
-(.npy, K x rows x columns) or a camera's state_dict (.safetensors, masks.phase
-in radians at 530 nm). A state does not tell a constraint: masks with one, and
-families without a phase, are exported from Python (kornia_tidy.mask_export).
+Export and import phase masks. MASKS is a file of heights in metres (.npy, K x rows x
+columns) or a camera's state_dict (.safetensors, masks.phase in radians at 530 nm). A
+state_dict does not contain the constraint of masks: export masks with a constraint, and
+families without the parameter phase, from Python (kornia_tidy.mask_export).
 """
 
 EXPORT = """\
-Write masks for the laboratory, by the name of OUT:
-  a folder  one frame a mask for the panel of a phase modulator (PNG or TIFF),
-            timing.csv, and frames.json with all that is needed to read them
+Export masks in the format given by the name of OUT:
+  a folder  one frame per mask for the panel of a phase modulator (PNG or TIFF),
+            timing.csv, and frames.json with the settings needed to read them
             back; up to 8 bits in 8-bit files, 9 and 10 in the least
             significant bits of 16-bit files
   x.npy     heights in metres
   x.stl     one mask on a plate, in millimetres
-All of it is written or nothing, and frames are read back and compared.
+Files are written atomically, and frames are read back and compared.
 """
 
 EXPORT_EXAMPLES = """\
@@ -73,7 +73,7 @@ def add_parser(subparsers: Any) -> None:
     )
     actions = masks.add_subparsers(required=True, metavar="ACTION", title="actions")
 
-    show = actions.add_parser("show", help="say what masks a file holds", description="Say what masks a file holds.")
+    show = actions.add_parser("show", help="list the masks of a file", description="List the masks of a file.")
     _add_masks(show)
     show.set_defaults(run=show_masks)
 
@@ -91,8 +91,8 @@ def add_parser(subparsers: Any) -> None:
         "--pupil-radius",
         type=float,
         metavar="M",
-        help="of the pupil, on the panel or the plate, metres; 2.3 of it span the mask (default on a panel: the "
-        "largest that fits with whole panel pixels a mask pixel)",
+        help="of the pupil on the panel or the plate, metres; the mask is 2.3 radii wide (default on a panel: the "
+        "largest with a whole number of panel pixels per mask pixel)",
     )
     _add_panel(export)
     _add_timing(export)
@@ -111,7 +111,7 @@ def add_parser(subparsers: Any) -> None:
     back.add_argument(
         "--shown",
         action="store_true",
-        help="heights as the panel shows them, without the whole waves that it cannot (default: with them)",
+        help="heights as shown by the panel, wrapped to one wave (default: with the whole waves restored)",
     )
     _add_material(back)
     back.add_argument("--force", action="store_true", help="replace OUT")

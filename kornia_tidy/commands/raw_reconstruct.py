@@ -299,7 +299,7 @@ def table(rows: list[Row]) -> list[str]:
 
 
 def _row(path: str, future: Future[Row]) -> Row:
-    """Process one file into a row of the summary; an error becomes the text of its row."""
+    """Return the summary row of a processed file; an error is printed and becomes the text of the row."""
     try:
         return future.result()
     except Exception as error:

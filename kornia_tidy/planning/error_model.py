@@ -187,7 +187,7 @@ def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> 
     """Return the root mean square error on a scene from changes of the PSFs.
 
     Args:
-        nodes: ascending defocus in radians at which the changes are given; they are interpolated in size.
+        nodes: ascending defocus in radians at which the changes are given. In between, their power is interpolated.
         changes: (len(nodes), C, P, P).
         light: of the scene.
     """

@@ -70,13 +70,11 @@ _ENOUGH = 0.05  # of the tolerance: with errors below it, more wavelengths bring
 class Planner:
     """Planner of scenes for one camera; PSF samples of the masks are computed once and shared by all scenes.
 
-    They belong to the masks at the time of construction.
-
-    ``optics.plan`` is this for one scene and one tolerance.
+    The samples belong to the masks at the time of construction. ``optics.plan`` plans one scene for one tolerance.
 
     Args:
         optics: the camera.
-        channels: of the images: as many as its spectrum has, or 1.
+        channels: number of channels of the images: that of the spectrum, or 1.
 
     Example:
         >>> from kornia_tidy import PixelwiseMask, TiDyOptics

@@ -141,7 +141,7 @@ class CameraSurvey:
         return self._layers[window]
 
     def window_survey(self, window: int) -> tuple[tuple[float, ...], Tensor]:
-        """Return sample values of defocus over the range, and the PSFs there in the reference window."""
+        """Return sample values of defocus over the range, and the PSFs there in a window."""
         nodes = self._spread(max(1, round((self.defocus_range[1] - self.defocus_range[0]) / _WINDOW_SPACING)))
         if window not in self._wide:
             self._wide[window] = self._bank(nodes, window, _TOLERANCE, torch.float32).psfs.cpu()
