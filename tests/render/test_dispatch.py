@@ -91,11 +91,12 @@ class TestChoose(BaseTester):
 
     def test_feature_a_choice_is_remembered_for_the_same_layers_and_for_no_others(self):
         """With the tiles, which take as long to choose as a small image to render."""
-        flat = torch.zeros(1, 1, 200, 300)
-        noise, nodes = 100 * torch.randint(2, flat.shape).float(), torch.tensor([0.0, 100.0])
-        image, psfs = torch.rand(1, 1, 200, 300), torch.rand(2, 1, 23, 23)
+        flat, nodes = torch.zeros(1, 1, 200, 300), torch.arange(20.0)
+        ramp = torch.linspace(0, 19, 300).expand(flat.shape)
+        image = torch.rand(1, 1, 200, 300)
+        psfs = torch.rand(20, 1, 23, 23).requires_grad_()  # with gradients dense is no choice
         sizes = []
-        for psi in (flat, noise, flat):
+        for psi in (flat, ramp, flat):
             first, again = (
                 layered_scene(image, psi, nodes, psfs, compositing="scatter", layers="nearest") for _ in range(2)
             )
