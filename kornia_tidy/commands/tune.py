@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
 
 def tune(threads: int, seconds: float = SECONDS) -> None:
     """Measure, fit, tell how well the predictions are now, and keep the profile."""
-    path, base = profile_path(threads), shipped_profile()  # a folder that cannot be written to is told of at once
+    path, base = profile_path(threads), shipped_profile()  # an unusable folder is an error before any work
     stages = Stages()
     with stages("measured"), _progress() as bar:
         measurements = measure(tuning_cases(), seconds, progress=lambda done: bar.update(done - bar.n))

@@ -30,13 +30,13 @@ from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE
 from kornia_tidy.render.first_use import profile_for
 from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 
-OCCLUSION_PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.99 to 1.46 of what was measured
+OCCLUSION_PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.99 to 1.46 of the measured peak
 DENSE_PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy
 
 
 @dataclass(frozen=True)
 class SceneWork:
-    """What backends would do for a scene, in float32 and for one channel.
+    """The work of each backend for a scene, in float32 and for one channel.
 
     Args:
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.

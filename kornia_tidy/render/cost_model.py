@@ -14,8 +14,8 @@ from typing import ClassVar, Protocol
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.cost_profile import CostProfile, Rates
 
-# Bytes of a tile's planes from which on they leave the processor's cache, or are fetched from the system each time.
-TILE_CACHE, OCCLUSION_CACHE = 16 << 20, 64 << 20
+# Bytes of a tile's planes in one channel, beyond which they leave the cache, or are fetched from the system each time.
+TILE_CACHE, OCCLUSION_CACHE = 16 << 20, (64 << 20) // 3
 
 
 class Work(Protocol):
@@ -228,7 +228,7 @@ class TiledOcclusionWork:
         samples = self.channels * self.size**2
         several = list(enumerate(self.windows))[2:]
         held = sum(layers * count for layers, count in several)
-        large = sum(layers * count * _spill(16 * samples * layers, OCCLUSION_CACHE) for layers, count in several)
+        large = sum(layers * count * _spill(16 * self.size**2 * layers, OCCLUSION_CACHE) for layers, count in several)
         alone = sum(self.windows[:2])
         return (
             1,

@@ -262,15 +262,14 @@ RATES: dict[str, type[Rates]] = {
     "bank": BankRates,
 }
 
-# One core of an idle 2.5 GHz Xeon. What was not measured there is EPYC's: dense rates, scaled as the tiles are, and
-# planes beyond the cache.
+# One core of an idle 2.5 GHz Xeon. Dense rates and large planes were not measured there: they are EPYC's, scaled.
 XEON = CostProfile(
     name="xeon-2.5",
     direct=DirectRates(1.0, 0, 0, 70, 0, 0.95),
     tiled=TiledRates(0.5, 0, 0, 8.5, 0.099, 1.98, 1.65, 1.7, 2200),
     dense=DenseRates(0.5, 9e4, 2.8, 0.13, 0.13, 0, 1.35),
     occlusion_direct=DirectOcclusionRates(1.0, 0, 0, 250, 3.7, 320, 3, 2.3, 12, 25),
-    occlusion_tiled=TiledOcclusionRates(0.5, 0, 0, 6.9, 19.6, 8, 33, 15000),
+    occlusion_tiled=TiledOcclusionRates(0.5, 0, 0, 6.9, 19.6, 8, 60, 15000),
     occlusion_dense=DenseRates(0.5, 0, 0, 0.36, 0.17, 0, 0),
     bank=BankRates(0.5, 0, 1 / 52, 1 / 57, 1 / 90, 1 / 115),
 )

@@ -37,7 +37,7 @@ _measured: dict[tuple[int, str], CostProfile] = {}  # by threads and kind of com
 
 @dataclass(frozen=True)
 class StoredProfile:
-    """A profile and what is known of it.
+    """A profile, and the kinds of compositing that it was measured for.
 
     Args:
         profile: the prices.
@@ -54,7 +54,7 @@ def shipped_profile() -> CostProfile:
 
 
 def is_tuning_off() -> bool:
-    """Return whether the environment forbids to measure, and to read what was measured."""
+    """Return whether the environment turns off measurements and their use."""
     return os.environ.get(TUNE, "").strip().lower() in ("off", "0", "no")
 
 

@@ -81,7 +81,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
     if len(able) > 1 and memory_objection(scene) is not None:
         able.remove(BACKENDS["dense"])
-    best = _fastest(able, scene) if len(able) > 1 else able[0]
+    best = able[0] if key is None and len(able) == 1 else _fastest(able, scene)  # and its tiles, to be remembered
     if key is not None:
         if len(_choices) >= REMEMBERED:
             _choices.clear()

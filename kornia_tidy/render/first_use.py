@@ -111,7 +111,7 @@ def measure_factors(kind: str, backends: Collection[Backend], profile: CostProfi
 
 
 def time_rendering(backend: Backend, scene: LayeredScene) -> float:
-    """Return the seconds that a backend takes to render a scene of which nothing is known yet.
+    """Return the time in seconds of rendering a scene by a backend, its plan included.
 
     On one thread it is the time of the processor, which does not run while something else does.
     """

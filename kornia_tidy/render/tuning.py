@@ -27,7 +27,7 @@ from kornia_tidy.render.scene_samples import sample_scene
 
 SECONDS = 80.0  # of measuring
 ROUNDS = 9  # at most
-SLOW = 2.5  # times the fastest backend: what takes longer is not measured again, for it is not chosen
+SLOW = 2.5  # times the fastest backend: slower ones are measured once
 LONG = 0.1  # s, from which on a rendering is not repeated at once
 PRIOR = 0.05  # how much a term that nothing tells apart is drawn to its proportion, as a fraction of a time
 OUTLIER = 0.1  # of a time: errors beyond count by their size, not by its square
@@ -170,7 +170,7 @@ def fit_rates(base: Rates, measurements: Sequence[Measurement]) -> Rates:
     shares = np.array([_shares(one, start.shared) for one in measurements])  # of the time, a nanosecond of each price
     guess = np.array(start.nanoseconds)
     scale = 1 / np.median(shares @ guess)
-    # A term whose price is zero in `base` may be found, from the scale of what it takes.
+    # A price of zero in `base` starts from zero, in units of 2 % of the time.
     unit = np.where(guess > 0, scale * guess, 0.02 / np.maximum(shares.mean(0), 1e-300))
     prices = _solve(shares * unit, (guess > 0).astype(float)) * unit
     return start.with_nanoseconds(prices.tolist())

@@ -60,7 +60,7 @@ class DirectBackend:
         return refusal(scene.labels, scene.image.dtype)
 
     def work(self, scene: LayeredScene) -> Work:
-        """Return the work: the pairs of strips and layers, or what occlusion has in their place."""
+        """Return the work, from the pairs of strips and layers; of occlusion from those of blocks and layers."""
         if scene.compositing == "occlusion":
             return direct_occlusion.scene_work(scene)
         strips = count_pairs(scene.labels, scene.image.dtype)
