@@ -17,6 +17,7 @@ from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, metric_range, table, write_table
+from kornia_tidy.training.settings import TrainingSettings
 
 DESCRIPTION = """\
 Let a trained camera and network see scenes they were not trained on. FOLDER gets
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     system = load_trained(args.checkpoint)
-    trained = system.settings
+    trained = TrainingSettings.of(system)
     settings = trained.replace(**{name: value for name, value in given_settings(args).items() if name != "scenes"})
     if settings.data != trained.data and "root" not in args:
         settings = settings.replace(root=None)  # the folder was that of the other data

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
 
 MAPS = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}  # and their channels, in order
-
-Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
-"""From prediction (B, C, H, W), target (B, C, H, W) and validity, bool (B, 1, H, W) or None, to a scalar."""
-
-# The paper's, Ikoma's of depth, and PhaseCam3D's of depth; each for every map of a task.
-LOSSES: dict[str, Loss] = {"mse": mse_loss, "l1": l1_loss, "phasecam3d": phasecam3d_loss}
 
 
 def channels_of(task: str) -> int:
@@ -77,22 +68,6 @@ def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
     """
     lo, hi = camera.defocus_range
     return camera.depth(lo + (hi - lo) * nearness.clamp(0, 1))
-
-
-def task_loss(
-    loss: Loss, estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor], mask: Tensor, weights: Mapping[str, float]
-) -> Tensor:
-    """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known.
-
-    A batch whose depth is nowhere known, as a crop may lie in a hole, teaches nothing about depth: that term is zero.
-    """
-    terms = []
-    for name, maps in estimate.items():
-        if name == "depth" and not bool(mask.any()):
-            terms.append(0 * maps.sum())
-        else:
-            terms.append(weights[name] * loss(maps, truth[name], mask if name == "depth" else None))
-    return sum(terms[1:], terms[0])
 
 
 def centre_crop(tensor: Tensor, height: int, width: int) -> Tensor:

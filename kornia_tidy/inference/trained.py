@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.heads import make_head
-from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.masks.base import PhaseMasks
@@ -30,16 +31,18 @@ class TrainedSystem(NamedTuple):
 
     optics: TiDyOptics
     head: nn.Module
-    settings: TrainingSettings
+    settings: SystemSettings
     step: int
     """Steps of the optimiser that it was trained for."""
+    run: Mapping[str, Any] = MappingProxyType({})
+    """The other settings in its checkpoint, unchecked: those of the run that trained it."""
 
 
-def build_optics(settings: TrainingSettings) -> TiDyOptics:
+def build_optics(settings: SystemSettings) -> TiDyOptics:
     """Return the camera that settings describe, its masks as they are before training, its PSF window fixed.
 
     Example:
-        >>> build_optics(TrainingSettings(masks=2, window=23)).window
+        >>> build_optics(SystemSettings(masks=2, window=23)).window
         23
     """
     optics = TiDyOptics(
@@ -54,7 +57,7 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
     return fix_window(optics)
 
 
-def _masks(settings: TrainingSettings) -> PhaseMasks:
+def _masks(settings: SystemSettings) -> PhaseMasks:
     """Return the masks before training."""
     if not settings.masks:
         return FresnelLens()
@@ -70,7 +73,7 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
     return optics
 
 
-def build_head(settings: TrainingSettings) -> nn.Module:
+def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, its weights drawn from the global generator."""
     head = make_head(settings.head, channels_of(settings.task), settings.width, 3 + settings.refocus)
     if settings.refocus:
@@ -111,7 +114,8 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
             f"and use load_weights"
         )
     try:
-        settings = TrainingSettings.from_dict(state["settings"])
+        known, run = SystemSettings.split(state["settings"])
+        settings = SystemSettings(**known)
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     _check_sizes(state, settings, str(path))
@@ -119,7 +123,7 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
         look_through(head, optics)
-    return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]))
+    return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]), run)
 
 
 def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
@@ -131,7 +135,7 @@ def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None
         raise ValueError(f"cannot read {path}: it is a checkpoint without step or settings, or is damaged")
 
 
-def _check_sizes(state: Mapping[str, Any], settings: TrainingSettings, name: str) -> None:
+def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) -> None:
     """Refuse settings of another camera or network than the weights are of, before any memory is taken for these."""
     masks = state["state_dict"].get("optics.masks.phase")
     if masks is not None and settings.masks and len(masks) != settings.masks:

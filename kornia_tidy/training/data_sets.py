@@ -17,11 +17,11 @@ from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.patches import central_crop, random_crop
 from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.data.rgbd_folder import described_folder
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.tasks import metres
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
+from kornia_tidy.training.settings import TrainingSettings
 
 SPLITS = ("train", "validation", "test", "all")
 PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}

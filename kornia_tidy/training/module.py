@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.settings import SCHEDULES, TrainingSettings, differences
-from kornia_tidy.inference.tasks import LOSSES, MAPS, Loss, centre_crop, nearness, split_maps, task_loss
+from kornia_tidy.inference.tasks import MAPS, centre_crop, nearness, split_maps
 from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, look_through
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.losses import mse_loss
@@ -20,6 +19,8 @@ from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
+from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
+from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
 
 class Seen(NamedTuple):

@@ -19,7 +19,6 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch.utils.data import Dataset
 
 from kornia_tidy.files import only_here
-from kornia_tidy.inference.settings import TrainingSettings, differences
 from kornia_tidy.inference.trained import load_weights
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
@@ -27,6 +26,7 @@ from kornia_tidy.training.checkpoint import SafetensorsIO
 from kornia_tidy.training.data_module import SceneData
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.settings import TrainingSettings, differences
 
 SETTINGS = "settings.json"
 MAY_CHANGE = ("epochs", "patience")  # of a run that goes on

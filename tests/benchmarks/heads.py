@@ -33,7 +33,6 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, ship
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -41,6 +40,7 @@ from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.training.callbacks import BEST
 from kornia_tidy.training.evaluation import Looked, evaluate, mean_row
 from kornia_tidy.training.run import train
+from kornia_tidy.training.settings import TrainingSettings
 from tests.scenes import ENTRIES, load_scene
 
 SETTINGS = TrainingSettings(

@@ -12,11 +12,11 @@ import torch
 
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.tasks import nearness
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.data_sets import SCENES, make_scenes
 from kornia_tidy.training.scenes import SceneLoader
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
 from tests.data.published import write_flying_things, write_nyu
 

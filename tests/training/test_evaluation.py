@@ -11,10 +11,10 @@ from torch import nn
 
 from kornia_tidy import DefocusRange, FresnelLens, ThinLensCamera, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.tasks import nearness
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.training.evaluation import Looked, depth_row, evaluate, image_row, mean_row, table
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 INF = float("inf")

@@ -6,9 +6,9 @@ from torch import nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.training.scenes import Broken, SceneLoader
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 pl = pytest.importorskip("lightning.pytorch")
@@ -153,7 +153,7 @@ class TestCheckpoint(BaseTester):
         coded = system.optics(sample["image"], sample["depth"], generator=noise)
         assert torch.equal(coded, module.optics(sample["image"], sample["depth"], generator=noise.manual_seed(1)))
         assert torch.equal(system.head(coded), module(coded))
-        assert system.settings == module.settings
+        assert TrainingSettings.of(system) == module.settings
         assert system.step == 2
 
     def test_feature_a_network_that_refocuses_looks_through_the_masks_as_they_were_learnt(self, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import random
 
 import numpy as np
@@ -12,11 +13,15 @@ from torch import nn
 
 from kornia_tidy import DefocusRange, ThinLensCamera
 from kornia_tidy.inference.heads import make_head
-from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, load_pretrained
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
-from kornia_tidy.inference.tasks import LOSSES, centre_crop, metres, nearness, split_maps, task_loss
+from kornia_tidy.inference.tasks import centre_crop, metres, nearness, split_maps
+from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.task_loss import LOSSES, task_loss
 from tests.base import BaseTester
 
 
@@ -171,6 +176,21 @@ class TestSettings(BaseTester):
     def test_exception(self, change, sentence):
         with pytest.raises(ValueError, match=sentence):
             TrainingSettings(**change)
+
+    @pytest.mark.parametrize("name", PRETRAINED)
+    def test_feature_a_checkpoint_tells_the_settings_of_its_run(self, name):
+        stored = read_state(FOLDER / f"{name}.safetensors")["settings"]
+        settings = json.loads(json.dumps(TrainingSettings.of(load_pretrained(name)).as_dict()))
+        assert {key: settings[key] for key in stored} == stored
+
+    @pytest.mark.parametrize(
+        ("run", "sentence"),
+        [({"augment": 1}, "augment must be true or false, got 1"), ({"a" * 5000: 1}, "hold unknown names: a{1,200}$")],
+    )
+    def test_exception_settings_of_a_run_that_cannot_be(self, run, sentence):
+        system = TrainedSystem(nn.Identity(), nn.Identity(), SystemSettings(), 0, run)
+        with pytest.raises(ValueError, match=sentence):
+            TrainingSettings.of(system)
 
     @pytest.mark.parametrize("text", ["{", '{"maskz": 5}', "[1]", '{"masks": "five"}'])
     def test_exception_a_file_that_holds_no_settings_is_named(self, text, tmp_path):
