@@ -1,4 +1,4 @@
-"""Settings of a trained system: what its camera and its network are made from, as plain values that JSON can hold."""
+"""Settings of a trained system: plain values, stored as JSON, from which its camera and network are built."""
 
 from __future__ import annotations
 

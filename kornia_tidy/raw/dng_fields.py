@@ -1,4 +1,7 @@
-"""DNG files by their fields: samples of 16 bits, uncompressed in one strip."""
+"""DNG files by their fields: samples of 16 bits, uncompressed in one strip.
+
+tifffile is not used: it writes extra tags, but no Exif directory, in which exposure, aperture and lens stand.
+"""
 
 from __future__ import annotations
 

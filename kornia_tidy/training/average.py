@@ -17,7 +17,7 @@ from kornia_tidy.psf.camera_settings import EXTRA_STATE
 
 
 class MovingAverage(nn.Module):
-    r"""A copy of a network whose weights are an exponential moving average of the original's.
+    r"""Exponential moving average of a network's weights, held in a copy of the network.
 
     .. math:: a \leftarrow d_t a + (1 - d_t) w, \quad d_t = \min(d, (1 + t) / (10 + t))
 
