@@ -61,8 +61,8 @@ def render_scenes(
 
     Args:
         optics: the camera.
-        scenes: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere. Random scenes
-            must use the global generators of torch, NumPy or Python.
+        scenes: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
+            Random scenes must use the global generators of torch, NumPy or Python.
         folder: made if missing. It gets ``render.json`` (all that determines the captures), the captures and, after the
             last one, ``index.csv``. :class:`CodedCaptures` reads it.
         layout: files of the captures. Default: a folder with all maps for each item.

@@ -45,7 +45,7 @@ class UNet(ReconstructionHead):
         self.decoder = nn.ModuleList(decoder_level(coarse, fine) for fine, coarse in reversed(steps))
 
     def predict(self, image: Tensor) -> Tensor:
-        """Return the maps of an image whose sides are multiples of 16."""
+        """Return the maps of an image with sides that are multiples of 16."""
         *finer, coarsest = self.encoder
         skips = []
         for level in finer:
