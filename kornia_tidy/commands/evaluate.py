@@ -16,7 +16,7 @@ from kornia_tidy.commands.train import add_scene_options, given_settings
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.data_sets import make_scenes
-from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, metric_range, table, write_table
+from kornia_tidy.training.evaluation import SceneResult, draw_scene, evaluate, metric_range, table, write_table
 from kornia_tidy.training.settings import TrainingSettings
 
 DESCRIPTION = """\
@@ -77,9 +77,9 @@ def run(args: argparse.Namespace) -> None:
     numbers = count()
     with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene", disable=None) as progress:
 
-        def each(looked: Looked) -> None:
+        def each(result: SceneResult) -> None:
             if next(numbers) < args.pictures:
-                draw_scene(folder, looked)
+                draw_scene(folder, result)
             progress.update()
 
         rows = evaluate(system, scenes, args.noise_seed, each)

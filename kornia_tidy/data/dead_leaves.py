@@ -36,8 +36,8 @@ class _Leaves(NamedTuple):
     center: NDArray[np.float64]  # (N, 2) x, y in px
     radius: NDArray[np.float64]  # (N,) px, of the disc with the same area
     angle: NDArray[np.float64]  # (N,) rad
-    nearness: NDArray[np.float64]  # (N,) normalised inverse depth at the centre, 0 = far, 1 = near end
-    slant: NDArray[np.float64]  # (N, 2) gradient of nearness per px along x and y
+    inverse_depth: NDArray[np.float64]  # (N,) normalised inverse depth at the centre, 0 = far, 1 = near end
+    slant: NDArray[np.float64]  # (N, 2) gradient of inverse_depth per px along x and y
     outline: NDArray[np.float64]  # (N, OUTLINE_POINTS, 2) px
 
 
@@ -95,10 +95,10 @@ def dead_leaves(
     near, far = depth_range
     rng = np.random.default_rng(seed)
     leaves = _scatter_leaves(height, width, num_leaves, rng)
-    index, nearness = _rasterise(height, width, leaves)
+    index, inverse_depth = _rasterise(height, width, leaves)
     image = paint_leaves(index, leaves.center, leaves.radius, leaves.angle, rng)
 
-    dioptres = 1 / far + (1 / near - 1 / far) * nearness
+    dioptres = 1 / far + (1 / near - 1 / far) * inverse_depth
     depth = np.full_like(dioptres, np.inf)
     np.divide(1.0, dioptres, out=depth, where=dioptres > 0)
     depth = depth.astype(np.float32).clip(near, far)
@@ -185,11 +185,11 @@ def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Lea
 
     background = math.exp(-_coverage(height, width, count, smallest, largest))
     visible_below = background ** rng.random(count)  # fraction of the picture that is to show farther leaves
-    nearness = np.sort((visible_below - background) / (1 - background)) ** (MOST_FAR ** rng.random())
+    inverse_depth = np.sort((visible_below - background) / (1 - background)) ** (MOST_FAR ** rng.random())
 
     angle = rng.uniform(0, 2 * math.pi, count)
     slant = np.where(rng.random(count) < 1 / 3, rng.uniform(0, LARGEST_SLANT, count), 0.0)
-    slant = np.minimum(slant, np.minimum(nearness, 1 - nearness)) / radius  # keeps a leaf within the depth range
+    slant = np.minimum(slant, np.minimum(inverse_depth, 1 - inverse_depth)) / radius  # stays within the depth range
     direction = rng.uniform(0, 2 * math.pi, count)
     outline = _outlines(angle, radius, rng) + center[:, None]
 
@@ -199,7 +199,7 @@ def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Lea
         center=np.concatenate([middle, center]),
         radius=np.concatenate([[math.hypot(height, width) / 2], radius]),
         angle=np.concatenate([[0.0], angle]),
-        nearness=np.concatenate([[0.0], nearness]),
+        inverse_depth=np.concatenate([[0.0], inverse_depth]),
         slant=np.concatenate([np.zeros((1, 2)), slant[:, None] * np.stack([np.cos(direction), np.sin(direction)], 1)]),
         outline=np.concatenate([frame, outline]),
     )
@@ -260,12 +260,12 @@ def _outlines(angle: NDArray[np.float64], radius: NDArray[np.float64], rng: Gene
 def _rasterise(height: int, width: int, leaves: _Leaves) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return the visible leaf of each pixel and its normalised inverse depth, painted from far to near."""
     index = np.zeros((height, width), np.int32)
-    nearness = np.full((height, width), -1.0)
+    inverse_depth = np.full((height, width), -1.0)
     corner = np.floor(leaves.outline.min(1)).astype(int).clip(0)
     end = np.ceil(leaves.outline.max(1)).astype(int) + 1
     end = np.minimum(end, [width, height])
     points = np.rint((leaves.outline - corner[:, None]) * 2**SUBPIXEL_BITS).astype(np.int32)
-    at_corner = leaves.nearness + ((corner - leaves.center) * leaves.slant).sum(1)
+    at_corner = leaves.inverse_depth + ((corner - leaves.center) * leaves.slant).sum(1)
     columns, rows = np.arange(width, dtype=float), np.arange(height, dtype=float)[:, None]
     boxes = np.concatenate([corner, end], 1).tolist()
     for leaf, (x0, y0, x1, y1) in enumerate(boxes):
@@ -275,8 +275,8 @@ def _rasterise(height: int, width: int, leaves: _Leaves) -> tuple[NDArray[np.int
         cv2.fillPoly(mask, [points[leaf]], 1, shift=SUBPIXEL_BITS)
         slant_x, slant_y = leaves.slant[leaf]
         plane = at_corner[leaf] + slant_x * columns[: x1 - x0] + slant_y * rows[: y1 - y0]
-        below = nearness[y0:y1, x0:x1]
+        below = inverse_depth[y0:y1, x0:x1]
         seen = mask.view(bool) & (plane > below)
         np.copyto(below, plane, where=seen)
         np.copyto(index[y0:y1, x0:x1], leaf, where=seen)
-    return index, nearness.clip(0, 1)  # an outline can reach beyond its radius
+    return index, inverse_depth.clip(0, 1)  # an outline can reach beyond its radius

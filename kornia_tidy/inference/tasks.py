@@ -28,7 +28,7 @@ def split_maps(task: str, output: Tensor) -> dict[str, Tensor]:
     return dict(zip(MAPS[task], output.split(list(MAPS[task].values()), 1), strict=True))
 
 
-def nearness(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
+def normalised_inverse_depth(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
     r"""Return the normalised inverse depth that networks estimate: 0 at the far end of the range, 1 at the near end.
 
     .. math:: n = (\psi(z) - \psi_{min}) / (\psi_{max} - \psi_{min})
@@ -45,19 +45,19 @@ def nearness(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
 
     Example:
         >>> import torch
-        >>> nearness(ThinLensCamera(), torch.tensor([0.2975, 0.595, float("inf")]))
+        >>> normalised_inverse_depth(ThinLensCamera(), torch.tensor([0.2975, 0.595, float("inf")]))
         tensor([1.0000, 0.5000, 0.0000])
     """
     lo, hi = camera.defocus_range
     return ((camera.defocus(depth, check_inputs=False) - lo) / (hi - lo)).clamp(0, 1)
 
 
-def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
-    """Return depth in metres from normalised inverse depth, the inverse of :func:`nearness`.
+def metres(camera: ThinLensCamera, inverse_depth: Tensor) -> Tensor:
+    """Return depth in metres from normalised inverse depth, the inverse of :func:`normalised_inverse_depth`.
 
     Args:
         camera: a lens with metric scale.
-        nearness: any shape; values are clamped to [0, 1].
+        inverse_depth: any shape; values are clamped to [0, 1].
 
     Returns:
         Same shape, metres from the near to the far end of the camera's range, which may be infinite.
@@ -68,7 +68,7 @@ def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
         tensor([0.2975, 0.5950,    inf])
     """
     lo, hi = camera.defocus_range
-    return camera.depth(lo + (hi - lo) * nearness.clamp(0, 1))
+    return camera.depth(lo + (hi - lo) * inverse_depth.clamp(0, 1))
 
 
 def centre_crop(tensor: Tensor, height: int, width: int) -> Tensor:

@@ -81,7 +81,7 @@ def build_head(settings: SystemSettings) -> nn.Module:
     return Residual(head) if settings.residual else head
 
 
-def look_through(head: nn.Module, optics: TiDyOptics) -> None:
+def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
     """Update the PSFs of a network that refocuses captures (:class:`~kornia_tidy.reconstruction.Refocused`).
 
     They are the camera's present PSFs of green light, evenly spaced over the range of defocus. Other networks are
@@ -91,7 +91,7 @@ def look_through(head: nn.Module, optics: TiDyOptics) -> None:
         if isinstance(module, Refocused):
             lo, hi = optics.camera.defocus_range
             nodes = torch.linspace(lo, hi, module.layers, dtype=torch.float64).tolist()
-            module.look_through(optics.psf_bank(1, defocus=nodes))
+            module.set_psfs(optics.psf_bank(1, defocus=nodes))
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
@@ -123,7 +123,7 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
     optics, head = build_optics(settings), build_head(settings)
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
-        look_through(head, optics)
+        update_psfs(head, optics)
     return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]), run)
 
 

@@ -68,7 +68,7 @@ class Refocused(ReconstructionHead):
         - Brightness is the mean of the channels; for encoded captures it is not linear light, and the inversion is
           approximate.
         - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the filters.
-        - The filters are computed by :meth:`look_through` from the camera's PSFs and are not part of the state. In
+        - The filters are computed by :meth:`set_psfs` from the camera's PSFs and are not part of the state. In
           training they are computed for every batch, and gradients reach the masks through them too.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes the layers of a closed
@@ -78,7 +78,7 @@ class Refocused(ReconstructionHead):
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
         >>> head = Refocused(AttentionUNet(3 + 4, out_channels=1, width=4), layers=4).eval()
-        >>> head.look_through(PSFBank.from_measured(torch.rand(4, 1, 5, 5), torch.arange(4.0)))
+        >>> head.set_psfs(PSFBank.from_measured(torch.rand(4, 1, 5, 5), torch.arange(4.0)))
         >>> head(torch.rand(2, 3, 16, 20)).shape
         torch.Size([2, 1, 16, 20])
     """
@@ -92,7 +92,7 @@ class Refocused(ReconstructionHead):
         network._looked = True  # no check of the range, as refocused maps leave [0, 1]
         self.register_buffer("filters", torch.zeros(0), persistent=False)
 
-    def look_through(self, bank: PSFBank) -> None:
+    def set_psfs(self, bank: PSFBank) -> None:
         """Compute the filters from a camera's PSFs, averaged over channels."""
         if len(bank.psfs) != self.layers:
             raise ValueError(f"a network for {self.layers} layers needs as many PSFs, got {len(bank.psfs)}")
@@ -101,7 +101,7 @@ class Refocused(ReconstructionHead):
     def predict(self, image: Tensor) -> Tensor:
         """Return the network's maps from the capture and its refocused brightness."""
         if not self.filters.numel():
-            raise ValueError("the network does not know its camera: call look_through(optics.psf_bank(...)) first")
+            raise ValueError("the network does not know its camera: call set_psfs(optics.psf_bank(...)) first")
         brightness = image.to(torch.promote_types(image.dtype, self.filters.dtype)).mean(1, keepdim=True)
         return self.network(torch.cat([image, _convolve(brightness, self.filters).to(image.dtype)], 1))
 

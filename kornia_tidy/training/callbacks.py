@@ -159,7 +159,9 @@ class DrawPictures(pl.Callback):
         """Draw the pictures of an epoch."""
         if self._batch is None or trainer.sanity_checking or trainer.current_epoch % self.every:
             return
-        pictures = draw_pictures(pl_module.optics, pl_module.see(self._batch), self.folder, trainer.current_epoch)
+        pictures = draw_pictures(
+            pl_module.optics, pl_module.reconstruct(self._batch), self.folder, trainer.current_epoch
+        )
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 for name, picture in pictures.items():

@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.tasks import centre_crop, metres, nearness, split_maps
+from kornia_tidy.inference.tasks import centre_crop, metres, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores
@@ -31,7 +31,7 @@ ABOUT_ROW = ("scene", "name")
 REACH = 32.0  # in units of the near end: how far depth is scored in metres, if the range has no far end
 
 
-class Looked(NamedTuple):
+class SceneResult(NamedTuple):
     """One scene as a trained system sees it; maps are (C, H, W)."""
 
     index: int
@@ -50,7 +50,7 @@ def evaluate(
     system: TrainedSystem,
     scenes: Dataset,
     seed: int = 0,
-    each: Callable[[Looked], None] | None = None,
+    each: Callable[[SceneResult], None] | None = None,
 ) -> list[Row]:
     """Photograph scenes with a system's camera and score the estimates of its network.
 
@@ -70,34 +70,34 @@ def evaluate(
     for batch in SceneLoader(scenes, 1, seed=seed, train=False):
         if isinstance(batch, Broken):
             raise ValueError(batch.reason)
-        looked = _look(system, batch)
-        row: Row = {"scene": looked.index, "name": looked.name}
-        if "depth" in looked.estimate:
-            row |= depth_row(system.optics.camera, looked)
-        if "image" in looked.estimate:
-            row |= image_row(looked)
+        result = _reconstruct(system, batch)
+        row: Row = {"scene": result.index, "name": result.name}
+        if "depth" in result.estimate:
+            row |= depth_row(system.optics.camera, result)
+        if "image" in result.estimate:
+            row |= image_row(result)
         rows.append(row)
         if each is not None:
-            each(looked)
+            each(result)
     return rows
 
 
-def image_row(looked: Looked) -> dict[str, float]:
+def image_row(result: SceneResult) -> dict[str, float]:
     """Return the scores of an all-in-focus image, which is not clipped to [0, 1].
 
     Returns:
         ``image_rmse``, ``image_psnr`` in dB, and ``image_ssim``; see :mod:`kornia_tidy.reconstruction.metrics`.
     """
-    scores = image_scores(looked.estimate["image"][None], looked.truth["image"][None])
+    scores = image_scores(result.estimate["image"][None], result.truth["image"][None])
     return {f"image_{name}": float(value) for name, value in scores.items()}
 
 
-def depth_row(camera: ThinLensCamera | DefocusRange, looked: Looked) -> dict[str, float]:
+def depth_row(camera: ThinLensCamera | DefocusRange, result: SceneResult) -> dict[str, float]:
     r"""Return the scores of a depth map where depth is known.
 
     Args:
         camera: the camera that took the capture.
-        looked: the scene.
+        result: the scene.
 
     Returns:
         - ``depth_rmse``, of the normalised inverse depth in [0, 1] that the network estimates, and
@@ -111,13 +111,13 @@ def depth_row(camera: ThinLensCamera | DefocusRange, looked: Looked) -> dict[str
         Scores in metres count the pixels whose depth is known and lies within :func:`metric_range`, which excludes
         infinity. Estimates are clamped to this range.
     """
-    estimate, truth, mask = looked.estimate["depth"][None], looked.truth["depth"][None], looked.mask[None]
+    estimate, truth, mask = result.estimate["depth"][None], result.truth["depth"][None], result.mask[None]
     lo, hi = camera.defocus_range
     unit, radians = defocus_scores(estimate, truth, mask, span=hi - lo).values()
     row = {"depth_rmse": unit, "depth_rmse_radians": radians}
     if isinstance(camera, ThinLensCamera):
         near, far = metric_range(camera)
-        depth = looked.depth[None].to(estimate)
+        depth = result.depth[None].to(estimate)
         counted = mask & (depth >= near) & (depth <= far)
         scores = depth_scores(metres(camera, estimate).clamp(near, far), depth, counted)
         scores["rmse_metres"] = scores.pop("rmse")
@@ -181,23 +181,23 @@ def table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def draw_scene(folder: Path, looked: Looked) -> None:
+def draw_scene(folder: Path, result: SceneResult) -> None:
     """Write capture, estimates, true maps and errors (times 3) of a scene as PNG files."""
-    pictures = {"coded": looked.coded}
-    for name, maps in looked.estimate.items():
-        known = looked.mask if name == "depth" else torch.ones_like(looked.mask)
-        error = error_map(maps, looked.truth[name]).where(known, 0)
-        pictures |= {name: maps, f"{name}_truth": looked.truth[name], f"{name}_error_x3": error}
+    pictures = {"coded": result.coded}
+    for name, maps in result.estimate.items():
+        known = result.mask if name == "depth" else torch.ones_like(result.mask)
+        error = error_map(maps, result.truth[name]).where(known, 0)
+        pictures |= {name: maps, f"{name}_truth": result.truth[name], f"{name}_error_x3": error}
     for name, picture in pictures.items():
-        write_image(folder / f"scene_{looked.index:04d}_{name}.png", picture)
+        write_image(folder / f"scene_{result.index:04d}_{name}.png", picture)
 
 
-def _look(system: TrainedSystem, batch: dict[str, Any]) -> Looked:
+def _reconstruct(system: TrainedSystem, batch: dict[str, Any]) -> SceneResult:
     noise = torch.Generator().manual_seed(batch["noise_seed"])
     sample = system.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
     coded, depth = sample["image"], sample["depth"]
     maps = split_maps(system.settings.task, system.head(coded).float())
-    truth = {"image": sample["all_in_focus"][0], "depth": nearness(system.optics.camera, depth)[0]}
+    truth = {"image": sample["all_in_focus"][0], "depth": normalised_inverse_depth(system.optics.camera, depth)[0]}
     mask = centre_crop(batch["mask"], *coded.shape[-2:])[0]
     estimate = {name: m[0] for name, m in maps.items()}
-    return Looked(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask)
+    return SceneResult(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask)

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.tasks import MAPS, centre_crop, nearness, split_maps
-from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, look_through
+from kornia_tidy.inference.tasks import MAPS, centre_crop, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
@@ -23,7 +23,7 @@ from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differenc
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
 
-class Seen(NamedTuple):
+class BatchResult(NamedTuple):
     """Captures of a batch, the network's estimates and the true maps."""
 
     coded: Tensor
@@ -65,7 +65,7 @@ class TidyTraining(pl.LightningModule):
         optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
         head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint.
         task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is estimated as
-            :func:`~kornia_tidy.inference.tasks.nearness`.
+            :func:`~kornia_tidy.inference.tasks.normalised_inverse_depth`.
         loss: function of an estimated map, the true map and the validity mask; the same for all maps.
         lr: learning rate of the network, and of learnable parameters of the optics other than masks.
         lr_metres: learning rate of the masks, in metres of height.
@@ -146,10 +146,10 @@ class TidyTraining(pl.LightningModule):
     def forward(self, coded: Tensor) -> Tensor:
         """Return the network's estimates from captures; in eval mode those of its moving average."""
         network = self.head if self.training or self.average is None else self.average
-        look_through(network, self.optics)
+        update_psfs(network, self.optics)
         return network(coded)
 
-    def see(self, batch: dict[str, Any]) -> Seen:
+    def reconstruct(self, batch: dict[str, Any]) -> BatchResult:
         """Photograph the scenes of a batch and estimate their maps.
 
         Raises:
@@ -162,26 +162,29 @@ class TidyTraining(pl.LightningModule):
         sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
         coded = sample["image"]
         estimate = {name: maps.float() for name, maps in split_maps(self.task, self(coded)).items()}
-        truth = {"image": sample["all_in_focus"], "depth": nearness(self.optics.camera, sample["depth"].float())}
+        truth = {
+            "image": sample["all_in_focus"],
+            "depth": normalised_inverse_depth(self.optics.camera, sample["depth"].float()),
+        }
         mask = batch.get("mask")
         mask = torch.ones_like(sample["depth"], dtype=torch.bool) if mask is None else mask
-        return Seen(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
+        return BatchResult(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
-        seen = self.see(batch)
-        loss = task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)
-        self.log("loss", loss.detach(), prog_bar=True, batch_size=len(seen.coded))
+        result = self.reconstruct(batch)
+        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)
+        self.log("loss", loss.detach(), prog_bar=True, batch_size=len(result.coded))
         return loss
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Log the mean over all scenes of the loss and of each map's root mean squared error."""
-        seen = self.see(batch)
-        scores = {"val_loss": task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)}
-        for name, maps in seen.estimate.items():
-            errors = rmse(maps, seen.truth[name], seen.mask if name == "depth" else None)
+        result = self.reconstruct(batch)
+        scores = {"val_loss": task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)}
+        for name, maps in result.estimate.items():
+            errors = rmse(maps, result.truth[name], result.mask if name == "depth" else None)
             scores[f"val_{name}_rmse"] = errors.nanmean()
-        self.log_dict(scores, batch_size=len(seen.coded), sync_dist=True, prog_bar=True)
+        self.log_dict(scores, batch_size=len(result.coded), sync_dist=True, prog_bar=True)
 
     def configure_optimizers(self) -> Any:
         """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""

@@ -14,11 +14,11 @@ from kornia_tidy.data.image_files import write_image
 
 SCALE, GAP = 4, 2  # picture pixels per pixel of a mask or PSF; picture pixels between two of them
 DEPTHS, SCENES = 7, 4  # drawn, at most
-ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
+ERROR_SCALE = 3.0  # of error maps, so that small errors are visible
 
 
-class SeenLike(Protocol):
-    """Captures, estimates and true maps of a batch, see :class:`kornia_tidy.training.module.Seen`."""
+class BatchMaps(Protocol):
+    """Captures, estimates and true maps of a batch, see :class:`kornia_tidy.training.module.BatchResult`."""
 
     @property
     def coded(self) -> Tensor: ...  # noqa: D102
@@ -28,10 +28,10 @@ class SeenLike(Protocol):
     def truth(self) -> dict[str, Tensor]: ...  # noqa: D102
 
 
-def draw_pictures(optics: TiDyOptics, seen: SeenLike, folder: Path, epoch: int) -> dict[str, Tensor]:
+def draw_pictures(optics: TiDyOptics, result: BatchMaps, folder: Path, epoch: int) -> dict[str, Tensor]:
     """Write masks, PSFs and estimates to PNG files named by the epoch, and return the pictures, (3, H, W)."""
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = {"masks": masks_picture(optics), "psfs": psfs_picture(optics), "estimates": estimates_picture(seen)}
+    pictures = {"masks": masks_picture(optics), "psfs": psfs_picture(optics), "estimates": estimates_picture(result)}
     for name, picture in pictures.items():
         write_image(folder / f"epoch_{epoch:04d}_{name}.png", picture)
     return pictures
@@ -59,13 +59,13 @@ def psfs_picture(optics: TiDyOptics) -> Tensor:
     return _grid([[enlarged((psf / psf.max().clamp(min=1e-30)).clamp(min=0).sqrt()) for psf in light]])
 
 
-def estimates_picture(seen: SeenLike) -> Tensor:
+def estimates_picture(result: BatchMaps) -> Tensor:
     """Return one row per scene: the capture, then for each map estimate, true map, and :func:`error_map`."""
     rows = []
-    for i in range(min(SCENES, len(seen.coded))):
-        row = [seen.coded[i]]
-        for name, maps in seen.estimate.items():
-            truth = seen.truth[name][i]
+    for i in range(min(SCENES, len(result.coded))):
+        row = [result.coded[i]]
+        for name, maps in result.estimate.items():
+            truth = result.truth[name][i]
             row += [maps[i], truth, error_map(maps[i], truth)]
         rows.append([part.detach().float().cpu() for part in row])
     return _grid(rows)
