@@ -1,4 +1,7 @@
-"""Whole files in and out: one sentence when reading fails, and writes that are never left half done."""
+"""Reading of whole files with one sentence for each failure, and atomic writing of files and folders.
+
+No package is used for atomic writing: atomicwrites is no longer maintained, and writes no folders.
+"""
 
 from __future__ import annotations
 

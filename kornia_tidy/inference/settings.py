@@ -16,6 +16,7 @@ from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 
@@ -85,7 +86,7 @@ class SystemSettings:
         for name in ("focal_length", "pixel_pitch"):
             check_positive(name, getattr(self, name))
         for name in ("masks", "refocus", "seed"):
-            check_least(name, getattr(self, name), 0)
+            check_count(name, getattr(self, name), 0)
         for name in ("masks", "refocus"):
             if getattr(self, name) > MOST:
                 raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
@@ -154,12 +155,6 @@ class SystemSettings:
             return cls.from_dict(values)
         except ValueError as error:
             raise ValueError(f"cannot read {path}: {error}") from error
-
-
-def check_least(name: str, value: Any, least: int) -> None:
-    """Raise ``ValueError`` unless a setting is a whole number of at least ``least``."""
-    if not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
 def _check_types(settings: SystemSettings) -> None:

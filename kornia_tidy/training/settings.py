@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.settings import SystemSettings, check_least
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.training.task_loss import LOSSES
 
 SCHEDULES = ("constant", "cosine")
@@ -85,9 +86,9 @@ class TrainingSettings(SystemSettings):
         for name in ("lr", "lr_metres"):
             check_positive(name, getattr(self, name))
         for name in ("size", "scenes", "validation_scenes", "batch", "accumulate", "epochs"):
-            check_least(name, getattr(self, name), 1)
+            check_count(name, getattr(self, name), 1)
         for name in ("pretrain_epochs", "design"):
-            check_least(name, getattr(self, name), 0)
+            check_count(name, getattr(self, name), 0)
         if self.design and self.task != "edof":
             raise ValueError(f"masks can be designed before training for the task 'edof' only, got {self.task!r}")
         if self.patience is not None and self.patience < 1:
