@@ -20,7 +20,7 @@ try:
 except ImportError:  # not on Windows, where nothing is locked
     fcntl = None
 
-_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # what the writers below call files and folders until they are whole
+_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of incomplete files and folders
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -41,7 +41,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file that is there.
+    """Return the path of an existing regular file.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -72,7 +72,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what JSON says.
+    """Parse JSON.
 
     Raises:
         ValueError: if it is not JSON, or is nested too deep.
@@ -90,7 +90,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file so that nobody ever sees half of it: under another name in the same folder, then renamed.
+    """Write a file atomically: under another name in the same folder, then renamed.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -102,11 +102,11 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
-    """Give another name in the same folder to write to; what is written there takes the file's place, if all went well.
+    """Yield a temporary path in the same folder, which replaces the file at the end of a block without errors.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        OSError: if it cannot be written, the disk being full for one; the path is named.
+        OSError: if it cannot be written, for example because the disk is full; the message names the path.
         ValueError: if the path is a folder.
     """
     path = Path(path)
@@ -124,16 +124,16 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
 
 
 def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], replace: bool = False) -> None:
-    """Write a folder of files so that nobody ever sees a part of it: under another name beside it, then renamed.
+    """Write a folder of files atomically: under another name beside it, then renamed.
 
     Args:
-        path: where to; with ``replace`` a folder of this name is replaced as a whole.
+        path: of the folder.
         files: contents by name.
-        replace: whether there may be one.
+        replace: replace an existing folder as a whole.
 
     Raises:
-        FileExistsError: if there is something of this name that is not to be replaced.
-        FileNotFoundError: if the folder it is to lie in does not exist.
+        FileExistsError: if the path exists and is not to be replaced.
+        FileNotFoundError: if the parent folder does not exist.
     """
     path = Path(path).absolute()
     if not path.parent.is_dir():
@@ -162,17 +162,17 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
 
 @contextmanager
 def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
-    """Hold a folder in a block, so that no other process or thread that asks for it does the same in it.
+    """Lock a folder for a block against other processes and threads that use this function.
 
-    The system gives it back when the process ends, however it ends; nothing is left in the folder. Where the file
-    system knows no locks, nothing is held.
+    The system releases the lock when the process ends, however it ends; no file is left in the folder. On file systems
+    without locks this has no effect.
 
     Args:
-        folder: that is there.
-        what: is done in it, in words, for the message.
+        folder: an existing folder.
+        what: what the block does in it, in words, for the message.
 
     Raises:
-        ValueError: if another holds it.
+        ValueError: if the folder is locked.
     """
     if fcntl is None:
         yield
@@ -197,17 +197,17 @@ def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
 
 @contextmanager
 def _named(path: Path) -> Generator[None]:
-    """Name the file in what the system says of its own temporary one, or of none: no space left on device."""
+    """Add the path to an ``OSError`` that names the temporary file or none, such as a full disk."""
     try:
         yield
-    except (FileExistsError, FileNotFoundError):  # told from others by those who write into one folder together
+    except (FileExistsError, FileNotFoundError):  # handled by callers that share a folder
         raise
     except OSError as error:
         raise OSError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:
-    """Remove from a folder what writers left that were killed at work. Nobody may be writing into it."""
+    """Remove temporary files of interrupted writers from a folder, into which nobody else may be writing."""
     for path in Path(folder).iterdir():
         if _LEFTOVER.fullmatch(path.name):
             if path.is_dir():

@@ -162,7 +162,7 @@ class _Captures(Dataset):
                 sample.setdefault("mask", torch.ones_like(sample["depth"]))
                 return encode_item(sample, self.optics.clamped_pixels, self.layout)
         except (KeyError, OSError, TypeError, ValueError) as error:
-            reason = error.args[0] if isinstance(error, KeyError) else error  # whose str() is in quotes
+            reason = error.args[0] if isinstance(error, KeyError) else error  # as str() adds quotes
             return f"scene {index} of the data cannot be used: {reason}"
 
 

@@ -25,11 +25,11 @@ INSIDE = slice(44, 471), slice(40, 601)  # rows and columns that the toolbox eva
 
 
 class NYUDepthV2(SceneDataset):
-    """Labelled frames of NYU Depth v2 with depth in metres. It needs h5py: ``pip install 'kornia-tidy[data]'``.
+    """Labelled frames of NYU Depth v2 with depth in metres. They need ``pip install 'kornia-tidy[data]'``.
 
     Args:
         root: the folder that holds ``nyu_depth_v2_labeled.mat`` and ``splits.mat``, as published.
-        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``, for which SciPy is needed; ``"all"``; or
+        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``; ``"all"``; or
             the path of a text file with the numbers of frames, from 1, one per line.
         raw: the depth that the Kinect measured, with holes filled from the nearest known pixel and False in the mask.
             Default: the published depth, whose holes were filled by colour (Levin et al.).
@@ -157,7 +157,7 @@ def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
         from scipy.io import loadmat  # noqa: PLC0415 - only this needs it
     except ImportError:
         raise ImportError(
-            f"{path} is a MATLAB 5 file, which needs SciPy: pip install scipy, or give split= a text file with the "
+            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text file with the "
             "numbers of the frames, one a line"
         ) from None
     try:

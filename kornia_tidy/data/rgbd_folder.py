@@ -82,7 +82,7 @@ class RGBDFolder(SceneDataset):
 
 
 def described_folder(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
-    """Return the scenes of a folder whose file ``rgbd.json`` holds the patterns of names and the storage of depth.
+    """Return the scenes of a folder by the description in its file ``rgbd.json``.
 
     Args:
         root: the folder. ``rgbd.json`` in it holds arguments of :class:`RGBDFolder` as JSON, such as

@@ -1,4 +1,4 @@
-"""Base class of data sets of scenes, whose items are mappings of image, depth and mask, read on access."""
+"""Base class of data sets of scenes: items are mappings of image, depth and mask, read on access."""
 
 from __future__ import annotations
 

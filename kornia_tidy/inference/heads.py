@@ -40,7 +40,7 @@ def make_head(name: str, out_channels: int, width: int | None = None, in_channel
 
 
 class PlainHead(ReconstructionHead):
-    """Small network of five 3x3 convolutions with growing dilation, whose receptive field is 63 pixels wide.
+    """Small network of five 3x3 convolutions with growing dilation and a receptive field of 63 pixels.
 
     It is fast and has no batch normalisation, whose statistics would differ between processes: for examples, tests and
     first trials.

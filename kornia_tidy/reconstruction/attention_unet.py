@@ -1,4 +1,4 @@
-"""Attention U-Net: a U-Net whose skip connections are weighted by attention gates."""
+"""Attention U-Net: a U-Net with attention gates in its skip connections."""
 
 from __future__ import annotations
 

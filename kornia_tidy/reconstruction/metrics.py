@@ -146,7 +146,7 @@ def log10_error(prediction: Tensor, target: Tensor, mask: Tensor | None = None) 
 
 
 def delta_accuracy(prediction: Tensor, target: Tensor, mask: Tensor | None = None, threshold: float = 1.25) -> Tensor:
-    r"""Return the fraction of pixels whose depth is right within a factor, :math:`\max(z/\hat{z}, \hat{z}/z) < t`.
+    r"""Return the fraction of pixels with a depth right within a factor, :math:`\max(z/\hat{z}, \hat{z}/z) < t`.
 
     Args:
         prediction: depth as for :func:`rmse`. A pixel where it is zero or negative is wrong.

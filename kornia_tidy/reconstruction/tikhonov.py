@@ -84,7 +84,7 @@ def tikhonov_layers(
     veil: Tensor | None = None,
     border: str = "smooth",
 ) -> Tensor:
-    r"""Separate a capture into depth layers of least energy whose blurred sum is the capture.
+    r"""Separate a capture into depth layers: their blurred sum is the capture, and their energy is least.
 
     .. math:: \arg\min_{x_k} \lVert \sum_k h_k * x_k - y \rVert^2 + \gamma \sum_k \lVert x_k \rVert^2, \qquad
               X_k = \frac{\bar{H}_k Y}{\gamma + \sum_j |H_j|^2}

@@ -75,7 +75,7 @@ class TileGrid:
         return min(choices)[1] if choices else None
 
     def smallest_sides(self) -> tuple[int, int]:
-        """Return the sides of the smallest tile, of which a part is kept and less is padding than image."""
+        """Return the sides of the smallest tile: a part of it is kept, and less of it is padding than image."""
         least = max(2 * self.margin, self.stride) + self.stride
         return min(least, self.whole[0]), min(least, self.whole[1])
 

@@ -33,7 +33,7 @@ def reconstruct_tiled(
     out: Tensor | tuple[Tensor, ...] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Any:
-    r"""Apply a network to an image in overlapping tiles, of which the middles are kept.
+    r"""Apply a network to an image in overlapping tiles and join their middles.
 
     Tiles are cut on the grid of the network's stride, and outputs within its receptive field of a cut are discarded.
     The others equal the result for the whole image up to rounding. The receptive field is measured, see

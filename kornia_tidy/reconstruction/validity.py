@@ -56,7 +56,7 @@ def valid_maps(
 
 
 def safe_sqrt(value: Tensor) -> Tensor:
-    """Return the square root, whose gradient at zero is zero instead of infinite.
+    """Return the square root, with a gradient of zero instead of infinity at zero.
 
     Example:
         >>> x = torch.tensor([0.0, 4.0], requires_grad=True)
