@@ -157,10 +157,10 @@ def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
         from scipy.io import loadmat  # noqa: PLC0415 - only this needs it
     except ImportError:
         raise ImportError(
-            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text file with the "
-            "numbers of the frames, one a line"
+            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text file "
+            "with the numbers of the frames, one per line"
         ) from None
     try:
         return loadmat(path)[key].ravel().astype(int)
-    except Exception as error:  # loadmat raises whatever its parser trips over
+    except Exception as error:  # of any type, for damaged files
         raise ValueError(f"cannot read {path}: it should hold trainNdxs and testNdxs: {error!r}") from error
