@@ -157,8 +157,8 @@ def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
         from scipy.io import loadmat  # noqa: PLC0415 - only this needs it
     except ImportError:
         raise ImportError(
-            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text file "
-            "with the numbers of the frames, one per line"
+            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text "
+            "file with the numbers of the frames, one per line"
         ) from None
     try:
         return loadmat(path)[key].ravel().astype(int)
