@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -34,7 +33,7 @@ class TrainedSystem(NamedTuple):
     settings: SystemSettings
     step: int
     """Steps of the optimiser that it was trained for."""
-    run: Mapping[str, Any] = MappingProxyType({})
+    run: Mapping[str, Any] = {}
     """The other settings in its checkpoint, unchecked: those of the run that trained it."""
 
 
