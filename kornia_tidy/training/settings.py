@@ -103,7 +103,10 @@ class TrainingSettings(SystemSettings):
         Raises:
             ValueError: if the system's checkpoint holds a name that is unknown or a value that is not allowed.
         """
-        return cls.from_dict({**system.settings.as_dict(), **system.run})
+        try:
+            return cls.from_dict({**system.settings.as_dict(), **system.run})
+        except ValueError as error:
+            raise ValueError(f"the checkpoint's settings of its run cannot be used: {error}") from error
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
