@@ -1,6 +1,6 @@
-"""Reading of whole files with one sentence for each failure, and atomic writing of files and folders.
+"""File input and output: errors of one sentence, atomic writes, and locks of folders.
 
-No package is used for atomic writing: atomicwrites is no longer maintained, and writes no folders.
+No package is used for atomic writes: atomicwrites is no longer maintained, and writes no folders.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from uuid import uuid4
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where nothing is locked
+except ImportError:  # missing on Windows, where nothing is locked
     fcntl = None
 
-_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of incomplete files and folders
+_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of files and folders until they are complete
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -41,7 +41,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:
-    """Return the path of an existing regular file.
+    """Return the path of a file that is there.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -72,7 +72,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON.
+    """Parse a text of JSON.
 
     Raises:
         ValueError: if it is not JSON, or is nested too deep.
@@ -90,7 +90,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file atomically: under another name in the same folder, then renamed.
+    """Write a file atomically: under a temporary name in the same folder, then renamed.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -102,11 +102,11 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
-    """Yield a temporary path in the same folder, which replaces the file at the end of a block without errors.
+    """Yield a temporary path in the same folder; after success the file written there replaces ``path``.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        OSError: if it cannot be written, for example because the disk is full; the message names the path.
+        OSError: if it cannot be written, for example on a full disk; the message names ``path``.
         ValueError: if the path is a folder.
     """
     path = Path(path)
@@ -124,12 +124,12 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
 
 
 def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], replace: bool = False) -> None:
-    """Write a folder of files atomically: under another name beside it, then renamed.
+    """Write a folder of files atomically: under a temporary name beside it, then renamed.
 
     Args:
-        path: of the folder.
+        path: the folder.
         files: contents by name.
-        replace: replace an existing folder as a whole.
+        replace: whether an existing folder is replaced as a whole.
 
     Raises:
         FileExistsError: if the path exists and is not to be replaced.
@@ -162,17 +162,17 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
 
 @contextmanager
 def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
-    """Lock a folder for a block against other processes and threads that use this function.
+    """Lock an existing folder within a block against other processes and threads that lock it.
 
-    The system releases the lock when the process ends, however it ends; no file is left in the folder. On file systems
-    without locks this has no effect.
+    The system releases the lock when the process ends for whatever reason, and no file is left in the folder. On file
+    systems without locks nothing is locked.
 
     Args:
         folder: an existing folder.
-        what: what the block does in it, in words, for the message.
+        what: the work done in it, in words, for the message.
 
     Raises:
-        ValueError: if the folder is locked.
+        ValueError: if the folder is locked already.
     """
     if fcntl is None:
         yield
@@ -188,7 +188,7 @@ def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
         try:
             yield
         finally:
-            # Forks, such as workers that outlive the block, hold the same lock: closing would leave it with them.
+            # Forked processes that outlive the block share the lock, and closing the file would leave it with them.
             with suppress(OSError):
                 fcntl.flock(place, fcntl.LOCK_UN)
     finally:
@@ -197,17 +197,17 @@ def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
 
 @contextmanager
 def _named(path: Path) -> Generator[None]:
-    """Add the path to an ``OSError`` that names the temporary file or none, such as a full disk."""
+    """Put the path of the final file into errors about the temporary file, such as "no space left on device"."""
     try:
         yield
-    except (FileExistsError, FileNotFoundError):  # handled by callers that share a folder
+    except (FileExistsError, FileNotFoundError):  # distinguishes processes that write into one folder
         raise
     except OSError as error:
         raise OSError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:
-    """Remove temporary files of interrupted writers from a folder, into which nobody else may be writing."""
+    """Remove the temporary files of killed processes from a folder into which no process is writing."""
     for path in Path(folder).iterdir():
         if _LEFTOVER.fullmatch(path.name):
             if path.is_dir():

@@ -12,7 +12,7 @@ import torch
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.figures.system_survey import contrast_transfer
+from kornia_tidy.figures.system_statistics import contrast_transfer
 from kornia_tidy.inference.tasks import metres
 from kornia_tidy.mask_design.fisher_information import crlb
 from kornia_tidy.masks import CubicMask, RadialMask, ZernikeMask
