@@ -125,7 +125,7 @@ class Fidelity:
         """Return a preset by name.
 
         ``draft`` is for looking, ``balanced`` (the default) for training, ``reference`` for judging the others, and
-        ``paper`` for repeating published numbers. Their measured price stands in the README.
+        ``paper`` for repeating published numbers. Their measured price stands in docs/benchmarks.md.
 
         Raises:
             ValueError: if there is no such preset.

@@ -17,6 +17,7 @@ import importlib.util
 import io
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,13 +30,13 @@ from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
 MOST_NOT_RUN = 12  # in all pages: a block that is not run can be wrong
 SLOW: set[str] = set()  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-REASON = re.compile(r"<!-- not run: (.+?) -->\n\Z", re.DOTALL)
+REASON = re.compile(r"<!-- not run: ((?:(?!-->).)+) -->\n\Z", re.DOTALL)
 LINK = re.compile(r"\]\(([^)\s]*?)(?:#([^)\s]*))?\)")
 
 
@@ -118,10 +119,12 @@ def check_command(block: Block, words: list[str]) -> None:
         words = words[1:]
     program, *rest = words
     if program == "kornia-tidy":
+        status: object = 0
         try:
             build_parser().parse_args(rest)
         except SystemExit as leaving:
-            assert leaving.code == 0, f"{block.place}: kornia-tidy refuses {shlex.join(rest)}"
+            status = leaving.code
+        assert status == 0, f"{block.place}: kornia-tidy refuses {shlex.join(rest)}"
     elif program == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
         wanted = [word for word in rest if "=" not in word]
@@ -130,8 +133,13 @@ def check_command(block: Block, words: list[str]) -> None:
         file = rest[1] if rest[0] == "-m" else rest[0]
         there = importlib.util.find_spec(file) if rest[0] == "-m" else (ROOT / file).is_file()
         assert there, f"{block.place}: there is no {file}"
+    elif program == "pip":
+        with (ROOT / "pyproject.toml").open("rb") as file:
+            extras = tomllib.load(file)["project"]["optional-dependencies"]
+        wanted = [extra for word in rest for found in re.findall(r"\[([\w,]+)\]", word) for extra in found.split(",")]
+        assert set(wanted) <= set(extras), f"{block.place}: there are no extras {wanted}"
     else:
-        assert program in ("cd", "git", "pip", "pre-commit"), f"{block.place}: {program} is not known here"
+        assert program in ("cd", "git"), f"{block.place}: {program} is not known here"
 
 
 def anchors(page: Path) -> set[str]:
@@ -208,7 +216,9 @@ class TestRunPage(BaseTester):
     """That what is wrong in a page is found."""
 
     def test_feature_blocks_share_names_and_prints_are_compared(self, folder):
-        run_page("p.md", page("```python", "x = 1", "```", "", "```python", "print(x, 2)", "```", "```text", "1 ...", "```"))
+        run_page(
+            "p.md", page("```python", "x = 1", "```", "", "```python", "print(x, 2)", "```", "```text", "1 ...", "```")
+        )
 
     def test_exception_another_print(self, folder):
         with pytest.raises(AssertionError, match=r"p\.md:4 shows\s+2\s+but printed is\s+1"):
@@ -227,8 +237,14 @@ class TestRunPage(BaseTester):
         with pytest.raises(AssertionError, match="only kornia-tidy can be, not ls"):
             run_page("p.md", page("```bash", "ls", "```"))
 
-    def test_feature_a_marked_block_is_not_run(self, folder):
-        run_page("p.md", page("<!-- not run: why -->", "```python", "1 / 0", "```"))
+    def test_feature_a_marked_block_is_not_run_and_the_next_one_is(self, folder):
+        text = page(
+            "<!-- not run: why -->", "```python", "1 / 0", "```", "", "<!-- not run: that -->", "```text", "```"
+        )
+        run_page("p.md", text)
+        assert [block.reason for block in blocks("p.md", text)] == ["why", "that"]
+        with pytest.raises(ZeroDivisionError):
+            run_page("p.md", page(text, "```python", "1 / 0", "```"))
 
     @pytest.mark.parametrize(
         ("language", "line", "match"),
@@ -238,6 +254,7 @@ class TestRunPage(BaseTester):
             ("bash", "kornia-tidy render --gone", "kornia-tidy refuses render --gone"),
             ("bash", "python gone.py", r"there is no gone\.py"),
             ("bash", "OMP_NUM_THREADS=1 python -m tests.gone", r"there is no tests\.gone"),
+            ("bash", "pip install '.[plot,gone]'", r"there are no extras .*'gone'"),
             ("bash", "gone", "gone is not known here"),
         ],
     )
