@@ -24,7 +24,7 @@ CORE = "core"  # the modules at the package's root
 COMMAND_LINE = {"cli": "commands", "__main__": "commands"}
 MADE = "outputs/"  # a folder that make fills and git ignores
 MADE_IN = "docs/architecture.md"
-DOCUMENTS = ("*.md", "docs/*.md")  # in which file names are checked
+DOCUMENTS = ("CONTRIBUTING.md", "README.md", "docs/*.md")  # in which file names are checked
 
 Arrows = dict[str, set[str]]
 

@@ -101,7 +101,7 @@ def run_shell(block: Block) -> None:
 
 
 def check_names(block: Block) -> None:
-    """Check of a Python block that it can be compiled and that what it imports is there."""
+    """Compile a Python block and import the names that it imports."""
     tree = ast.parse("\n" * block.line + block.text, block.place)
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -114,7 +114,7 @@ def check_names(block: Block) -> None:
 
 
 def check_command(block: Block, words: list[str]) -> None:
-    """Check of a command that it and its options exist."""
+    """Look up a command and its options."""
     while "=" in words[0]:  # a variable of the environment
         words = words[1:]
     program, *rest = words
@@ -213,7 +213,7 @@ def page(*parts: str) -> str:
 
 
 class TestRunPage(BaseTester):
-    """That what is wrong in a page is found."""
+    """Faults that are planted in a page are found."""
 
     def test_feature_blocks_share_names_and_prints_are_compared(self, folder):
         run_page(
