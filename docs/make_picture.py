@@ -105,7 +105,7 @@ def _psfs(figure: Figure, system: TrainedSystem) -> None:
 def _row_of_psfs(figure: Figure, y: float, bank: PSFBank, columns: Sequence[int]) -> None:
     for column, node in enumerate(columns):
         light = bank.psfs[node] / bank.psfs[node].amax()
-        _show(figure, (PSFS_X + column * STEP, y), CELL, light.sqrt())  # on a square-root scale, so that faint light shows
+        _show(figure, (PSFS_X + column * STEP, y), CELL, light.sqrt())  # the root makes faint light visible
 
 
 def _mask(figure: Figure, x: float, y: float, phase: Tensor, amplitude: Tensor) -> None:

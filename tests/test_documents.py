@@ -16,6 +16,7 @@ import importlib
 import importlib.util
 import io
 import re
+import runpy
 import shlex
 import tomllib
 from pathlib import Path
@@ -25,7 +26,7 @@ import pytest
 import torch
 
 from kornia_tidy.cli import build_parser, main
-from kornia_tidy.data import dead_leaves, write_depth, write_image
+from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -199,6 +200,13 @@ class TestEveryPage(BaseTester):
         for block in found:
             print(f"{block.place}: {block.reason}")
         assert len(found) <= MOST_NOT_RUN
+
+    def test_feature_the_picture_of_the_readme_is_drawn(self, tmp_path):
+        script = ROOT / "docs" / "make_picture.py"
+        namespace = runpy.run_path(str(script))
+        path = namespace["main"](["--size", "64", "--output", str(tmp_path / "new" / "camera.png")])
+        assert read_image(path).shape == read_image(namespace["PICTURE"]).shape
+        assert namespace["PICTURE"].stat().st_size < 300_000
 
     def test_feature_the_readme_is_short(self):
         assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 200
