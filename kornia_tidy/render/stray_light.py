@@ -14,6 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.render.layers import blend_of_layers
+from kornia_tidy.render.scene import LayeredScene
+
 _RINGS = 128  # at most; in larger images neighbours stand together, each group's light spread evenly over its pixels
 
 
@@ -64,7 +67,7 @@ def _pixels_around(side: int, radius: Tensor) -> Tensor:
 
 
 def spread_evenly(light: Tensor, psf_size: int, border: str) -> Tensor:
-    """Return what each pixel gets of light that has strayed: its mean, or with the border ``"zero"`` what stays of it.
+    """Return the stray light on each pixel: the mean of light that has strayed, for a zero border the part that stays.
 
     Args:
         light: (..., H, W) light that leaves the PSFs' window, at the pixels that it comes from.
@@ -80,8 +83,25 @@ def spread_evenly(light: Tensor, psf_size: int, border: str) -> Tensor:
     return mean * share_within(*light.shape[-2:], psf_size, light.device).to(light.dtype)
 
 
-def normalised_share(veil: Tensor, psfs: Tensor, shape: Sequence[int], border: str) -> Tensor:
-    r"""Return how much of the light that a pixel is seen to have is stray, where PSFs are normalised to what they see.
+def stray_light_of(scene: LayeredScene) -> Tensor:
+    """Return the stray light that gather or scatter adds to a scene, broadcastable to (B, C, h, w).
+
+    Gather takes it by the layer of the pixel that it falls on, scatter by the layer of the pixel that it comes from.
+
+    Args:
+        scene: with stray light.
+    """
+    assert scene.stray_light is not None
+    if scene.compositing == "scatter":
+        strayed = blend_of_layers(scene.stray_light, scene.layer_index, scene.layer_weight) * scene.image
+        return spread_evenly(strayed, scene.psfs.shape[-1], scene.border)
+    index, weight = scene.sorted_layers
+    taken = blend_of_layers(scene.stray_light, index[:, None], None if weight is None else weight[:, None])
+    return taken * spread_evenly(scene.image, scene.psfs.shape[-1], scene.border)
+
+
+def normalised_share(stray_light: Tensor, psfs: Tensor, shape: Sequence[int], border: str) -> Tensor:
+    r"""Return the fraction of stray light in a pixel, where PSFs are normalised by the weight that they cover.
 
     .. math:: v' = \frac{v \, \overline{w}}{\overline{h * 1} + v \, \overline{w}}
 
@@ -89,16 +109,17 @@ def normalised_share(veil: Tensor, psfs: Tensor, shape: Sequence[int], border: s
     is v itself.
 
     Args:
-        veil: v, (D, C).
+        stray_light: v, (D, C).
         psfs: h, (D, C, P, P).
         shape: height and width of the image.
         border: what lies beyond the image.
     """
     if border != "zero":
-        return veil
-    stray = veil * share_within(*shape, psfs.shape[-1], veil.device).mean().to(veil.dtype)
-    held = share_in_frame(psfs, shape).to(veil.dtype)
-    return stray / (held + stray).clamp(min=torch.finfo(veil.dtype).tiny)
+        return stray_light
+    dtype, device = stray_light.dtype, stray_light.device
+    stray = stray_light * share_within(*shape, psfs.shape[-1], device).mean().to(dtype)
+    held = share_in_frame(psfs, shape).to(dtype)
+    return stray / (held + stray).clamp(min=torch.finfo(dtype).tiny)
 
 
 def share_in_frame(psfs: Tensor, shape: Sequence[int]) -> Tensor:
@@ -116,5 +137,7 @@ def share_in_frame(psfs: Tensor, shape: Sequence[int]) -> Tensor:
         tensor(0.1111)
     """
     offset = torch.arange(psfs.shape[-1], dtype=psfs.dtype, device=psfs.device) - psfs.shape[-1] // 2
-    down, across = ((1 - offset.abs() / side).clamp(min=0) for side in shape)  # pixels whose neighbour there is inside
+    down, across = (
+        (1 - offset.abs() / side).clamp(min=0) for side in shape
+    )  # fraction of pixels with a neighbour inside
     return (psfs * (down[:, None] * across)).sum((-2, -1))

@@ -16,9 +16,10 @@ from torch.nn.functional import conv2d, one_hot
 
 from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW, mutual_energies
 from kornia_tidy.render.backends import direct, direct_occlusion
-from kornia_tidy.render.backends.dense_occlusion import occlude_dense
-from kornia_tidy.render.backends.tile_plan import Labels
+from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
+from kornia_tidy.render.layers import Labels
+from kornia_tidy.render.scene import scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies import round_off, written_out
 from tests.rounding import gamma
@@ -69,7 +70,7 @@ def gather(draw: random.Random) -> Call:
     labels, slope = Labels(scene.lower, scene.fraction), scene.fraction is not None and draw.random() < 0.5
     pairs = direct.count_pairs(labels, scene.light.dtype)
     assert pairs >= 0, scene.about
-    got = direct.mix_directly(scene.light, scene.psfs, labels, slope=slope)
+    got = direct.mix_directly(scene.light, scene.psfs, labels, weight_gradient=slope)
 
     def truth() -> tuple[Tensor, Tensor]:
         weights = _weights(labels, len(scene.psfs), slope=slope)
@@ -133,7 +134,8 @@ def occlude(draw: random.Random) -> Call:
 
     def truth() -> tuple[Tensor, float]:
         shared = None if fraction is None else fraction[:, None]
-        expected = occlude_dense(image, lower[:, None], shared, psfs, veil=veil, border=border)
+        scene = scene_of_layers(image, lower[:, None], shared, psfs, veil, border, "occlusion", dtype)
+        expected = DenseBackend().render(scene)
         apart = 1 if dtype == torch.float32 else 1 + 3 * side**2
         return expected, 6 * layers * (layers + 1) * apart * gamma(side**2 + 16, dtype)
 
@@ -223,11 +225,11 @@ def _layers(
 
 def _weights(labels: Labels, layers: int, *, slope: bool = False) -> Tensor:
     """Return the weights of the layers, (B, D, H, W), or for gradients their differences between adjacent layers."""
-    lower = one_hot(labels.lower, layers + 1).movedim(-1, 1).double()
-    upper = one_hot(labels.lower + 1, layers + 1).movedim(-1, 1).double()
+    lower = one_hot(labels.layer_index, layers + 1).movedim(-1, 1).double()
+    upper = one_hot(labels.layer_index + 1, layers + 1).movedim(-1, 1).double()
     if slope:
         return (upper - lower)[:, :layers]
-    fraction = torch.zeros(()) if labels.fraction is None else labels.fraction[:, None].double()
+    fraction = torch.zeros(()) if labels.layer_weight is None else labels.layer_weight[:, None].double()
     return ((1 - fraction) * lower + fraction * upper)[:, :layers]
 
 

@@ -1,0 +1,177 @@
+"""The choice of a backend: the cheapest one that supports a scene, or the one asked for by name."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.render.backend import Backend
+from kornia_tidy.render.backends.dense import DenseBackend
+from kornia_tidy.render.backends.direct import DirectBackend
+from kornia_tidy.render.backends.tiled import TiledBackend
+from kornia_tidy.render.layers import SAMPLE
+from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.stray_light import stray_light_of
+from kornia_tidy.runtime.tracing import is_followed
+
+BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
+METHODS = ("auto", *BACKENDS)
+LARGEST_PLANE = 32 << 20  # bytes of all channels of an image, up to which "auto" may take dense
+REMEMBERED = 256  # choices, each of some 500 bytes and a grid
+
+_choices: dict[tuple[Hashable, ...], tuple[Backend, dict[Any, Any]]] = {}
+
+
+def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
+    """Render a layered scene by the cheapest backend, or by one that is named or given.
+
+    Args:
+        scene: from :func:`kornia_tidy.render.scene.layered_scene`.
+        method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``, or a backend.
+
+    Returns:
+        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says.
+
+    Raises:
+        ValueError: if the method is not known, or does not support the scene.
+    """
+    with torch.autocast(scene.image.device.type, enabled=False):
+        backend = choose(scene, method) if isinstance(method, str) else method
+        coded = backend.render(scene)
+        if scene.stray_light is not None and scene.compositing != "occlusion":
+            coded = coded + stray_light_of(scene)
+    return coded.to(scene.dtype)
+
+
+def choose(scene: LayeredScene, method: str = "auto") -> Backend:
+    """Return the backend that :func:`render_scene` takes.
+
+    Of those that support the scene it is the one with the least estimated time. Dense rendering is taken only while
+    its memory stays small, or if nothing else supports the scene. The choice for a sample of layers is remembered: it
+    takes as long as to render a small image.
+
+    Args:
+        scene: to be rendered.
+        method: ``"auto"``, or the name of the backend.
+
+    Raises:
+        ValueError: as :func:`render_scene`.
+    """
+    check_choice("method", method, METHODS)
+    if method != "auto":
+        why = refusal(BACKENDS[method], scene)
+        if why is not None:
+            raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
+        return BACKENDS[method]
+    key = _fingerprint(scene)
+    if key in _choices and refusal(_choices[key][0], scene) is None:
+        best, grids = _choices[key]
+        scene.grids.update(grids)
+        return best
+    able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
+    if len(able) > 1 and memory_objection(scene) is not None:
+        able.remove(BACKENDS["dense"])
+    best, least = able[0], math.inf
+    for backend in able if len(able) > 1 else ():
+        if backend.least_seconds(scene) < least and (seconds := backend.seconds(scene)) < least:
+            best, least = backend, seconds
+    if key is not None:
+        if len(_choices) >= REMEMBERED:
+            _choices.clear()
+        _choices[key] = best, dict(scene.grids)
+    return best
+
+
+def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
+    """Return what a choice depends on, with a digest of the sample of layers that costs are estimated from.
+
+    None on an accelerator, which one would have to wait for, and where torch compiles or transforms the renderer.
+    """
+    labels = scene.labels
+    if labels.layer_index.device.type != "cpu" or is_followed():
+        return None
+    digest = hashlib.blake2b(digest_size=16)
+    for layer in labels.every(SAMPLE).terms():
+        digest.update(layer.contiguous().numpy())
+    # With occlusion the values of PSFs matter too.
+    refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
+    objected, threads, shape = memory_objection(scene), torch.get_num_threads(), labels.layer_index.shape
+    shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
+    return scene.compositing, *shapes, refused, objected, threads, digest.digest()
+
+
+def refusal(backend: Backend, scene: LayeredScene) -> str | None:
+    """Return why a backend does not support a scene, or None if it does.
+
+    This alone decides what runs while torch compiles or transforms the renderer.
+    """
+    if backend.name != "dense" and is_followed():
+        return "torch.compile, torch.func and forward-mode derivatives need plain operations of torch"
+    return backend.refusal(scene)
+
+
+def memory_objection(scene: LayeredScene) -> str | None:
+    """Return why the memory of dense rendering is too large for a scene, or None if it is small."""
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
+        return "for gradients it keeps a spectrum for each layer"
+    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
+    plane = scene.image.numel() * itemsize
+    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Which backend renders a scene and why, see :func:`explain`.
+
+    Args:
+        scene: the scene in words.
+        backend: name of the one that ``method="auto"`` takes.
+        seconds: estimated time of each backend that supports the scene, by name.
+        objections: why a backend does not support the scene, or is not taken for its memory, by name.
+    """
+
+    scene: str
+    backend: str
+    seconds: dict[str, float]
+    objections: dict[str, str]
+
+    def __str__(self) -> str:
+        by_time = sorted(self.seconds.items(), key=lambda item: item[1])
+        words = {name: f"about {1e3 * seconds:.3g} ms" for name, seconds in by_time}
+        for name, why in self.objections.items():
+            words[name] = f"{words[name]}, but {why}" if name in words else why
+        return "\n".join([f"{self.scene}: {self.backend}", *(f"  {name}: {why}" for name, why in words.items())])
+
+
+def explain(scene: LayeredScene) -> Explanation:
+    """Return the choice of ``method="auto"`` for a scene, with the estimated times and the objections to the others.
+
+    Args:
+        scene: from :func:`kornia_tidy.render.scene.layered_scene`.
+
+    Example:
+        >>> import torch
+        >>> from kornia_tidy.render.scene import layered_scene
+        >>> image, psi, nodes = torch.rand(1, 3, 2, 40), torch.zeros(1, 1, 2, 40), torch.tensor([0.0, 4.0])
+        >>> explanation = explain(layered_scene(image, psi, nodes, torch.rand(2, 3, 3, 3), compositing="scatter"))
+        >>> sorted(explanation.seconds), explanation.objections
+        (['dense', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
+    """
+    (height, width), (batch, channels), side = scene.output_size, scene.image.shape[:2], scene.psfs.shape[-1]
+    words = (
+        f"{scene.compositing} of {batch} x {channels} channels of {height}x{width} px, {scene.sampled_layers} of "
+        f"{len(scene.psfs)} layers, PSFs of {side}x{side} px, {torch.get_num_threads()} threads"
+    )
+    objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
+    seconds = {name: backend.seconds(scene) for name, backend in BACKENDS.items() if name not in objections}
+    if len(seconds) > 1 and (why := memory_objection(scene)) is not None:
+        objections["dense"] = why
+    return Explanation(words, choose(scene).name, seconds, objections)
