@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.mask_design.fisher_information import crlb
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 
 
 class Survey(NamedTuple):
@@ -25,7 +25,7 @@ class Survey(NamedTuple):
 
 
 @torch.no_grad()
-def survey(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> Survey:
+def survey(lens: PSFModel, nodes: int = 49, frequencies: int = 32) -> Survey:
     """Look at a lens over all of its camera's range.
 
     Args:
@@ -35,7 +35,7 @@ def survey(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> Survey:
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
-        >>> seen = survey(CodedLens(PixelwiseMask(1, initial="flat")), nodes=5)
+        >>> seen = survey(PSFModel(PixelwiseMask(1, initial="flat")), nodes=5)
         >>> int(seen.contrast.mean((1, 2)).argmax())  # a plain lens is sharpest in the middle, in focus
         2
     """

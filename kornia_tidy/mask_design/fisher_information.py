@@ -26,7 +26,7 @@ from kornia_tidy.checks import check_positive
 from kornia_tidy.masks.base import MASK_SPAN, central_square, mask_coordinates
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.propagation import sensor_kernels
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.pupil import gapped_cells, gapped_pupil_field, pupil_field
 
 PHOTONS, BACKGROUND = 3000.0, 5.0
@@ -45,7 +45,7 @@ class PointResponse(NamedTuple):
     """(3, D, C, P, P), per radian of defocus at 530 nm, and per pixel of the point's image along x and y."""
 
 
-def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) -> PointResponse:
+def defocus_response(lens: PSFModel, defocus: Sequence[float] | None = None) -> PointResponse:
     r"""Return the average PSFs of a lens and their slopes, exactly propagated, whatever the lens' own propagation.
 
     Where :math:`W = K U K^T` is the wave on the sensor (see :mod:`~kornia_tidy.psf.propagation`) and K' and K'' are
@@ -61,7 +61,7 @@ def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) ->
         PSFs and slopes in float64; gradients reach masks and modulator, and may be taken again.
 
     Example:
-        >>> psfs, slopes = defocus_response(CodedLens(), [-8.0, 0.0, 8.0])
+        >>> psfs, slopes = defocus_response(PSFModel(), [-8.0, 0.0, 8.0])
         >>> psfs.shape[:2], slopes.shape[:3]
         (torch.Size([3, 3]), torch.Size([3, 3, 3]))
     """
@@ -182,7 +182,7 @@ def defocus_bound(information: Tensor, known_position: bool = False) -> Tensor:
 
 
 def crlb(
-    lens: CodedLens,
+    lens: PSFModel,
     defocus: Sequence[float] | None = None,
     photons: float = PHOTONS,
     background: float = BACKGROUND,
@@ -217,7 +217,7 @@ def crlb(
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
-        >>> flat = CodedLens(PixelwiseMask(1, initial="flat"))
+        >>> flat = PSFModel(PixelwiseMask(1, initial="flat"))
         >>> [round(value, 3) for value in crlb(flat, [-8.0, 0.0, 8.0]).tolist()]
         [0.041, inf, 0.041]
     """

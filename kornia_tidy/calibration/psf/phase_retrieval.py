@@ -18,7 +18,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 
 POLISHING = 40  # steps of quasi-Newton at the end
 STEP = 2.5e-8  # metres of height that the first steps move, 0.15 rad
@@ -38,14 +38,14 @@ class MaskFit:
         residual: (D, C) relative L1, the sum of the moduli of what is left over that of the PSF.
     """
 
-    lens: CodedLens
+    lens: PSFModel
     defocus_offset: float
     shifts: Tensor
     psfs: Tensor
     residual: Tensor
 
 
-def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel: int | None = None) -> MaskFit:
+def fit_masks(measured: PSFBank, lens: PSFModel, iterations: int = 150, channel: int | None = None) -> MaskFit:
     r"""Fit masks to measured PSFs by gradient descent through the optics, from the masks as they are; they change.
 
     .. math:: \min \frac{1}{DC} \sum_{dc} \lVert \sqrt{h_{dc}} - \sqrt{m_{dc}} \rVert^2
@@ -71,11 +71,11 @@ def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel
 
     Example:
         >>> small, spectrum = Fidelity("small", window=15), Spectrum.monochrome()
-        >>> shown = CodedLens(PixelwiseMask(1, 11), fidelity=small, spectrum=spectrum)
+        >>> shown = PSFModel(PixelwiseMask(1, 11), fidelity=small, spectrum=spectrum)
         >>> with torch.no_grad():
         ...     bank = shown.psf_bank(defocus=[-5.0, 5.0])
         >>> near = PixelwiseMask(1, initial=shown.masks.heights() + 5e-8 * torch.rand(11, 11))
-        >>> fit = fit_masks(bank, CodedLens(near, fidelity=small, spectrum=spectrum), iterations=20)
+        >>> fit = fit_masks(bank, PSFModel(near, fidelity=small, spectrum=spectrum), iterations=20)
         >>> bool(fit.residual.max() < 0.01)
         True
     """
@@ -153,7 +153,7 @@ def retrieve_mask(
     for channel in range(len(spectrum.weights)):
         best: MaskFit | None = None
         for _ in range(starts):
-            lens = CodedLens(PixelwiseMask(1, size, generator=generator), camera, None, fidelity, spectrum)
+            lens = PSFModel(PixelwiseMask(1, size, generator=generator), camera, None, fidelity, spectrum)
             fit = fit_masks(measured, lens, iterations, channel)
             if best is None or fit.residual.mean() < best.residual.mean():
                 best = fit
@@ -165,7 +165,7 @@ def retrieve_mask(
     factors = [masks.dispersion(_mean_wavelength(spectrum, channel)) for channel in range(len(found))]
     with torch.no_grad():
         masks.phase.copy_(one_height([phase * s for phase, s in zip(found, factors, strict=True)], factors)[None])
-    return fit_masks(measured, CodedLens(masks, camera, None, fidelity, spectrum), iterations)
+    return fit_masks(measured, PSFModel(masks, camera, None, fidelity, spectrum), iterations)
 
 
 def one_height(phases: Sequence[Tensor], factors: Sequence[float]) -> Tensor:
@@ -202,7 +202,7 @@ def one_height(phases: Sequence[Tensor], factors: Sequence[float]) -> Tensor:
 class _Model:
     """The PSFs that a lens makes at the measured depths, with shifts and an offset to learn."""
 
-    def __init__(self, measured: PSFBank, lens: CodedLens, channel: int | None) -> None:
+    def __init__(self, measured: PSFBank, lens: PSFModel, channel: int | None) -> None:
         self.lens, self.nodes, self.centre = lens, measured.defocus.tolist(), 0.0
         self.learning = any(parameter.requires_grad for parameter in lens.masks.parameters())
         weights = lens.spectrum.weights if channel is None else (lens.spectrum.weights[channel],)
