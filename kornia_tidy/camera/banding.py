@@ -3,52 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, Watchful, cropped, survey_defocus
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, cropped, survey_defocus
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.render.borders import check_border
 from kornia_tidy.runtime.tracing import is_followed
 from kornia_tidy.sensor.noise import STRIP
 
-class CameraNow(Watchful, Protocol):
-    """What a banded capture asks of a camera, which does not change meanwhile."""
 
-    border: str
-    compositing: str
-    memory_budget: int
-
-    @property
-    def fidelity(self) -> Fidelity: ...
-
-    @property
-    def window(self) -> int: ...
-
-    def parameters(self) -> Any: ...
-
-    def decode(self, image: Tensor) -> Tensor: ...
-
-    def defocus(self, depth: Tensor) -> Tensor: ...
-
-    def scene_banks(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> list[tuple[Tensor | float, PSFBank]]: ...
-
-    def render(
-        self, light: Tensor, defocus: Tensor, banks: list[tuple[Tensor | float, PSFBank]], border: str
-    ) -> Tensor: ...
-
-    def expose(
-        self, light: Tensor, params: Mapping[str, Tensor] | None, generator: torch.Generator | None
-    ) -> Tensor: ...
-
-    def encode(self, light: Tensor) -> Tensor: ...
-
-
-def rows_at_once(camera: CameraNow, sample: Sample) -> int | None:
+def rows_at_once(camera: Any, sample: Sample) -> int | None:
     """Return how many rows fit the memory allowed; None where all do, or where the whole image is needed."""
     image, depth = sample.image, sample.depth
     learning = torch.is_grad_enabled() and (
@@ -65,7 +32,7 @@ def rows_at_once(camera: CameraNow, sample: Sample) -> int | None:
 
 
 def capture_in_bands(
-    camera: CameraNow,
+    camera: Any,
     sample: Sample,
     rows: int,
     params: Mapping[str, Tensor] | None = None,
@@ -74,7 +41,7 @@ def capture_in_bands(
     """Take the picture some rows at a time, each with as much of its neighbours as the PSFs reach.
 
     Args:
-        camera: as it is at this moment.
+        camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
         sample: image and depth.
         rows: rows of a band, a multiple of those that the sensor's noise is drawn for at once.
         params: noise of the whole capture, drawn before.
@@ -87,7 +54,7 @@ def capture_in_bands(
     check_border(camera.border, *image.shape[-2:], camera.window)
     height, width = cropped(image, radius if camera.border == "valid" else 0).shape[-2:]
     span = survey_defocus((camera.defocus(part.to(dtype)) for part in depth.split(rows, dim=-2)), camera)
-    banks = camera.scene_banks(image.shape[1], dtype, span.reach)
+    banks = camera.psf_model.scene_banks(image.shape[1], dtype, span.reach, camera.compositing == "occlusion")
     sides = "replicate" if camera.border == "zero" else camera.border  # what is black may lie anywhere
     coded = image.new_empty(*image.shape[:2], height, width)
     for top in range(0, height, rows):

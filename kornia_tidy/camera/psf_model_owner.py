@@ -14,14 +14,13 @@ from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.modulator.modulator import Timeline
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.lens_limits import PARTS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.runtime.tracing import is_followed, refuse_torchscript
 
-_SWAPPED = {*PARTS, "aperture"}  # attributes that belong to the PSF model
+_SUBMODULES = ("masks", "camera", "modulator")
 
 
 class PSFModelOwner(nn.Module):
@@ -42,18 +41,21 @@ class PSFModelOwner(nn.Module):
     def __init__(self, psf_model: PSFModel) -> None:
         super().__init__()
         self.psf_model = psf_model
-        for name in ("masks", "camera", "modulator"):
+        for name in _SUBMODULES:
             super().__setattr__(name, getattr(psf_model, name))
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; a part of the PSF model makes another model."""
-        if name not in _SWAPPED:
+        """Set an attribute; masks, camera and modulator are of the PSF model too."""
+        if name not in _SUBMODULES:
             super().__setattr__(name, value)
             return
         with self.psf_model.lock:
-            self.psf_model = self.psf_model.replace(**{name: value})
-            if name in self._modules:
-                super().__setattr__(name, value)
+            self._swap(**{name: value})
+            super().__setattr__(name, value)
+
+    def _swap(self, **parts: Any) -> None:
+        with self.psf_model.lock:
+            self.psf_model = self.psf_model.replace(**parts)
 
     @abstractmethod
     def _replace(self, **attributes: Any) -> Self:
@@ -68,15 +70,27 @@ class PSFModelOwner(nn.Module):
         """How exactly to compute."""
         return self.psf_model.fidelity
 
+    @fidelity.setter
+    def fidelity(self, value: Fidelity) -> None:
+        self._swap(fidelity=value)
+
     @property
     def spectrum(self) -> Spectrum:
         """Wavelengths, and how each channel weights them."""
         return self.psf_model.spectrum
 
+    @spectrum.setter
+    def spectrum(self, value: Spectrum) -> None:
+        self._swap(spectrum=value)
+
     @property
     def aperture(self) -> Tensor | None:
         """Amplitude over the mask's pixels, None for the binary disc."""
         return self.psf_model.aperture
+
+    @aperture.setter
+    def aperture(self, value: Tensor | None) -> None:
+        self._swap(aperture=value)
 
     @property
     def pupil(self) -> Pupil:

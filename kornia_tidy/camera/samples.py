@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -71,8 +71,8 @@ class Sample:
         if self.form is None:
             return coded
         if not isinstance(self.form, Mapping):
-            parts = (coded, cropped(self.form[1], margin), *self.form[2:])
-            return type(self.form)(*parts) if hasattr(self.form, "_fields") else type(self.form)(parts)
+            parts, make = (coded, cropped(self.form[1], margin), *self.form[2:]), cast("Any", type(self.form))
+            return make(*parts) if hasattr(self.form, "_fields") else make(parts)
         maps = {name: cropped(self.form[name], margin) for name in (*DEPTH_KEYS, "mask") if name in self.form}
         return {**self.form, "image": coded, "all_in_focus": cropped(self.form["image"], margin), **maps}
 
@@ -213,12 +213,19 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
         pixels += own.numel()
     camera.notes.of_thread.clamped = clamped
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
-        _tell_of_defocus(extremes, pixels, int(clamped), camera)
+        tell_of_defocus(extremes, camera, pixels, int(clamped))
     return DefocusSpan(extremes if reach is None else reach, clamped)
 
 
-def _tell_of_defocus(extremes: Tensor, pixels: int, clamped: int, camera: Watchful) -> None:
-    """Warn once of depths in another unit, or else of those beyond the camera's range."""
+def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped: int = 0) -> None:
+    """Warn once of depths in another unit, or else of those beyond the camera's range.
+
+    Args:
+        extremes: lowest and highest defocus in radians, (2,).
+        camera: its range of defocus, and what it has told before.
+        pixels: number of all pixels.
+        clamped: number of those beyond the range.
+    """
     lens = camera.psf_model.camera
     said = misread_depth(lens, *extremes)
     if said is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
@@ -13,7 +13,7 @@ from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
-from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus
+from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus, tell_of_defocus
 from kornia_tidy.checks import check_choice, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, adam_groups
@@ -201,8 +201,8 @@ class TiDyOptics(CameraState):
                 return sample.coded(capture_in_bands(now, sample, rows, params, generator))
             light = now.decode(sample.image.to(sample.dtype))
             defocus = now.defocus(sample.depth.to(sample.dtype))
-            span = survey_defocus([defocus], now)
-            banks = now.scene_banks(light.shape[1], sample.dtype, span.reach)
+            reach = survey_defocus([defocus], now).reach
+            banks = now.psf_model.scene_banks(light.shape[1], sample.dtype, reach, now.compositing == "occlusion")
             irradiance = now.render(light, defocus, banks, now.border)
             coded = now.encode(now.expose(irradiance, params, generator))
         return sample.coded(coded.to(sample.image.dtype))
@@ -224,8 +224,8 @@ class TiDyOptics(CameraState):
     def _replace(self, **attributes: Any) -> Self:
         """Return a camera with other attributes. Parts, notes, lock and remembered PSFs are shared."""
         other = object.__new__(type(self))
-        own = {name: dict(getattr(self, name)) for name in ("_modules", "_parameters", "_buffers")}
-        vars(other).update(vars(self), **own, **attributes)
+        modules, parameters, buffers = dict(self._modules), dict(self._parameters), dict(self._buffers)
+        vars(other).update(vars(self), _modules=modules, _parameters=parameters, _buffers=buffers, **attributes)
         return other
 
     def decode(self, image: Tensor) -> Tensor:
@@ -248,29 +248,13 @@ class TiDyOptics(CameraState):
         """
         return self.psf_model.camera.defocus(depth, check_inputs=self.check_inputs and not is_value_unknown())
 
-    def scene_banks(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> Banks:
-        """Return the PSFs that a scene is rendered through, each with its share of the exposure.
-
-        Their average does for the whole exposure, except where layers hide one another: there each state of its own.
-
-        Args:
-            channels: of the image.
-            dtype: float32 or float64.
-            defocus: of the scene in radians, any shape.
-        """
-        model = self.psf_model
-        if self.compositing != "occlusion" or model.fidelity.occlusion_states == "mean":
-            return [(1.0, model.scene_bank(channels, dtype, defocus))]
-        weights = model.state_weights(dtype)
-        return [(share, model.scene_bank(channels, dtype, defocus, state)) for state, share in enumerate(weights)]
-
     def render(self, light: Tensor, defocus: Tensor, banks: Banks, border: str) -> Tensor:
         """Return the irradiance of a scene on the sensor, over the whole exposure.
 
         Args:
             light: (B, C, H, W) linear light.
             defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-            banks: of :meth:`scene_banks`.
+            banks: PSFs, each with its share of the exposure.
             border: what lies beyond the image.
         """
         # Where colours have spectra, each channel of the sensor sees a plane for each channel of the scene.
@@ -279,14 +263,15 @@ class TiDyOptics(CameraState):
             light = light.repeat(1, reflectances, 1, 1)
         if len(light) == 0:  # a batch of no images, of which gradients are zero
             return cropped(light, banks[0][1].window // 2 if border == "valid" else 0) + _nothing(defocus, banks)
-        fidelity, total = self.psf_model.fidelity, None
+        fidelity = self.psf_model.fidelity
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        for share, bank in banks:
+        total = light
+        for index, (share, bank) in enumerate(banks):
             seen = render(
                 light, defocus, bank, self.compositing, layers=layers, border=border, correlate=fidelity.correlate
             )
             seen = seen if len(banks) == 1 else seen * share
-            total = seen if total is None else total + seen
+            total = total + seen if index else seen
         return total.unflatten(1, (-1, reflectances)).sum(2) if reflectances > 1 else total
 
     def expose(
@@ -384,7 +369,9 @@ class TiDyOptics(CameraState):
     def check_scene(self, image: Tensor, depth: Tensor) -> None:
         """Look at an image and its depth as a capture does: refuse what makes no sense, warn of other units."""
         sample = read_sample(image, depth, self)
-        survey_defocus([self.defocus(sample.depth.to(sample.dtype))], self)
+        defocus = self.defocus(sample.depth.to(sample.dtype)).detach()
+        if self.check_inputs:
+            tell_of_defocus(torch.stack(torch.aminmax(defocus)), self)
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -113,7 +113,7 @@ def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype)
     alone = threading.active_count() == 1
     for _ in range(READS):
         before = [] if alone else [p.detach().clone() for part in (masks, modulator) for p in part.parameters()]
-        phase = masks.phase.to(dtype)
+        phase = cast("Tensor", masks.phase).to(dtype)
         shown = modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
         if shown.mixture is None and shown.middles is None:
             shown = Timeline(shown.states.clone(), shown.durations.clone())

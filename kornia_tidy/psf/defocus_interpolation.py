@@ -12,8 +12,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kornia_tidy.psf.psf_bank import PSFBank
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from functools import partial
 from math import ceil, floor
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn, Self, cast
 
 import numpy as np
 import torch
@@ -130,33 +130,56 @@ class ScenePSFs:
 
     # ------------------------------------------------------------------ PSFs
 
-    def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, state: int | None = None) -> PSFBank:
-        """Return the PSFs that a scene needs: those of depths it does not hold are not computed.
+    def scene_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> PSFBank:
+        """Return the PSFs that a scene needs, averaged over the exposure. See :meth:`scene_banks`."""
+        return self.scene_banks(channels, dtype, defocus)[0][1]
 
-        Where the spectrum has a basis, (D, C B, P, P): those of a channel follow each other. The bank may be given out
-        again: its tensors must not be changed.
+    def scene_banks(
+        self, channels: int, dtype: torch.dtype, defocus: Tensor, each_state: bool = False
+    ) -> list[tuple[Tensor | float, PSFBank]]:
+        """Return the PSFs that a scene needs, with shares of the exposure; of depths it does not hold there are none.
+
+        Where the spectrum has a basis, (D, C B, P, P): those of a channel follow each other. The banks may be given out
+        again: their tensors must not be changed.
 
         Args:
-            channels: of the image, those of the spectrum, or 1.
+            channels: of the image: those of the spectrum, or 1.
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
-            state: index of the one state to look through. Default: the average over the exposure.
+            each_state: return a bank for each state of the exposure, not their average, unless the fidelity takes the
+                mean PSFs in any case.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
         if self.measured is not None:
-            return self._measured_bank(spectrum, dtype, defocus.device)
+            return [(1.0, self._measured_bank(spectrum, dtype, defocus.device))]
         nodes, kind = self.defocus_nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
-        if kind in ("nearest", "linear"):
-            return self._computed_bank(spectrum, dtype, nodes_around(nodes, defocus), state, stray_light)
+        interpolated = kind not in ("nearest", "linear")
+        around = fine_nodes(nodes) if interpolated else nodes
+        targets = nodes_around(around, defocus)
+        states: list[tuple[Tensor | float, int | None]] = [(1.0, None)]
+        if each_state and self.fidelity.occlusion_states == "each":
+            states = [(share, state) for state, share in enumerate(self.states(dtype)[1])]
+        banks: list[tuple[Tensor | float, PSFBank]] = []
+        for share, state in states:
+            if interpolated:
+                bank = self._interpolated_bank(spectrum, dtype, targets, state).with_stray_light(*stray_light)
+            else:
+                bank = self._computed_bank(spectrum, dtype, targets, state, stray_light)
+            banks.append((share, bank))
+        return banks
+
+    def _interpolated_bank(
+        self, spectrum: Spectrum, dtype: torch.dtype, targets: tuple[float, ...], state: int | None
+    ) -> PSFBank:
+        """Return the PSFs at fine nodes, interpolated from those at the layers around them."""
+        nodes, kind = self.defocus_nodes, self.fidelity.layers
         spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
-        targets = nodes_around(fine_nodes(nodes), defocus)
         first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
         last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
         samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
         bank = self._computed_bank(spectrum, dtype, samples, state)
-        bank = interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
-        return bank.with_stray_light(*stray_light)
+        return interpolated_bank(bank, samples, targets, self._band() if kind == "bandlimited" else None)
 
     def _computed_bank(
         self,
@@ -212,7 +235,7 @@ class ScenePSFs:
         return exact_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
-        bank = self.measured
+        bank = cast("PSFBank", self.measured)
         if bank.psfs.shape[1] != len(spectrum.weights):
             raise ValueError(f"the measured PSFs have {bank.psfs.shape[1]} channels, not {len(spectrum.weights)}")
         veil = None if bank.veil is None else bank.veil.to(device, dtype)
@@ -248,6 +271,8 @@ class ScenePSFs:
         Args:
             dtype: float32 or float64, in which the masks are needed.
         """
+        if torch.jit.is_tracing():
+            refuse_torchscript()
         if self.shown is not None or is_followed():
             return self
         with self.lock:
@@ -265,7 +290,10 @@ class ScenePSFs:
             return tuple(self.measured.defocus.tolist())
         lo, hi = self.camera.defocus_range
         intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
-        return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
+        nodes = []
+        for i in range(intervals + 1):
+            nodes.append(lo + (hi - lo) * i / intervals)  # noqa: PERF401 (a comprehension would be a frame of its own)
+        return tuple(nodes)
 
     @property
     def fixed_window(self) -> int | None:
@@ -342,7 +370,6 @@ class ScenePSFs:
         raise ValueError(
             f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )
-
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:

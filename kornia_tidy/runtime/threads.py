@@ -10,8 +10,10 @@ from weakref import WeakSet
 
 from torch import Tensor
 
+_RLock: Any = type(threading.RLock())  # a lock in C, of which the typing stubs say that it cannot be inherited from
 
-class SharedLock(type(threading.RLock())):  # type: ignore[misc]  # ty: ignore[unsupported-base]
+
+class SharedLock(_RLock):
     """A re-entrant lock for objects that are copied, pickled and carried into forked processes.
 
     A copy has a lock of its own. In a forked child, where the thread that held the lock does not exist, it is open.

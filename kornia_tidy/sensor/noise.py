@@ -205,11 +205,13 @@ class SensorNoise(nn.Module):
         if self.full_well is not None:
             samplers["shot"] = torch.rand
         *outer, height, width = shape
-        fields = {name: torch.empty(*shape, device=device, dtype=dtype) for name in samplers}
+        fields: dict[str, Tensor] = {}
         for top in range(0, max(height, 1), STRIP):
             part = (*outer, min(STRIP, height - top), width)
             for name, sampler in samplers.items():
                 drawn = sampler(part, generator=generator, device=source, dtype=dtype)
+                if name not in fields:
+                    fields[name] = drawn.new_empty(*shape, device=device)
                 fields[name][..., top : top + STRIP, :] = drawn.to(device)
         return fields
 

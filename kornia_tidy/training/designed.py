@@ -5,15 +5,15 @@ from __future__ import annotations
 from torch import Tensor
 from tqdm import tqdm
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.mask_design.objectives import design, restoration_error
-from kornia_tidy.psf.psf_model import PSFModel
 
 LEAST_SIGMA = 1e-3  # of full scale; without noise every blur can be undone, and there is nothing to design
 SCENE_SPREAD = 0.2  # standard deviation of a scene's light, of full scale
 LR_METRES = 8e-8  # five masks are after 120 steps within 0.2 % of where they are after 200
 
 
-def design_masks(lens: PSFModel, steps: int, sigma: float = 0.01, *, progress: bool = False) -> list[float]:
+def design_masks(lens: TiDyOptics, steps: int, sigma: float = 0.01, *, progress: bool = False) -> list[float]:
     """Design a camera's masks for extended depth of field, in place: they lower the error of the best restoration.
 
     End-to-end training then goes on from there. Few steps of it move masks little: those that began as noise had a

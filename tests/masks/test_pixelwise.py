@@ -10,6 +10,13 @@ from kornia_tidy.optics.materials import FUSED_SILICA, constant_index
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
+TWO_MASKS = {"pixelwise": lambda **o: PixelwiseMask(2, **o)}
+ONE_MASK = {
+    "flat": lambda g: PixelwiseMask(1, initial="flat"),
+    "random": lambda g: PixelwiseMask(1, generator=g),
+    "random, 3 um": lambda g: PixelwiseMask(initial=3e-6 * torch.rand(1, 23, 23, generator=g)),
+}
+
 
 class TestPixelwiseMask(BaseTester):
     def test_cardinality(self):
