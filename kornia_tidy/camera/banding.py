@@ -55,7 +55,7 @@ def capture_in_bands(
     height, width = cropped(image, radius if camera.border == "valid" else 0).shape[-2:]
     span = survey_defocus((camera.defocus(part.to(dtype)) for part in depth.split(rows, dim=-2)), camera)
     banks = camera.psf_model.scene_banks(image.shape[1], dtype, span.reach, camera.compositing == "occlusion")
-    sides = "replicate" if camera.border == "zero" else camera.border  # what is black may lie anywhere
+    sides = "replicate" if camera.border == "zero" else camera.border  # black has no depth of its own
     coded = image.new_empty(*image.shape[:2], height, width)
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))

@@ -93,7 +93,7 @@ def burst(
     shots = []
     for k, share in enumerate(burst_shares(_dwell_shares(now, sample.dtype), dead_time, exposure)):
         one = linear_through_moment(now, k)
-        one.check_inputs = now.check_inputs and k == 0  # say once what is wrong
+        one.check_inputs = now.check_inputs and k == 0  # warnings come once
         shot = one(light, sample.depth) * share.to(light)
         shots.append(shot if now.sensor is None else _sensor_for(now.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1)
@@ -101,7 +101,7 @@ def burst(
 
 
 def _dwell_shares(optics: TiDyOptics, dtype: torch.dtype) -> Tensor:
-    """Return the dwell shares of the masks: a modulator's first K moments, without what lies between."""
+    """Return the dwell shares of the K masks, scaled to sum to one; transitions between masks are left out."""
     shown = optics.timeline(dtype).durations[: optics.masks.phase.shape[0]]
     if not bool(shown.sum() > 0):
         raise ValueError("a burst needs masks that are shown for a time, but switching takes the whole exposure")

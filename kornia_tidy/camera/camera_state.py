@@ -1,4 +1,4 @@
-"""The state of a camera: its weights, its settings and its PSF window, so that what is restored is what was saved."""
+"""The state of a camera: weights, settings and PSF window in one ``state_dict``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")  # of a camera
 
 
 class CameraState(PSFModelOwner):
-    """A module whose ``state_dict`` also tells which camera it is: the base of all cameras.
+    """A camera with a ``state_dict`` of weights, settings and PSF window.
 
     The settings of its parts and its PSF window are one entry, ``_extra_state``, a tensor of bytes. Loading a state
 

@@ -1,4 +1,4 @@
-"""A module that has a PSF model: its parts can be read and swapped, and its PSFs be asked for, on the module itself."""
+"""A module with a PSF model, whose parts and PSFs are attributes and methods of the module too."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SUBMODULES = ("masks", "camera", "modulator")
 
 
 class PSFModelOwner(nn.Module):
-    """A module that has a PSF model, whose masks, camera and modulator are its submodules.
+    """A module with a PSF model; masks, camera and modulator of the model are its submodules.
 
     So states hold ``masks.phase``, and optimisers and ``to(device)`` reach the parts. To set ``masks``, ``camera``,
     ``modulator``, ``fidelity``, ``spectrum`` or ``aperture`` puts another PSF model in the place of the present one.
@@ -62,7 +62,7 @@ class PSFModelOwner(nn.Module):
         """Return this module with other attributes; all others are shared."""
 
     def __prepare_scriptable__(self) -> NoReturn:
-        """Refuse ``torch.jit.script``, of this camera and of what it is a part of."""
+        """Refuse ``torch.jit.script`` of this camera and of modules that contain it."""
         refuse_torchscript()
 
     @property

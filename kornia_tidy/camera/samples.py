@@ -1,4 +1,4 @@
-"""What a camera is given: an image and its depth as tensors, a tuple or a mapping, and how far the defocus reaches."""
+"""Samples: an image and its depth as tensors, a tuple or a mapping; checks of their values and of their defocus."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from kornia_tidy.runtime.threads import CaptureNotes
 from kornia_tidy.runtime.tracing import is_followed, is_value_unknown, refuse_torchscript
 
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
-# What a capture in float32 takes at its peak beyond image and capture: for tiles, and for each value of the image.
+# Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
 ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
 
 
 class Watchful(Protocol):
-    """A camera that looks at what it is given."""
+    """A camera that checks its inputs and warns once."""
 
     psf_model: PSFModel
     check_inputs: bool
@@ -153,7 +153,7 @@ def check_light(image: Tensor, camera: Watchful) -> None:
 
 
 def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
-    """Return what a mapping holds as image and as depth."""
+    """Return the image and the depth of a mapping."""
     keys = [key for key in DEPTH_KEYS if key in sample]
     if "image" not in sample:
         raise KeyError(f"a mapping sample needs an 'image', got the keys {list(sample)}")

@@ -132,7 +132,7 @@ class TiDyOptics(CameraState):
             )
         super().__init__(PSFModel(masks, camera, modulator, fidelity, spectrum, aperture))
         if compositing == "occlusion" and self.spectrum.basis is not None:
-            # What hides is normalised by the light of its PSF; those between colours hold as much below zero as above.
+            # Occlusion divides by the sum of each PSF; the PSFs between two colours sum to zero.
             raise ValueError(
                 "compositing 'occlusion' needs colours without spectra of their own, got a spectrum with a basis: "
                 "leave reflectance=True out, or use 'gather' or 'scatter'"
@@ -145,7 +145,7 @@ class TiDyOptics(CameraState):
         self.border = border
         self.check_inputs = check_inputs
         self.memory_budget = memory_budget
-        self.notes = CaptureNotes()  # shared by this camera and those that are made of its parts
+        self.notes = CaptureNotes()  # shared with cameras made by _replace
 
     @classmethod
     def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
@@ -208,7 +208,7 @@ class TiDyOptics(CameraState):
         return sample.coded(coded.to(sample.image.dtype))
 
     def snapshot(self, dtype: torch.dtype) -> Self:
-        """Return the camera as it is now, for one capture: what other threads change meanwhile is seen by the next one.
+        """Return the camera as it is now, for one capture; later changes by other threads reach the next one.
 
         Masks that another thread changes in place, as an optimiser does, are copied until they stand still. The parts
         themselves are shared. The compiler sees the camera itself.
@@ -261,7 +261,7 @@ class TiDyOptics(CameraState):
         reflectances = banks[0][1].psfs.shape[1] // light.shape[1]
         if reflectances > 1:
             light = light.repeat(1, reflectances, 1, 1)
-        if len(light) == 0:  # a batch of no images, of which gradients are zero
+        if len(light) == 0:  # an empty batch: gradients are zero
             return cropped(light, banks[0][1].window // 2 if border == "valid" else 0) + _nothing(defocus, banks)
         fidelity = self.psf_model.fidelity
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
@@ -367,7 +367,7 @@ class TiDyOptics(CameraState):
         return int(self.notes.clamped)
 
     def check_scene(self, image: Tensor, depth: Tensor) -> None:
-        """Look at an image and its depth as a capture does: refuse what makes no sense, warn of other units."""
+        """Check the values of an image and its depth as a capture does, and warn of other units."""
         sample = read_sample(image, depth, self)
         defocus = self.defocus(sample.depth.to(sample.dtype)).detach()
         if self.check_inputs:
@@ -384,5 +384,5 @@ class TiDyOptics(CameraState):
 
 
 def _nothing(defocus: Tensor, banks: Banks) -> Tensor:
-    """Return a number that depends on all that shapes a picture, to be added to no pixel at all."""
+    """Return a number that depends on masks and depth, so that an empty capture has gradients."""
     return defocus.sum() + sum(bank.psfs.sum() * share for share, bank in banks)

@@ -30,7 +30,7 @@ def defocus_band(max_rho2: float, shortest_wavelength: float, reference_waveleng
 
 
 def fine_nodes(nodes: Sequence[float]) -> tuple[float, ...]:
-    """Return nodes over the same range, at most ``FINE_SPACING`` apart, of which the given ones are some.
+    """Return nodes over the same range, at most ``FINE_SPACING`` apart, the given nodes included.
 
     Example:
         >>> fine_nodes((0.0, 0.5, 1.0))
@@ -131,7 +131,7 @@ def fine_layer_matrix(
     return tuple(map(tuple, (points[1:-1] - np.diff(points, 2, axis=0) / 16).tolist()))
 
 
-# What torch.compiler.assume_constant_result does, see propagation.py: NumPy is not traced through.
+# As torch.compiler.assume_constant_result does, see propagation.py: NumPy is not traced.
 setattr(fine_layer_matrix, "_dynamo_marked_constant", True)  # noqa: B010
 
 

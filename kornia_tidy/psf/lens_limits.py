@@ -1,4 +1,4 @@
-"""What a coded lens may be made of, and how much defocus its PSFs can hold."""
+"""Limits of a PSF model: the types of its parts, and the defocus that its PSFs can hold."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_LAYERS = 4096
 def check_defocus_range(
     defocus_range: tuple[float, float], step: float | Tensor, fidelity: Fidelity, window: int | None
 ) -> None:
-    """Refuse a range of defocus whose PSFs would take minutes and gigabytes, before any work.
+    """Refuse a range of defocus with too many layers or too wide PSFs, before any work.
 
     Out of focus a point is a disc, by rays of diameter ``2 |psi| 530 nm / (pi s)`` pixels: the gradient of the phase
     ``psi rho^2`` at the edge of the pupil.

@@ -1,4 +1,4 @@
-"""PSFs that need not be computed again: while masks and camera stay as they are, each depth is computed once."""
+"""A cache of PSFs: while masks and camera stay as they are, each depth is computed once."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class BankMemory:
         build: Callable[[tuple[float, ...]], PSFBank],
         stray_light: tuple[str, int] | None = None,
     ) -> PSFBank:
-        """Return the bank for these nodes, building only what is not remembered.
+        """Return the bank for these nodes; only PSFs that are not remembered are computed.
 
         Args:
             kind: of bank, such as its spectrum. Banks of another kind, data type or device are remembered beside it.
@@ -72,7 +72,7 @@ class BankMemory:
             stray_light: arguments of :meth:`PSFBank.with_stray_light`; the last bank is then kept whole and given out
                 again, so its tensors must not be changed. Default: light outside the window is left alone.
         """
-        with torch.inference_mode(False), torch.no_grad():  # what is remembered must serve in training too
+        with torch.inference_mode(False), torch.no_grad():  # remembered PSFs serve in training too
             kind = (kind, states.dtype, states.device)
             with self._lock:
                 known = self._banks.pop(kind, None)
@@ -112,7 +112,7 @@ def plain_attributes(*parts: nn.Module) -> list[Any]:
         for module in part.modules():
             for name, value in vars(module).items():
                 if name not in _OF_EVERY_MODULE:
-                    # What can change in place is compared by what it holds now.
+                    # Containers are compared by their present values.
                     found += name, value.tolist() if hasattr(value, "tolist") else value
                     if isinstance(value, (list, dict, set)):
                         found[-1] = repr(value)
