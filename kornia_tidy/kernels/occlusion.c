@@ -1,14 +1,18 @@
-// Occlusion by direct convolution: a block of pixels meets the layers of its window, each only in the rows and columns
-// where it is.
+// Occlusion-aware compositing by direct convolution: a block of pixels is convolved with the layers in its window, each
+// only in the rows and columns where it is present.
 //
-// A block is BAND rows of LANES pixels, and its sums stay in registers. All that is added up is positive, so that
-// sample by sample in REAL it keeps its relative accuracy however small it is (transforms do not, see occlusion.py).
+// From near to far, with the blurred light L, alpha A and cumulative alpha E of each layer (the alpha of the layer and all
+// farther ones): total += T L / E and T -= T A / E, where T is the transmission of the nearer layers. With stray light L
+// becomes (1 - veil) L + veil mean A.
 //
-// - Light is convolved, masked to a layer. A row of it above and one below the window's middle together serve each of
-//   the block's rows once: no product is wasted.
-// - Weights are whole ones along runs of pixels. The blur of a run is a difference of two sums over a PSF's row, one for
-//   each of its ends: looked up in double, since differences do keep only their absolute accuracy.
-// - Weights that are shared by two layers are convolved like light.
+// A block is BAND rows of LANES pixels, and its sums stay in registers. All terms are positive, so direct sums in REAL keep
+// their relative accuracy however small they are (transforms do not, see dense_occlusion.py).
+//
+// - Light is masked to a layer and convolved. A row above and a row below the middle of the window together serve each of
+//   the block's rows once, so that no product is wasted.
+// - Weights are 1 along runs of pixels. The blur of a run is the difference of two partial sums over a PSF's row, one for
+//   each end. They come from tables in double, since a difference keeps only absolute accuracy.
+// - Weights between 0 and 1, of pixels shared by two layers, are convolved like light.
 //
 // Compiled by build.py with REAL as float or double.
 
@@ -20,76 +24,77 @@ typedef double dvec __attribute__((vector_size(64)));
 typedef double dloose __attribute__((vector_size(64), aligned(8), may_alias));
 typedef REAL part __attribute__((vector_size(DOUBLES * sizeof(REAL))));
 
-static const REAL EPSILON = 1e-6;  // as in occlusion.py
+static const REAL EPSILON = 1e-6;  // as in dense_occlusion.py
 
 // The fields of `_Panes` in direct_occlusion.py. Widths and heights are those of the output; planes are larger by side - 1.
 typedef struct {
     int64_t images, channels, height, width, layers, side, threads;
     int64_t plane_image, plane_channel, plane_row, map_image, map_row;
     const REAL *plane;  // light
-    const REAL *psfs;   // (layers, channels, side, side), turned, columns first
-    const REAL *lower;  // layers of the plane's pixels; `layers` and more: in none
-    const REAL *share;  // below 1: of the next layer; like lower, or null
-    const REAL *mean;   // (images, channels) light that the veil spreads, or null
-    const REAL *veil;   // (layers, channels)
+    const REAL *psfs;   // (layers, channels, side, side), flipped, columns first
+    const REAL *lower;  // layer indices of the plane's pixels; `layers` or more: in no layer
+    const REAL *share;  // weight of the next layer, below 1; like lower, or null
+    const REAL *mean;   // (images, channels) mean light, spread as stray light, or null
+    const REAL *veil;   // (layers, channels) share of stray light
     REAL *out;          // (images, channels, height, width)
-} panes;
+} scene_parameters;
 
-// Pixels of one row and one `lower`, up to the next run: either all of them share light with the next layer, or none.
+// A run of pixels of one row with the same layer index; either all or none of them are shared with the next layer.
 typedef struct {
     int32_t start, layer, shared;
 } run;
 
-// A row of light or weights, and the columns of the PSF that meet any of it.
+// A row of light or weights, and the range of PSF columns with nonzero products.
 typedef struct {
     const REAL *light;
     int32_t from, to;
 } ray;
 
-// Where whole weights begin (sign 1) or end (-1), as a place in the tables of sums.
+// Start (sign 1) or end (-1) of a run of weights 1, as an index into the tables of partial sums.
 typedef struct {
     int64_t at;
     double sign;
 } edge;
 
-// Whole weights in a window: where they begin and end within rows, and from which row to which they fill rows' starts.
+// Weights 1 in a window: their starts and ends within rows, and the ranges of rows that begin with weights 1.
 typedef struct {
     edge *columns, *rows;
     int column_count, row_count, open;
 } region;
 
 typedef struct {
-    ray *light, *lower, *upper;  // of a layer: all of its light; shared weights of runs whose `lower` it is, or is the next
+    ray *light, *lower, *upper;  // light of a layer; shared weights of runs with it as `lower`, or as the next layer
     int lower_count, upper_count;
-    region own, behind;  // of whole weights of the layer; and of it and all behind it
+    region own, behind;  // weights 1 of the layer, and of the layer and all farther ones
 } outline;
 
-// What a thread works with.
+// Buffers of a thread.
 typedef struct {
     run *runs;          // of the rows of a window, at row % rows
-    int64_t *made;      // which row of all maps they are of
-    const run **heads;  // the runs in which the rows of a window begin
+    int64_t *made;      // index of the row, over all maps, to which they belong
+    const run **heads;  // first run of each row of a window
     int32_t *members;   // layers in the window, near to far
-    int64_t *stamps;    // by layer: the window it was last seen in
+    int64_t *stamps;    // by layer: number of the last window that contained it
     int64_t window;
-    REAL *rows[3];      // masked: light, shared weights of runs whose `lower` the layer is, or is the next
+    REAL *rows[3];      // masked rows: light, and the shared weights `lower` and `upper` of the outline
     REAL *nothing;      // a row of zeros
     ray *rays;          // of one channel
-    vec (*total)[BAND], (*through)[BAND];  // by channel: light of the layers so far, and how much they let through
+    vec (*total)[BAND], (*through)[BAND];  // by channel: light of the nearer layers, and their transmission
     outline outline;
     void *all[20];
     int count;
-} desk;
+} workspace;
 
-// ---- Tables: sums over the ends of a PSF's rows.
-// rows (side + 2 BAND - 2, pitch): row BAND - 1 + k holds, rising by u, the sum of row k's samples from column
-// side + LANES - 2 - u on; rows beyond the PSF hold zeros. Then the sums of all rows from k = side + BAND - 2 - u on.
+// ---- Tables: partial sums over the ends of a PSF's rows, by which the blur of a run is a difference of two entries.
+// Rows (side + 2 BAND - 2, pitch): entry u of row BAND - 1 + k is the sum of row k's samples from column
+// side + LANES - 2 - u on; rows beyond the PSF are zero. They are followed by the sums of all rows from
+// k = side + BAND - 2 - u on.
 
-static int64_t table_pitch(const panes *s) { return s->side + 2 * LANES; }
-static int64_t table_rows(const panes *s) { return s->side + 2 * BAND - 2; }
-static int64_t table_size(const panes *s) { return table_rows(s) * (table_pitch(s) + 1) + DOUBLES; }
+static int64_t table_pitch(const scene_parameters *s) { return s->side + 2 * LANES; }
+static int64_t table_rows(const scene_parameters *s) { return s->side + 2 * BAND - 2; }
+static int64_t table_size(const scene_parameters *s) { return table_rows(s) * (table_pitch(s) + 1) + DOUBLES; }
 
-static void fill_table(const panes *s, const REAL *psf, double *table) {
+static void fill_table(const scene_parameters *s, const REAL *psf, double *table) {
     int64_t pitch = table_pitch(s), rows = table_rows(s);
     double *ends = table + rows * pitch;
     memset(table, 0, table_size(s) * sizeof(double));
@@ -107,19 +112,19 @@ static void fill_table(const panes *s, const REAL *psf, double *table) {
 
 // ---- Runs.
 
-static void find_runs(const panes *s, const REAL *lower, const REAL *share, run *runs) {
+static void find_runs(const scene_parameters *s, const REAL *lower, const REAL *share, run *runs) {
     int64_t width = s->width + s->side - 1, count = 0;
     for (int64_t x = 0; x < width; x++) {
         int shared = share && share[x] > 0;
         if (!x || lower[x] != lower[x - 1] || (share && shared != runs[count - 1].shared)) {
-            int exists = lower[x] >= 0 && lower[x] + shared < s->layers;  // not where depth is not a number
+            int exists = lower[x] >= 0 && lower[x] + shared < s->layers;  // false for a NaN depth
             runs[count++] = (run){x, exists ? lower[x] : s->layers, exists && shared};
         }
     }
     runs[count] = (run){width, 0, 0};
 }
 
-static void find_runs_of_band(const panes *s, desk *d, int64_t image, int64_t y) {
+static void find_runs_of_band(const scene_parameters *s, workspace *d, int64_t image, int64_t y) {
     int64_t rows = s->side + BAND - 1, width = s->width + s->side - 1, height = s->height + s->side - 1;
     for (int64_t r = y; r < y + rows; r++) {
         int64_t slot = r % rows, at = image * s->map_image + r * s->map_row;
@@ -130,8 +135,8 @@ static void find_runs_of_band(const panes *s, desk *d, int64_t image, int64_t y)
     }
 }
 
-// Goes on to a window further right in the same rows; says whether all of it is one layer's.
-static int move_heads(desk *d, int64_t rows, int64_t x, int64_t span) {
+// Moves to a window further right in the same rows; returns whether the window contains a single layer.
+static int move_heads(workspace *d, int64_t rows, int64_t x, int64_t span) {
     int alone = 1;
     for (int64_t r = 0; r < rows; r++) {
         const run *p = d->heads[r];
@@ -142,7 +147,7 @@ static int move_heads(desk *d, int64_t rows, int64_t x, int64_t span) {
     return alone;
 }
 
-INLINE int meet(desk *d, int count, int32_t layer) {
+INLINE int meet(workspace *d, int count, int32_t layer) {
     if (d->stamps[layer] == d->window) return count;
     d->stamps[layer] = d->window;
     int n = count;
@@ -152,7 +157,7 @@ INLINE int meet(desk *d, int count, int32_t layer) {
 }
 
 // Lists the layers of a window, near to far.
-static int list_layers(const panes *s, desk *d, int64_t rows, int64_t x, int64_t span) {
+static int list_layers(const scene_parameters *s, workspace *d, int64_t rows, int64_t x, int64_t span) {
     int count = 0;
     d->window++;
     for (int64_t r = 0; r < rows; r++)
@@ -173,7 +178,7 @@ INLINE void reach(extent *e, int32_t from, int32_t to) {
     e->to = to;
 }
 
-INLINE ray ray_of(const panes *s, extent e, const REAL *light, const REAL *nothing) {
+INLINE ray ray_of(const scene_parameters *s, extent e, const REAL *light, const REAL *nothing) {
     if (e.to == 0) return (ray){nothing, s->side, 0};
     return (ray){light, e.from < LANES ? 0 : e.from - LANES + 1, least(e.to, s->side)};
 }
@@ -187,8 +192,8 @@ INLINE void start_row(region *a, int64_t at, int whole) {
     a->open = whole;
 }
 
-// Where a layer is in a window.
-static void draw_outline(const panes *s, desk *d, int64_t x, int32_t layer, int64_t pitch) {
+// Finds the runs and rows of a layer in a window.
+static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int32_t layer, int64_t pitch) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1;
     outline *o = &d->outline;
     o->own.column_count = o->own.row_count = o->own.open = 0;
@@ -197,7 +202,7 @@ static void draw_outline(const panes *s, desk *d, int64_t x, int32_t layer, int6
     for (int64_t r = 0; r < rows; r++) {
         extent light = {span, 0}, lower = {span, 0}, upper = {span, 0};
         const run *p = d->heads[r];
-        int64_t place = (BAND - 1 + r) * table_pitch(s) + s->side + LANES - 2 + x;  // less the column where a run begins
+        int64_t place = (BAND - 1 + r) * table_pitch(s) + s->side + LANES - 2 + x;  // subtract the first column of a run
         int was_own = p->layer == layer && !p->shared, was_behind = was_own || p->layer < layer;
         int whole = was_own && p[1].start >= x + span;
         start_row(&o->own, rows - 1 - r, was_own);
@@ -213,7 +218,7 @@ static void draw_outline(const panes *s, desk *d, int64_t x, int32_t layer, int6
             if (below) reach(&lower, from, to);
             if (above) reach(&upper, from, to);
         }
-        // Rows that are the layer's alone need no mask: null for the plane's own row.
+        // Rows of this layer alone need no mask: null means the row of the plane itself.
         o->light[r] = ray_of(s, light, whole ? 0 : d->rows[0] + r * pitch, d->nothing);
         o->lower[r] = ray_of(s, lower, d->rows[1] + r * pitch, d->nothing);
         o->upper[r] = ray_of(s, upper, d->rows[2] + r * pitch, d->nothing);
@@ -224,7 +229,8 @@ static void draw_outline(const panes *s, desk *d, int64_t x, int32_t layer, int6
 
 // ---- Sums.
 
-// Two rows of light meet a PSF: row `a` for the block's rows up to `split`, row `b`, a PSF's height below, for the others.
+// Adds the products of two rows of light with a PSF: row `a` for the block's rows up to `split`, and row `b`, a PSF's
+// height below it, for the others.
 INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, int split, int strips, vec sums[2][BAND]) {
     int64_t from = least(a->from, b->from), to = a->to > b->to ? a->to : b->to;
     for (int64_t j = from; j < to; j++)
@@ -237,7 +243,7 @@ INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, 
         }
 }
 
-// `side` is at least BAND - 1.
+// Convolves rows of light with a PSF. `side` is at least BAND - 1.
 INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int strips, vec total[2][BAND]) {
     vec sums[2][BAND];
     memset(sums, 0, sizeof sums);
@@ -256,8 +262,8 @@ static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec tot
     convolve_rays(rays, psf, side, 2, total);
 }
 
-// The blur of whole weights, from where their runs begin and end.
-static void add_edges(const panes *s, const double *table, const region *a, vec total[BAND]) {
+// Adds the blur of weights 1: the sum over the starts and ends of runs of sign times the table's partial sum.
+static void add_edges(const scene_parameters *s, const double *table, const region *a, vec total[BAND]) {
     int64_t pitch = table_pitch(s);
     dvec constant = {0}, sums[BAND][PARTS];
     for (const edge *e = a->rows; e < a->rows + a->row_count; e++)
@@ -290,14 +296,14 @@ INLINE vec only(vec x, __typeof__((vec){0} == (vec){0}) mask) {
 
 enum { LIGHT, LOWER, UPPER };
 
-// A layer's light, or its shared weights, in the rows that hold any.
-INLINE void mask_rows(const panes *s, const ray *rays, int32_t layer, int what, const REAL *lower, const REAL *share,
+// Masks rows of light to a layer, or computes the rows of its shared weights, where the layer is present.
+INLINE void mask_rows(const scene_parameters *s, const ray *rays, int32_t layer, int what, const REAL *lower, const REAL *share,
                       const REAL *light, REAL *out, int64_t pitch) {
     const vec own = (REAL)layer - (vec){0}, below = (REAL)(layer - 1) - (vec){0};
     for (int64_t r = 0; r < s->side + BAND - 1; r++) {
         if (!rays[r].light || !rays[r].to) continue;
         const REAL *l = lower + r * s->map_row, *f = share ? share + r * s->map_row : 0, *x = light + r * s->plane_row;
-        for (int64_t j = 0;; j = least(j + LANES, s->side - 1)) {  // the last ones overlap
+        for (int64_t j = 0;; j = least(j + LANES, s->side - 1)) {  // the last two vectors overlap
             vec at = *(const loose *)(l + j), weight;
             if (what == LIGHT && !share) weight = only(*(const loose *)(x + j), at == own);
             else {
@@ -311,18 +317,18 @@ INLINE void mask_rows(const panes *s, const ray *rays, int32_t layer, int what, 
     }
 }
 
-static void mask_light(const panes *s, const ray *rays, int32_t layer, const REAL *lower, const REAL *share,
+static void mask_light(const scene_parameters *s, const ray *rays, int32_t layer, const REAL *lower, const REAL *share,
                        const REAL *light, REAL *out, int64_t pitch) {
     if (share) mask_rows(s, rays, layer, LIGHT, lower, share, light, out, pitch);
     else mask_rows(s, rays, layer, LIGHT, lower, 0, light, out, pitch);
 }
 
-static int64_t window_pitch(const panes *s) { return (s->side + 2 * LANES) / LANES * LANES; }
+static int64_t window_pitch(const scene_parameters *s) { return (s->side + 2 * LANES) / LANES * LANES; }
 
 // ---- Blocks.
 
-// A block of two strips whose window is all of one layer.
-static void lay_alone(const panes *s, desk *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
+// Renders a block of two strips with a single layer in its window: ((1 - veil) L + veil mean A) / A.
+static void lay_alone(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int32_t layer = d->heads[0]->layer;
     int64_t area = s->side * s->side, rows = s->side + BAND - 1;
     for (int64_t c = 0; c < s->channels; c++) {
@@ -347,8 +353,8 @@ static void lay_alone(const panes *s, desk *d, const double *tables, int64_t ima
     }
 }
 
-// A block of one strip, layer over layer.
-static void lay_over(const panes *s, desk *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
+// Renders a block of one strip by compositing its layers from near to far.
+static void lay_over(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int64_t area = s->side * s->side, rows = s->side + BAND - 1, pitch = window_pitch(s);
     int count = list_layers(s, d, rows, x, s->side + LANES - 1);
     int64_t corner = image * s->map_image + y * s->map_row + x;
@@ -374,7 +380,7 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
             mask_light(s, o->light, layer, lower, share, plane, d->rows[0], pitch);
             convolve_one(d->rays, psf, s->side, light);
             add_edges(s, table, &o->own, own[0]);
-            if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // nothing lies behind
+            if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // the farthest layer: the cumulative alpha is its own
             else add_edges(s, table, &o->behind, seen);
             if (o->lower_count) {
                 convolve_one(o->lower, psf, s->side, weight);
@@ -399,7 +405,7 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
     }
 }
 
-// What a block of one strip costs, see `direct_cost` in direct_occlusion.py.
+// Counts of operations for the cost of a scene, see `direct_cost` in direct_occlusion.py.
 enum { ALONE, PAIRS, COLUMNS, EDGES, COUNTS };
 
 static int64_t count_columns(const ray *rays, int64_t side) {
@@ -412,7 +418,7 @@ static int64_t count_columns(const ray *rays, int64_t side) {
     return columns;
 }
 
-static void count_block(const panes *s, desk *d, int64_t x, int64_t counts[COUNTS]) {
+static void count_block(const scene_parameters *s, workspace *d, int64_t x, int64_t counts[COUNTS]) {
     int count = list_layers(s, d, s->side + BAND - 1, x, s->side + LANES - 1);
     const outline *o = &d->outline;
     counts[PAIRS] += count;
@@ -425,15 +431,15 @@ static void count_block(const panes *s, desk *d, int64_t x, int64_t counts[COUNT
     }
 }
 
-// ---- Desks.
+// ---- Workspaces.
 
-static void *take(desk *d, int64_t bytes) {
+static void *take(workspace *d, int64_t bytes) {
     void *memory = aligned_alloc(64, (bytes + 127) / 64 * 64);
     if (memory) memset(memory, 0, bytes);
     return d->all[d->count++] = memory;
 }
 
-static int set_up(const panes *s, desk *d) {
+static int allocate_workspace(const scene_parameters *s, workspace *d) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1, pitch = window_pitch(s);
     outline *o = &d->outline;
     d->count = 0, d->window = 0;
@@ -454,21 +460,21 @@ static int set_up(const panes *s, desk *d) {
     o->behind.columns = take(d, rows * span * sizeof(edge));
     o->own.rows = take(d, rows * sizeof(edge));
     o->behind.rows = take(d, rows * sizeof(edge));
-    int well = 1;
-    for (int n = 0; n < d->count; n++) well &= d->all[n] != 0;
-    for (int64_t r = 0; well && r < rows; r++) d->made[r] = -1;
-    return well;
+    int ok = 1;
+    for (int n = 0; n < d->count; n++) ok &= d->all[n] != 0;
+    for (int64_t r = 0; ok && r < rows; r++) d->made[r] = -1;
+    return ok;
 }
 
-static void tear_down(desk *d) {
+static void free_workspace(workspace *d) {
     for (int n = 0; n < d->count; n++) free(d->all[n]);
 }
 
-// Lays the layers of a band, or with `counts` only counts what that would cost.
-static void lay_band(const panes *s, desk *d, const double *tables, int64_t band, int64_t *counts) {
+// Renders a band or, with `counts`, only counts its operations.
+static void lay_band(const scene_parameters *s, workspace *d, const double *tables, int64_t band, int64_t *counts) {
     int64_t bands = (s->height + BAND - 1) / BAND, rows = s->side + BAND - 1, image = band / bands;
     int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
-    int skip = top - y;  // rows that the band before has made, maybe on another thread
+    int skip = top - y;  // rows of the previous band, which another thread may be writing
     find_runs_of_band(s, d, image, y);
     for (int64_t x = 0, next; x < s->width; x = next) {
         int64_t left = least(x, s->width - LANES);
@@ -482,18 +488,18 @@ static void lay_band(const panes *s, desk *d, const double *tables, int64_t band
     }
 }
 
-// Adds up what every `every`-th band would cost. Returns 0, or 1 if there is no memory.
-int count(const panes *s, int64_t every, int64_t *counts) {
+// Counts the operations of every `every`-th band. Returns 0, or 1 if there is no memory.
+int count(const scene_parameters *s, int64_t every, int64_t *counts) {
     int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
-    desk d;
-    int well = set_up(s, &d);
-    for (int64_t n = every / 2; well && n < bands; n += every) lay_band(s, &d, 0, n, counts);
-    tear_down(&d);
-    return !well;
+    workspace d;
+    int ok = allocate_workspace(s, &d);
+    for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
+    free_workspace(&d);
+    return !ok;
 }
 
-// Lays the layers of a scene over one another. Returns 0, or 1 if there is no memory.
-int occlude(const panes *s) {
+// Renders a scene by occlusion-aware compositing of its layers. Returns 0, or 1 if there is no memory.
+int occlude(const scene_parameters *s) {
     int64_t bands = (s->height + BAND - 1) / BAND, all = s->layers * s->channels, failed = 0;
     double *tables = malloc(all * table_size(s) * sizeof(double));
     if (!tables) return 1;
@@ -501,16 +507,16 @@ int occlude(const panes *s) {
     {
 #pragma omp for
         for (int64_t n = 0; n < all; n++) fill_table(s, s->psfs + n * s->side * s->side, tables + n * table_size(s));
-        desk d;
-        int well = set_up(s, &d);
-        if (!well) {
+        workspace d;
+        int ok = allocate_workspace(s, &d);
+        if (!ok) {
 #pragma omp atomic write
             failed = 1;
         }
 #pragma omp for schedule(dynamic, 4)
         for (int64_t n = 0; n < s->images * bands; n++)
-            if (well) lay_band(s, &d, tables, n, 0);
-        tear_down(&d);
+            if (ok) lay_band(s, &d, tables, n, 0);
+        free_workspace(&d);
     }
     free(tables);
     return failed;

@@ -1,6 +1,6 @@
 """From the pupil to point spread functions: propagation, interpolation over defocus, the PSF bank and its cache.
 
-Masks, modulator, camera, spectrum and fidelity come in as a PSF model; PSFs at the defocus of each layer go out as a bank.
+Masks, modulator, camera, spectrum and fidelity come in as a PSF model; PSFs at each layer's defocus go out as a bank.
 Read ``psf_model.py`` first, then ``scene_psfs.py``; ``exact.py`` and ``paper.py`` are the two propagations.
 """
 

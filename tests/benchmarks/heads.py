@@ -33,14 +33,14 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, ship
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.training.callbacks import BEST
-from kornia_tidy.training.evaluation import Looked, evaluate, mean_row
+from kornia_tidy.training.evaluation import SceneResult, evaluate, mean_row
 from kornia_tidy.training.run import train
+from kornia_tidy.training.settings import TrainingSettings
 from tests.scenes import ENTRIES, load_scene
 
 SETTINGS = TrainingSettings(
@@ -90,7 +90,7 @@ def folder_of(root: Path, task: str, masks: int, seed: int) -> Path:
 
 
 def train_all(root: Path, tasks: list[str], masks: list[int], seeds: list[int], **changed: Any) -> None:
-    """Train what is not yet trained, with some settings changed for all."""
+    """Train all systems that have no checkpoint yet, with some settings changed for all."""
     for seed in seeds:
         for task in tasks:
             for number in masks:
@@ -117,8 +117,8 @@ def score(folder: Path) -> dict[str, dict[str, float]]:
     for name, scenes in sets.items():
         captures: list[float] = []
 
-        def note(looked: Looked, captures: list[float] = captures) -> None:
-            captures.append(float(psnr(looked.coded[None], looked.truth["image"][None])))
+        def note(result: SceneResult, captures: list[float] = captures) -> None:
+            captures.append(float(psnr(result.coded[None], result.truth["image"][None])))
 
         rows = evaluate(system, scenes, each=note)
         scores[name] = {"scenes": len(rows), "capture_psnr": statistics.fmean(captures), **mean_row(rows)}
@@ -126,7 +126,7 @@ def score(folder: Path) -> dict[str, dict[str, float]]:
 
 
 def score_all(root: Path) -> None:
-    """Score what is trained and has no scores yet."""
+    """Score all trained systems without scores."""
     for folder in sorted(root.iterdir()):
         if is_trained(folder) and not (folder / "scores.json").exists():
             scores = score(folder)

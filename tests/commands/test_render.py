@@ -12,9 +12,9 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.coded_datasets import CodedCaptures
 from kornia_tidy.data import write_depth, write_image
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_head, build_optics
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 from tests.coded_datasets.samples import contents
 
@@ -31,7 +31,7 @@ def rendered(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    """A trained system, whose masks are not those that its settings begin with."""
+    """Write a trained system with masks other than the initial ones of its settings."""
     settings = TrainingSettings(masks=1, size=40, width=4, head="plain", window=23, border="replicate", seed=3)
     optics, head = build_optics(settings), build_head(settings)
     with torch.no_grad():

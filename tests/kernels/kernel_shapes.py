@@ -27,7 +27,7 @@ DTYPES = (torch.float32, torch.float64)
 
 
 LARGEST = 3 * 10**6  # products, of calls
-CHEAP = 3 * 10**5  # products, of calls whose values are looked at too: that is slower than the calls are
+CHEAP = 3 * 10**5  # products, in calls with a check of values, which is slower than the call
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Call:
     truth: Callable[[], tuple[Tensor, Tensor | float]]
 
     def error(self) -> float:
-        """Return the largest difference over what is allowed."""
+        """Return the largest ratio of a difference to its bound."""
         expected, allowed = self.truth()
         off = (self.got.double() - expected).abs()
         return float(torch.where(off > 0, off / allowed, 0).max())
@@ -222,7 +222,7 @@ def _layers(
 
 
 def _weights(labels: Labels, layers: int, *, slope: bool = False) -> Tensor:
-    """(B, D, H, W): what pixels take of each layer, or gain of it on the way to the next one."""
+    """Return the weights of the layers, (B, D, H, W), or for gradients their differences between adjacent layers."""
     lower = one_hot(labels.lower, layers + 1).movedim(-1, 1).double()
     upper = one_hot(labels.lower + 1, layers + 1).movedim(-1, 1).double()
     if slope:

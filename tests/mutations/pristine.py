@@ -15,13 +15,13 @@ from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import write_depth, write_image
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.pfm import encode_pfm
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_head, build_optics
 from kornia_tidy.mask_export import SLMFrames, write_slm_frames
 from kornia_tidy.mask_export.mask_files import write_heights
 from kornia_tidy.modulator.phase_panel import GreyLevels
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import DATA
 
 SIZE = 48
@@ -76,7 +76,7 @@ def _write_pictures(folder: Path) -> None:
 
 
 def _pictures(folder: Path) -> list[Case]:
-    """Each as the picture or the depth of a scene, whose other half is whole."""
+    """Each file as the picture or the depth of a scene with an intact other half."""
     kinds = {".png": "png", ".tif": "tiff", ".jpg": "jpeg", ".npy": "npy", ".pfm": "pfm"}
     cases = []
     for path in sorted(folder.iterdir()):
@@ -110,7 +110,7 @@ def _masks(folder: Path) -> list[Case]:
 
 
 def _checkpoints(folder: Path) -> list[Case]:
-    """Trained systems, of no training at all: one whose network sees the capture alone, one that refocuses."""
+    """Untrained systems in the format of trained ones: one with the capture as input, one with refocused images."""
     plain = TrainingSettings(
         task="joint", masks=2, head="plain", width=4, size=32, scenes=2, validation_scenes=1, window=9,
         fidelity="draft",
