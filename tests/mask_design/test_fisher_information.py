@@ -248,7 +248,7 @@ class TestCRLB(BaseTester):
 
     def test_smoke_any_mask_has_a_bound_in_double_precision(self, device, dtype):
         masks = PixelwiseMask(2).to(device, dtype)
-        bound = crlb(PSFModel(masks, fidelity="draft").to(device), [-5.0, 5.0])
+        bound = crlb(PSFModel(masks.to(device), fidelity="draft"), [-5.0, 5.0])
         assert (bound.dtype, bound.device.type, bound.shape) == (torch.float64, device.type, (2,))
         bound.sum().backward()
         (gradient,) = (p.grad for p in masks.parameters())
