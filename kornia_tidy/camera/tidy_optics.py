@@ -207,6 +207,16 @@ class TiDyOptics(CameraState):
             coded = now.encode(now.expose(irradiance, params, generator))
         return sample.coded(coded.to(sample.image.dtype))
 
+    def capture(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        params: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Take a picture of an image and its depth. See :meth:`forward`."""
+        return self.forward(image, depth, params, generator)
+
     def snapshot(self, dtype: torch.dtype) -> Self:
         """Return the camera as it is now, for one capture; later changes by other threads reach the next one.
 
