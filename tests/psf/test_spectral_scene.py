@@ -12,6 +12,7 @@ from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.optics.spectrum import smoothest_reflectances
 from kornia_tidy.psf import PSFBank
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.spectral_error import spectral_error
 from tests.base import BaseTester
 
