@@ -118,14 +118,15 @@ def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype)
     """
     alone = threading.active_count() == 1
     for _ in range(READS):
-        before = [] if alone else [p.detach().clone() for part in (masks, modulator) for p in part.parameters()]
+        now = [] if alone else [*masks.parameters(), *modulator.parameters()]
+        before = list(map(Tensor.clone, map(Tensor.detach, now)))
         phase = cast("Tensor", masks.phase).to(dtype)
         shown = modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
         if shown.mixture is None and shown.middles is None:
             shown = Timeline(shown.states.clone(), shown.durations.clone())
         else:
             shown = shown.map(Tensor.clone)
-        after = [] if alone else [p for part in (masks, modulator) for p in part.parameters()]
+        after = [] if alone else [*masks.parameters(), *modulator.parameters()]
         if all(map(torch.equal, before, after)):
             break
     return shown
