@@ -88,7 +88,8 @@ class PhaseMasks(nn.Module):
     @property
     def phase(self) -> Tensor:
         """Phase with the constraint applied, (K, N, N) radians at 530 nm."""
-        return limited_phase(self.free_phase(), self.constraint, self.max_phase)
+        free = self.free_phase()
+        return free if self.constraint == "none" else limited_phase(free, self.constraint, self.max_phase)
 
     def free_phase(self) -> Tensor:
         """Return the phase before the constraint: here the parameter or buffer registered as ``phase``."""

@@ -14,7 +14,6 @@ from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.planning.bank_cost import bank_operations, bank_work, window_side
 from kornia_tidy.planning.planner import Planner
 from kornia_tidy.planning.rendering_cost import count_work, label_pixels, rendering_bytes, rendering_seconds
-from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
 from kornia_tidy.render.backends.window_plan import plan_windows
@@ -156,7 +155,6 @@ class TestCost(BaseTester):
             predicted.append(planned.seconds(fidelity))
             camera, times = optics.with_fidelity(fidelity), []
             for _ in range(3):
-                camera._memory = BankMemory()
                 start = time.perf_counter()
                 with torch.no_grad():
                     camera(image, depth)
