@@ -98,7 +98,7 @@ class TestChoose(BaseTester):
         flat, nodes = torch.zeros(1, 1, 200, 300), torch.arange(20.0)
         ramp = torch.linspace(0, 19, 300).expand(flat.shape)
         image = torch.rand(1, 1, 200, 300)
-        psfs = torch.rand(20, 1, 23, 23)
+        psfs = torch.rand(20, 1, 23, 23).requires_grad_()  # dense is no choice, whose time needs no tiles
         sizes = []
         for psi in (flat, ramp, flat):
             first, again = (
