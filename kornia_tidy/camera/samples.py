@@ -175,6 +175,11 @@ def cropped(tensor: Tensor, margin: int) -> Tensor:
     return tensor[..., margin : tensor.shape[-2] - margin, margin : tensor.shape[-1] - margin]
 
 
+def zero_of(*tensors: Tensor) -> Tensor:
+    """Return a number that depends on tensors: an empty capture, to which it is added, has their gradients, of zero."""
+    return cast("Tensor", sum(tensor.sum() for tensor in tensors)) * 0
+
+
 class DefocusSpan(NamedTuple):
     """How far the defocus of a scene reaches, and how many of its pixels lie beyond the camera's range.
 

@@ -9,14 +9,15 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
+from kornia_tidy.camera.advice import explain_capture, plan_capture
 from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
-from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus, tell_of_defocus
+from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus, tell_of_defocus, zero_of
 from kornia_tidy.checks import check_choice, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks.base import PhaseMasks, adam_groups
+from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -30,6 +31,7 @@ from kornia_tidy.systems.presets import published_system
 
 if TYPE_CHECKING:
     from kornia_tidy.planning.render_plan import RenderPlan
+    from kornia_tidy.render.dispatch import Explanation
 
 Banks = list[tuple[Tensor | float, PSFBank]]
 _DEFAULT_SENSOR = SensorNoise(0.01)
@@ -272,7 +274,8 @@ class TiDyOptics(CameraState):
         if reflectances > 1:
             light = light.repeat(1, reflectances, 1, 1)
         if len(light) == 0:  # an empty batch: gradients are zero
-            return cropped(light, banks[0][1].window // 2 if border == "valid" else 0) + _nothing(defocus, banks)
+            margin = banks[0][1].window // 2 if border == "valid" else 0
+            return cropped(light, margin) + zero_of(defocus, *(bank.psfs for _, bank in banks))
         fidelity = self.psf_model.fidelity
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
         total = light
@@ -329,17 +332,25 @@ class TiDyOptics(CameraState):
             >>> plan.predicted_error <= 1e-2
             True
         """
-        from kornia_tidy.planning.planner import Planner  # noqa: PLC0415 (only who plans waits for it)
+        return plan_capture(self, depth, image, tolerance)
 
-        shape = (len(self.spectrum.weights), *depth.shape[-2:])
-        blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
-        sample = read_sample(blank, depth, self)
-        if len(sample.image) == 0 or len(sample.depth) == 0:
-            found = f"{len(sample.image)} and {len(sample.depth)}"
-            raise ValueError(f"a plan needs at least one image and its depth, got {found}")
-        light = None if image is None else self.decode(sample.image.to(sample.dtype))
-        defocus = self.defocus(sample.depth.to(compute_dtype(depth.dtype, self.fidelity)))
-        return Planner(self, sample.image.shape[1]).scene(defocus, light).plan(tolerance)
+    @torch.no_grad()
+    def explain(self, image: Tensor, depth: Tensor) -> Explanation:
+        """Return which backend renders a scene and why, with the estimated time of each.
+
+        Args:
+            image: (B, C, H, W) or (C, H, W), as for a capture.
+            depth: its depth.
+
+        Raises:
+            ValueError: if the batch holds no image, or as for a capture.
+
+        Example:
+            >>> print(TiDyOptics(compositing="scatter").explain(torch.rand(3, 64, 64), torch.ones(1, 64, 64)))
+            scatter of 1 x 3 channels of 64x64 px, ...
+              direct: direct convolution gathers light and does not scatter it
+        """
+        return explain_capture(self, image, depth)
 
     # ------------------------------------------------------------------ training, data sets, people
 
@@ -356,12 +367,7 @@ class TiDyOptics(CameraState):
             >>> optimizer.param_groups[0]["eps"]
             1e-15
         """
-        groups: list[dict[str, Any]] = [adam_groups(self.masks, lr_metres)]
-        in_masks = {id(p) for p in self.masks.parameters()}
-        others = [p for p in self.parameters() if id(p) not in in_masks]
-        if others:
-            groups.append({"params": others} if lr is None else {"params": others, "lr": lr})
-        return groups
+        return parameter_groups(self, self.masks, lr_metres, lr)
 
     def as_transform(self, seed: int | None = None, key: Any = "index") -> DatasetTransform:
         """Return the camera as a transform of single samples, without gradients. See :class:`DatasetTransform`."""
@@ -391,8 +397,3 @@ class TiDyOptics(CameraState):
             f"{self.window}x{self.window} px holding {held[0]:.0%} to {held[1]:.0%} of the light "
             f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
         )
-
-
-def _nothing(defocus: Tensor, banks: Banks) -> Tensor:
-    """Return a number that depends on masks and depth, so that an empty capture has gradients."""
-    return defocus.sum() + sum(bank.psfs.sum() * share for share, bank in banks)
