@@ -38,7 +38,7 @@ RENDERING = (
     "tests/camera/test_motion.py",
     "tests/camera/test_burst.py",
     "tests/planning/test_error_model.py",
-    "tests/render/test_cost_model.py",
+    "tests/planning/test_rendering_cost.py",
     "tests/camera/test_pipelines_captures.py",
     "tests/systems/test_presets.py",
 )

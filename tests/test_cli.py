@@ -27,7 +27,19 @@ class TestMain(BaseTester):
 
     @pytest.mark.parametrize(
         "argv",
-        [[], ["simulate"], ["demo"], ["systems"], ["trade"], ["train"], ["evaluate"], ["raw"], ["render"], ["info"]],
+        [
+            [],
+            ["simulate"],
+            ["demo"],
+            ["systems"],
+            ["trade"],
+            ["train"],
+            ["evaluate"],
+            ["raw"],
+            ["render"],
+            ["tune"],
+            ["info"],
+        ],
     )
     def test_smoke_help_teaches_and_exits_with_zero(self, argv, capsys):
         with pytest.raises(SystemExit) as exit_:

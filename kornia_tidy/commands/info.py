@@ -16,9 +16,11 @@ import torch
 
 import kornia_tidy
 from kornia_tidy.commands.report import tell
+from kornia_tidy.commands.tune import in_words
 from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
 from kornia_tidy.psf import mutual_intensity
 from kornia_tidy.render.backends import direct, direct_occlusion
+from kornia_tidy.render.cost_store import read_profile
 
 DESCRIPTION = """\
 Print the environment of kornia_tidy: versions of packages, processor and threads, the C
@@ -70,6 +72,7 @@ def lines() -> Iterator[tuple[str, str]]:
         else:
             threads = "" if built.threads else f", in one thread: {built.remark}"
             yield "kernel", f"{name}: {built.path.name}, {built.path.stat().st_size >> 10} KiB{threads}"
+    yield "costs", _costs()
     yield "cache", _cache()
 
 
@@ -100,6 +103,11 @@ def _compiler() -> str:
     except RuntimeError as error:
         return str(error)
     return f"{' '.join((*compiler.program, *compiler.options))}: {compiler.version}"
+
+
+def _costs() -> str:
+    threads = torch.get_num_threads()
+    return in_words(read_profile(threads), threads)
 
 
 def _cache() -> str:

@@ -273,12 +273,12 @@ def cache_folder() -> Path:
 def _private(folder: Path) -> Path:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     status = folder.lstat() if folder.parent == Path(tempfile.gettempdir()) else folder.stat()
-    if not (stat.S_ISDIR(status.st_mode) and _is_ours(status) and os.access(folder, os.W_OK | os.X_OK)):
+    if not (stat.S_ISDIR(status.st_mode) and is_ours(status) and os.access(folder, os.W_OK | os.X_OK)):
         raise PermissionError(f"{folder} must belong to the user and be writable for no one else")
     return folder
 
 
-def _is_ours(status: os.stat_result) -> bool:
+def is_ours(status: os.stat_result) -> bool:
     """Whether something belongs to this user, and only this user may write to it."""
     return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
 
@@ -288,7 +288,7 @@ def _find(folder: Path, name: str) -> Path | None:
     for path in sorted(folder.glob(f"{name}-*.so")):
         status = path.lstat()
         whole = stat.S_ISREG(status.st_mode) and path.stem == f"{name}-{_content_digest(path)}"
-        if whole and _is_ours(status):
+        if whole and is_ours(status):
             return path
         with suppress(OSError):
             path.unlink()
@@ -303,12 +303,12 @@ def _digest(source: Path, compiler: Compiler, flags: tuple[str, ...]) -> str:
     """Name all that a library depends on in 16 digits. One source may include others of its folder."""
     sources = [SHARED, *sorted(source.parent.glob("*.c"))]
     words = [source.name, *compiler.program, compiler.version, *flags, *compiler.options]
-    parts = [*(path.read_bytes() for path in sources), *(word.encode() for word in words), _processor()]
+    parts = [*(path.read_bytes() for path in sources), *(word.encode() for word in words), processor_features()]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
 
 
 @cache
-def _processor() -> bytes:
+def processor_features() -> bytes:
     """What the processor is and can do: a home folder may be shared by unlike machines."""
     try:
         lines = Path("/proc/cpuinfo").read_bytes().split(b"\n\n")[0].splitlines()

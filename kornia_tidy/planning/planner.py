@@ -32,27 +32,25 @@ from torch.nn.functional import max_pool2d
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.planning.bank_cost import bank_work, memory_bytes, window_side
 from kornia_tidy.planning.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_ladder
 from kornia_tidy.planning.depth_energy import Depths
 from kornia_tidy.planning.error_model import LayerErrors, change_error, layer_coefficients
 from kornia_tidy.planning.psf_samples import CameraSurvey, PlannableCamera
 from kornia_tidy.planning.render_plan import RenderPlan
+from kornia_tidy.planning.rendering_cost import (
+    SceneWork,
+    count_work,
+    label_pixels,
+    rendering_bytes,
+    rendering_seconds,
+)
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes, guarded
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
 from kornia_tidy.render.borders import pad_border
-from kornia_tidy.render.cost_model import (
-    Tiles,
-    bank_seconds,
-    count_tiles,
-    label_pixels,
-    memory_bytes,
-    rendering_bytes,
-    rendering_seconds,
-    window_side,
-)
+from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
 from kornia_tidy.render.stray_light import share_in_frame
 
 SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.2 times the formula
@@ -106,7 +104,7 @@ class PlannedScene:
         self._batch = len(defocus if light is None else light)
         self._survey, self._defocus = survey, defocus.detach()
         self._known: dict[Any, float] = {}
-        self._tiles: dict[tuple[str, Sequence[float], int], Tiles | Windows] = {}
+        self._works: dict[tuple[str, Sequence[float], int], SceneWork] = {}
         self._labelled: tuple[tuple[str, Sequence[float], int], Labels] | None = None
         self.reference = survey.reference(height, width)
         size = spectrum_size(window_side(self.reference))
@@ -152,15 +150,15 @@ class PlannedScene:
         return sum(error for _, error in self._parts(fidelity))
 
     def seconds(self, fidelity: Fidelity) -> float:
-        """Return the predicted time in seconds of a capture with its PSFs on one core.
+        """Return the predicted time in seconds of a capture with its PSFs on torch's threads.
 
         See :mod:`kornia_tidy.render.cost_model`.
         """
-        survey, cut = self._survey, self._cut(fidelity)
-        bank = bank_seconds(survey.geometry(fidelity), fidelity, self._computed(fidelity))
-        if isinstance(cut, Windows):
-            return survey.captures * (bank + windows_seconds(cut, survey.planes, itemsize=8 if fidelity.double else 4))
-        return bank + rendering_seconds(cut, survey.planes, fidelity)
+        survey, scene = self._survey, self._work(fidelity)
+        bank = bank_work(survey.geometry(fidelity), fidelity, self._computed(fidelity))
+        seconds = seconds_of(bank, scene.profile, torch.get_num_threads())
+        seconds += rendering_seconds(scene, survey.planes, double=fidelity.double)
+        return (survey.captures if self._occlusion else 1) * seconds
 
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
@@ -355,12 +353,9 @@ class PlannedScene:
         return int(self._known[key])
 
     def _memory(self, fidelity: Fidelity) -> int:
-        survey, cut, layers = self._survey, self._cut(fidelity), self._computed(fidelity)
-        if isinstance(cut, Windows):
-            rendering = windows_bytes(cut, survey.planes, itemsize=8 if fidelity.double else 4)
-        else:
-            rendering = rendering_bytes(cut, survey.planes, fidelity)
-        held = survey.captures * max(layers, cut.layers)
+        survey, scene, layers = self._survey, self._work(fidelity), self._computed(fidelity)
+        rendering = rendering_bytes(scene, survey.planes, double=fidelity.double)
+        held = survey.captures * max(layers, scene.layers)
         return memory_bytes(survey.geometry(fidelity), survey.planes, fidelity, held, rendering)
 
     def _rendered(self, fidelity: Fidelity) -> Sequence[float]:
@@ -368,11 +363,11 @@ class PlannedScene:
         nodes = self._survey.nodes(fidelity)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
-    def _cut(self, fidelity: Fidelity) -> Tiles | Windows:
-        """Return the renderer's tiles for the scene."""
+    def _work(self, fidelity: Fidelity) -> SceneWork:
+        """Return the work of the renderer for the scene."""
         nodes, window = self._rendered(fidelity), window_side(fidelity)
         mode = "nearest" if fidelity.layers == "nearest" else "linear"
-        if (mode, nodes, window) not in self._tiles:
+        if (mode, nodes, window) not in self._works:
             margin = 0 if self._survey.compositing == "gather" and self._survey.border != "valid" else window // 2
             if self._labelled is None or self._labelled[0] != (
                 mode,
@@ -381,11 +376,9 @@ class PlannedScene:
             ):  # only one is cached: it is large
                 seen = self._seen(margin)
                 self._labelled = (mode, nodes, margin), label_pixels(seen, self._batch, nodes, mode)
-            scene = self._labelled[1], len(nodes), window
-            gathers = self._survey.compositing == "gather"
-            cut = count_windows(*scene) if self._occlusion else count_tiles(*scene, gathers=gathers)
-            self._tiles[mode, nodes, window] = cut
-        return self._tiles[mode, nodes, window]
+            work = count_work(self._labelled[1], len(nodes), window, self._survey.compositing)
+            self._works[mode, nodes, window] = work
+        return self._works[mode, nodes, window]
 
     def _seen(self, margin: int) -> Tensor:
         """Return the defocus of the rendered pixels: cropped for the border ``valid``, else padded by the margin."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.planning.bank_cost import BankGeometry
 from kornia_tidy.planning.candidates import REFERENCE, layer_kinds, wavelength_ladder
 from kornia_tidy.planning.error_model import chebyshev_nodes, nodes_needed
 from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, guarded
@@ -19,7 +20,6 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.spectral_binning import fewer_wavelengths
 from kornia_tidy.render.borders import largest_window
-from kornia_tidy.render.cost_model import BankGeometry
 
 _TOLERANCE = 0.3  # pixel tolerance of the samples: some per cent suffice for differences of PSFs
 _WAVELENGTHS = 7  # at most, in the samples: PSFs then have errors of half a per cent

@@ -17,7 +17,7 @@ class RenderPlan:
         tolerance: largest error allowed.
         predicted_error: root mean square difference of the noise-free linear capture to ``reference``, full scale 1:
             an upper estimate, see :mod:`kornia_tidy.planning.planner` for its assumptions.
-        seconds: of one capture with its PSFs on one core, see :mod:`kornia_tidy.render.cost_model`.
+        seconds: of one capture with its PSFs on torch's threads, see :mod:`kornia_tidy.render.cost_model`.
         memory_bytes: peak of one capture without gradients, beyond the image.
         reference_seconds: predicted time of the reference.
         layers_present: PSFs computed for the scene.
@@ -70,7 +70,7 @@ class RenderPlan:
                 f"{knobs.window} px that hold {held} of the light, in float{64 if knobs.double else 32}"
                 + (f", and an image for each of {self.states} states of the exposure" if self.states > 1 else ""),
                 "  skips: " + "; ".join(skipped),
-                f"  costs: some {self.seconds:.2g} s on one core, {self.seconds / self.reference_seconds:.2%} of the "
+                f"  costs: some {self.seconds:.2g} s, {self.seconds / self.reference_seconds:.2%} of the "
                 f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",
                 f"  the reference itself is {self.reference_error:.1e} from a PSF of its own for each depth{at}",
             ]

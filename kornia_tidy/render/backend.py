@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 from torch import Tensor
 
+from kornia_tidy.render.cost_model import Work
 from kornia_tidy.render.scene import LayeredScene
 
 
@@ -21,15 +23,15 @@ class Backend(Protocol):
         """Return why it does not support a scene, as the end of a sentence, or None if it does."""
         ...
 
-    def seconds(self, scene: LayeredScene) -> float:
-        """Return the estimated time of the forward pass on as many threads as torch has.
+    def work(self, scene: LayeredScene) -> Work:
+        """Return the work of the forward pass: pairs of tiles and layers, strips, samples.
 
-        The backend counts (pairs of tiles and layers, strips, samples); the formulas turn counts into time.
+        :mod:`kornia_tidy.render.cost_model` prices it.
         """
         ...
 
-    def least_seconds(self, scene: LayeredScene) -> float:
-        """Return a lower bound of :meth:`seconds` that takes no time: it depends on shapes alone."""
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield lower bounds of :meth:`work`: one that takes no time, then closer ones that take less time than it."""
         ...
 
     def render(self, scene: LayeredScene) -> Tensor:

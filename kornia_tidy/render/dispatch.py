@@ -16,6 +16,9 @@ from kornia_tidy.render.backend import Backend
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
+from kornia_tidy.render.cost_model import seconds_of
+from kornia_tidy.render.cost_profile import CostProfile
+from kornia_tidy.render.first_use import profile_for
 from kornia_tidy.render.layers import SAMPLE
 from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.stray_light import stray_light_of
@@ -79,14 +82,25 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
     if len(able) > 1 and memory_objection(scene) is not None:
         able.remove(BACKENDS["dense"])
-    best, least = able[0], math.inf
-    for backend in able if len(able) > 1 else ():
-        if backend.least_seconds(scene) < least and (seconds := backend.seconds(scene)) < least:
-            best, least = backend, seconds
+    best = able[0] if key is None and len(able) == 1 else _fastest(able, scene)  # and its tiles, to be remembered
     if key is not None:
         if len(_choices) >= REMEMBERED:
             _choices.clear()
         _choices[key] = best, dict(scene.grids)
+    return best
+
+
+def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
+    """Return the backend with the least estimated time. To count takes time: what cannot be faster is not counted."""
+    best, least, profile, threads = able[0], math.inf, _profile(scene), torch.get_num_threads()
+    bounds = {backend.name: backend.bounds(scene) for backend in able}
+    first = {name: seconds_of(next(own), profile, threads) for name, own in bounds.items()}
+    for backend in sorted(able, key=lambda backend: first[backend.name]):
+        closer = (seconds_of(work, profile, threads) for work in bounds[backend.name])
+        if first[backend.name] >= least or any(seconds >= least for seconds in closer):
+            continue
+        if (seconds := seconds_of(backend.work(scene), profile, threads)) < least:
+            best, least = backend, seconds
     return best
 
 
@@ -172,7 +186,14 @@ def explain(scene: LayeredScene) -> Explanation:
         f"{len(scene.psfs)} layers, PSFs of {side}x{side} px, {torch.get_num_threads()} threads"
     )
     objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
-    seconds = {name: backend.seconds(scene) for name, backend in BACKENDS.items() if name not in objections}
+    profile, threads = _profile(scene), torch.get_num_threads()
+    able = {name: backend for name, backend in BACKENDS.items() if name not in objections}
+    seconds = {name: seconds_of(backend.work(scene), profile, threads) for name, backend in able.items()}
     if len(seconds) > 1 and (why := memory_objection(scene)) is not None:
         objections["dense"] = why
     return Explanation(words, choose(scene).name, seconds, objections)
+
+
+def _profile(scene: LayeredScene) -> CostProfile:
+    able = [name for name, backend in BACKENDS.items() if refusal(backend, scene) is None]
+    return profile_for(scene.compositing, math.prod(scene.output_size), able, BACKENDS.values())

@@ -1,110 +1,124 @@
 from __future__ import annotations
 
-import time
-from dataclasses import replace
-from itertools import product
-from pathlib import Path
+import math
+from dataclasses import fields, replace
 
 import pytest
-import scipy.stats
-import torch
-from torch.utils.flop_counter import FlopCounterMode
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.planning.planner import Planner
-from kornia_tidy.render.backends.block_plan import plan_blocks
-from kornia_tidy.render.backends.tile_plan import BLOCKS, choose_grid
 from kornia_tidy.render.cost_model import (
-    Tiles,
-    bank_operations,
-    count_tiles,
-    label_pixels,
-    rendering_bytes,
-    rendering_seconds,
-    window_side,
+    BankWork,
+    DenseOcclusionWork,
+    DenseWork,
+    DirectOcclusionWork,
+    DirectWork,
+    TiledOcclusionWork,
+    TiledWork,
+    seconds_of,
 )
-from tests.base import BaseTester, needs_data
-from tests.capture_memory import predicted_over_used
-from tests.scenes import load_scene
+from kornia_tidy.render.cost_profile import EPYC, RATES, XEON, CostProfile, DirectRates, TiledRates
+from tests.base import BaseTester
+
+WORKS = (
+    DirectWork(pixels=2**18, strips=2**13, psf_size=23),
+    TiledWork(size=72, blocks=64, pairs=200, layers=7, pixels=2**18, blended=2),
+    DenseWork(height=600, width=534, layers=7, pixels=2**18, blended=1),
+    DirectOcclusionWork(pixels=2**18, alone=500, pairs=4000, columns=10**6, edges=10**5, psf_size=23, layers=7),
+    TiledOcclusionWork(size=64, windows=(0, 20, 30, 10), pixels=2**18),
+    DenseOcclusionWork(height=600, width=534, layers=7, pixels=2**18),
+    BankWork(products=1e9, intensities=1e8),
+)
+RENDERING = WORKS[:-1]
 
 
-def _plan(labels, layers, psf_size):
-    return plan_blocks(labels, layers, choose_grid(labels, layers, psf_size), BLOCKS)
+def named(works):
+    return pytest.mark.parametrize("work", works, ids=lambda work: work.rates)
 
 
-class TestCost(BaseTester):
-    @pytest.mark.parametrize("fidelity", [Fidelity(window=31), Fidelity(window=15, pixel_tolerance=1e-6, double=True)])
-    def test_feature_matrix_products_are_those_that_torch_counts(self, fidelity):
-        optics = TiDyOptics(PixelwiseMask(2), fidelity=fidelity)
-        with FlopCounterMode(display=False) as counter:
-            optics.psf_bank(3, None, (-5.0, 0.0, 5.0))
-        counted = counter.get_total_flops()
-        expected = bank_operations(Planner(optics, 3).survey.geometry(fidelity), fidelity, 3) / (
-            2 if fidelity.double else 1
-        )
-        assert expected == pytest.approx(counted, rel=0.05)
+class TestSeconds(BaseTester):
+    @named(WORKS)
+    def test_cardinality_a_price_for_each_term(self, work):
+        for profile in (XEON, EPYC):
+            assert len(work.terms) == len(getattr(profile, work.rates).nanoseconds)
+            assert seconds_of(work, profile) > 0
+        assert {one.rates for one in WORKS} == set(RATES)
 
-    def test_feature_tiles_are_those_of_the_renderer(self):
-        """Against the plan that the renderer makes, where every pixel is looked at: some pairs are few pixels."""
-        rows = torch.linspace(-10, 10, 300).view(1, 1, -1, 1).expand(1, 1, 300, 400)
-        nodes = tuple(float(psi) for psi in range(-20, 21, 2))
-        labels = label_pixels(rows, 2, nodes, "linear")
-        counted, plan = count_tiles(labels, len(nodes), 31), _plan(labels, len(nodes), 31)
-        assert (counted.size, counted.blocks) == (plan.grid.size, plan.grid.blocks)
-        assert 0.7 < counted.pairs / sum(len(chunk.block) for chunk in plan.chunks) <= 1
-        assert counted.layers == len(plan.present) == 11
-        assert (counted.pixels, counted.terms) == (2 * 300 * 400, 2)
+    def test_feature_direct_work_on_the_xeon_by_hand(self):
+        """70 + 0.95 P^2 nanoseconds for each strip, layer and channel."""
+        seconds = seconds_of(DirectWork(10**6, 29_650, 23, channels=3), XEON)
+        assert seconds == pytest.approx(3e-9 * 29_650 * (70 + 0.95 * 23**2))
 
-    def test_feature_rendering_grows_with_channels_pairs_and_precision(self):
-        fidelity, tiles = Fidelity(window=23), Tiles(64, 40, 120, 9, 10**5, 2)
-        one = rendering_seconds(tiles, 1, fidelity)
-        assert rendering_seconds(tiles, 3, fidelity) == pytest.approx(3 * one)
-        assert rendering_seconds(tiles, 1, fidelity.replace(double=True)) == pytest.approx(2 * one)
-        assert one < rendering_seconds(replace(tiles, pairs=240), 1, fidelity) < 2 * one
+    def test_feature_tiles_by_hand(self):
+        """Transforms of blocks, pairs back and PSFs; 2 log2 n factors of two a sample."""
+        rates = replace(EPYC.tiled, call=0, pixel=0, blended=0, block=0, pair=0, large=0, step=0, transform=1)
+        work = TiledWork(size=64, blocks=5, pairs=9, layers=2, pixels=100, blended=1)
+        assert rates.seconds(work.terms) == pytest.approx(1e-9 * 64**2 * 12 * (5 + 9 + 2))
 
-    def test_feature_the_faster_way_counts(self, monkeypatch):
-        """By transforms or directly, on one core; who spreads light cannot go directly."""
-        monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-        rows = torch.linspace(-10, 10, 128).view(1, 1, -1, 1).expand(1, 1, 128, 128)
-        nodes = tuple(float(psi) for psi in range(-20, 21, 2))
-        labels = label_pixels(rows, 2, nodes, "nearest")
-        if count_tiles(labels, len(nodes), 9).strips is None:
-            pytest.skip("no C compiler on this machine: all is rendered by transforms")
-        assert count_tiles(labels, len(nodes), 9, gathers=False).strips is None
-        for window, directly in ((9, True), (129, False)):
-            tiles, fidelity = count_tiles(labels, len(nodes), window), Fidelity(window=window)
-            by_transforms = replace(tiles, strips=None)
-            assert (rendering_seconds(tiles, 3, fidelity) < rendering_seconds(by_transforms, 3, fidelity)) == directly
-            assert (rendering_bytes(tiles, 3, fidelity) < rendering_bytes(by_transforms, 3, fidelity)) == directly
+    @named(RENDERING)
+    def test_feature_grows_with_channels(self, work):
+        one, three = (seconds_of(replace(work, channels=channels), EPYC) for channels in (1, 3))
+        assert one < three <= 3 * one * (1 + 1e-12)
 
-    @needs_data
-    @pytest.mark.slow
-    def test_feature_what_is_predicted_cheaper_is_faster(self):
-        """Rank correlation of predicted and measured time over candidates from the cheapest to the dearest."""
-        optics = TiDyOptics(PixelwiseMask(2), sensor=None, fidelity=Fidelity(window=9), color_space="linear")
-        scene = load_scene("aloe")
-        image, depth = scene.image[None, :, :512, :512], scene.depth[None, :, :512, :512]
-        planned = Planner(optics, 3).scene(optics.camera.defocus(depth), image)
-        predicted, measured = [], []
-        for layers, spacing, window in product(("nearest", "linear"), (8.0, 2.0), (9, 33, 85, 129)):
-            fidelity = Fidelity(layers=layers, layer_spacing=spacing, window=window)
-            predicted.append(planned.seconds(fidelity))
-            camera, times = optics.with_fidelity(fidelity), []
-            for _ in range(3):
-                start = time.perf_counter()
-                with torch.no_grad():
-                    camera(image, depth)
-                times.append(time.perf_counter() - start)
-            measured.append(min(times))
-        assert scipy.stats.spearmanr(predicted, measured).statistic > 0.9
+    @named([work for work in RENDERING if hasattr(work, "itemsize")])
+    def test_feature_float64_takes_up_to_twice_as_long_for_the_same_counts(self, work):
+        one, two = (seconds_of(replace(work, itemsize=itemsize), EPYC) for itemsize in (4, 8))
+        assert one < two <= 2.2 * one
 
-    def test_exception_a_window_must_be_fixed(self):
-        with pytest.raises(ValueError, match="needs a fixed window, got window=None of 'balanced'"):
-            window_side(Fidelity())
+    @named(WORKS)
+    def test_feature_threads_share_all_but_what_is_paid_once(self, work):
+        rates = replace(getattr(EPYC, work.rates), shared=0.75)
+        once = 1e-9 * rates.nanoseconds[0]
+        one, four = (rates.seconds(work.terms, threads) - once for threads in (1, 4))
+        assert four == pytest.approx(one * (0.25 + 0.75 / 4))
 
-    @pytest.mark.slow
-    @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of memory is read from Linux's /proc")
-    @pytest.mark.parametrize(("side", "window"), [(1024, 23), (768, 65)])
-    def test_feature_memory_is_what_the_process_takes(self, side, window):
-        # What the library keeps of its memory differs from machine to machine.
-        assert 0.7 < predicted_over_used(side, window, "gather") < 1.8
+    def test_feature_dense_planes_of_odd_factors_take_longer_than_their_samples_say(self):
+        """620 px are transformed as 625, which has no factor of two, 640 as they are."""
+        odd, even = (DenseWork(side, side, 3, 1, 1) for side in (620, 640))
+        of_transforms = replace(EPYC.dense, call=0, pixel=0, product=0, blended=0)
+        each = [of_transforms.seconds(work.terms) / side**2 for work, side in ((odd, 625), (even, 640))]
+        assert each[0] > 1.1 * each[1]
+
+    def test_feature_windows_of_several_layers_cost_more_the_more_they_hold(self):
+        few, many = (TiledOcclusionWork(64, (0, 0, 40, 0, 0)), TiledOcclusionWork(64, (0, 0, 0, 0, 40)))
+        assert 2 < seconds_of(many, XEON) / seconds_of(few, XEON) < 3
+
+    def test_feature_large_planes_cost_more_a_sample(self):
+        small, large = (TiledWork(size, 1, 21, 21, 1, 1) for size in (64, 512))
+        only = replace(EPYC.tiled, call=0, pixel=0, blended=0, transform=0, block=0, step=0)
+        assert only.seconds(large.terms) > 64 * 1.5 * only.seconds(small.terms)
+
+
+class TestProfile(BaseTester):
+    @pytest.mark.parametrize("profile", [XEON, EPYC], ids=lambda profile: profile.name)
+    def test_feature_json_and_back(self, profile):
+        assert CostProfile.from_json(profile.as_json()) == profile
+
+    def test_feature_scaling_is_of_the_named_backends(self):
+        slow = EPYC.scaled("slow", {"direct": 2.0, "dense": 0.5})
+        assert slow.name == "slow"
+        for work in WORKS:
+            factor = {"direct": 2.0, "dense": 0.5}.get(work.rates, 1.0)
+            assert seconds_of(work, slow, 3) == pytest.approx(factor * seconds_of(work, EPYC, 3))
+
+    @pytest.mark.parametrize(
+        ("key", "number"), [("shared", 1.5), ("strip", -1.0), ("strip", math.nan), ("strip", "7"), ("strip", True)]
+    )
+    def test_exception_numbers_that_are_no_times(self, key, number):
+        document = EPYC.as_json()
+        document["direct"][key] = number
+        with pytest.raises(ValueError, match=rf"direct\.{key} of a cost profile must be a finite number"):
+            CostProfile.from_json(document)
+
+    @pytest.mark.parametrize("document", [[], {}, {**EPYC.as_json(), "more": 1}, {**EPYC.as_json(), "name": 1}])
+    def test_exception_documents_that_are_no_profile(self, document):
+        with pytest.raises(ValueError, match=r"of a cost profile|a cost profile has"):
+            CostProfile.from_json(document)
+
+    def test_exception_rates_that_are_incomplete(self):
+        document = EPYC.as_json()
+        del document["tiled"]["pair"]
+        with pytest.raises(ValueError, match="tiled of a cost profile has the numbers shared, call"):
+            CostProfile.from_json(document)
+
+    def test_cardinality_the_first_rate_is_paid_once(self):
+        for kind in (DirectRates, TiledRates, *RATES.values()):
+            assert [field.name for field in fields(kind)][:2] == ["shared", "call"]

@@ -10,6 +10,8 @@ import torch
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.compositing import COMPOSITING, render
+from kornia_tidy.render.cost_model import seconds_of
+from kornia_tidy.render.cost_store import settled_profile
 from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE, METHODS, choose, explain, render_scene
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
@@ -44,7 +46,9 @@ class TestChoose(BaseTester):
                 scene = scene_of(compositing, layers, psf_size, 80, 120)
                 for backend in BACKENDS.values():
                     if backend.refusal(scene) is None:
-                        assert 0 <= backend.least_seconds(scene) <= backend.seconds(scene) * (1 + 1e-6)
+                        own = seconds_of(backend.work(scene), settled_profile())
+                        for bound in backend.bounds(scene):
+                            assert 0 <= seconds_of(bound, settled_profile()) <= own * (1 + 1e-6)
 
     @pytest.mark.parametrize("method", METHODS)
     @over_compositing
@@ -94,7 +98,7 @@ class TestChoose(BaseTester):
         flat, nodes = torch.zeros(1, 1, 200, 300), torch.arange(20.0)
         ramp = torch.linspace(0, 19, 300).expand(flat.shape)
         image = torch.rand(1, 1, 200, 300)
-        psfs = torch.rand(20, 1, 23, 23)
+        psfs = torch.rand(20, 1, 23, 23).requires_grad_()  # dense is no choice, whose time needs no tiles
         sizes = []
         for psi in (flat, ramp, flat):
             first, again = (

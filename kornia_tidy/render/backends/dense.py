@@ -7,14 +7,14 @@ differentiated in turn is made from these functions instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends.dense_occlusion import occlude_dense, occlusion_planes
-from kornia_tidy.render.backends.tile_plan import transforms_seconds
-from kornia_tidy.render.borders import from_spectrum, next_fast_size, padded_size, to_spectrum
+from kornia_tidy.render.borders import from_spectrum, padded_size, to_spectrum
+from kornia_tidy.render.cost_model import DenseOcclusionWork, DenseWork, Work
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
@@ -27,13 +27,13 @@ class DenseBackend:
     def refusal(self, scene: LayeredScene) -> None:
         """Return None: it supports every scene."""
 
-    def seconds(self, scene: LayeredScene) -> float:
-        """Return the estimated time, from the number of layers in a sample of the scene's pixels."""
-        return _seconds(scene, scene.sampled_layers)
+    def work(self, scene: LayeredScene) -> Work:
+        """Return the work for the layers in a sample of the scene's pixels."""
+        return _work(scene, scene.sampled_layers)
 
-    def least_seconds(self, scene: LayeredScene) -> float:
-        """Return the time of a scene of one layer."""
-        return _seconds(scene, 1)
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield the work for a scene of one layer."""
+        yield _work(scene, 1)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64."""
@@ -115,29 +115,11 @@ def differentiable_gradients(
     return [next(found) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
-def dense_cost(samples: int, layers: int, transforms: int) -> float:
-    r"""Return the time of dense rendering in nanoseconds a channel, on a core of a 2.5 GHz Xeon in float32.
-
-    .. math:: n \left( L (T t + 4.5) + t \right), \qquad t = 0.04 \log_2 n + 0.4
-
-    Args:
-        samples: n, of the padded planes over the batch.
-        layers: L, how many the scene contains.
-        transforms: T, of a real plane for each layer.
-
-    Example:
-        >>> f"{dense_cost(1200 * 1350, 21, 2) * 3e-6:.0f} ms"
-        '715 ms'
-    """
-    transform = 0.04 * math.log2(samples) + 0.4
-    return samples * (layers * (transforms * transform + 4.5) + transform)
-
-
-def _seconds(scene: LayeredScene, layers: int) -> float:
+def _work(scene: LayeredScene, layers: int) -> Work:
     batch, channels, height, width = scene.image.shape
     height, width = padded_size(height, width, scene.psfs.shape[-1], scene.border)
-    samples = batch * next_fast_size(height) * next_fast_size(width)
-    # For occlusion a layer's light, its alpha and the cumulative alpha are transformed and back, in float64.
-    occlusion = scene.compositing == "occlusion"
-    itemsize = 8 if occlusion else scene.image.element_size()
-    return transforms_seconds(dense_cost(samples, layers, 6 if occlusion else 2) * itemsize / 4) * channels
+    pixels = batch * math.prod(scene.output_size)
+    if scene.compositing == "occlusion":
+        return DenseOcclusionWork(height, width, layers, pixels, batch, channels)
+    blended, itemsize = 1 if scene.layer_weight is None else 2, scene.image.element_size()
+    return DenseWork(height, width, layers, pixels, blended, batch, channels, itemsize)

@@ -10,6 +10,7 @@ pixels of many layers.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -21,8 +22,9 @@ from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.dense import gather_dense
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.tile_plan import BLOCKS, SHARED, choose_grid
+from kornia_tidy.render.backends.tile_plan import BLOCKS, choose_grid
 from kornia_tidy.render.backends.tiled import gather_gradients, twice_differentiable
+from kornia_tidy.render.cost_model import DirectWork, Work
 from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import LayeredScene
 
@@ -57,18 +59,17 @@ class DirectBackend:
             return direct_occlusion.refusal(scene.output_size, scene.psfs)
         return refusal(scene.labels, scene.image.dtype)
 
-    def seconds(self, scene: LayeredScene) -> float:
-        """Return the estimated time, from the pairs of strips and layers; all of it is shared by threads."""
+    def work(self, scene: LayeredScene) -> Work:
+        """Return the work, from the pairs of strips and layers; of occlusion from those of blocks and layers."""
         if scene.compositing == "occlusion":
-            cost = direct_occlusion.scene_cost(scene)
-        else:
-            cost = direct_cost(count_pairs(scene.labels, scene.image.dtype), scene.psfs.shape[-1])
-        return cost * scene.image.shape[1] / torch.get_num_threads() * 1e-9
+            return direct_occlusion.scene_work(scene)
+        strips = count_pairs(scene.labels, scene.image.dtype)
+        channels, itemsize = scene.image.shape[1], scene.image.element_size()
+        return DirectWork(scene.labels.layer_index.numel(), strips, scene.psfs.shape[-1], channels, itemsize)
 
-    def least_seconds(self, scene: LayeredScene) -> float:
-        """Return zero: to count is cheap."""
-        del scene
-        return 0.0
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield no work: to count is cheap."""
+        yield DirectWork(0, 0, scene.psfs.shape[-1])
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
@@ -104,26 +105,6 @@ def refusal(labels: Labels, dtype: torch.dtype) -> str | None:
 def can_go_directly(labels: Labels, dtype: torch.dtype) -> bool:
     """Return whether light can be gathered directly, see :func:`refusal`."""
     return refusal(labels, dtype) is None
-
-
-def is_direct_faster(direct: float, transforms: float) -> bool:
-    """Return whether direct work is faster than transforms: threads share all of the one, ``SHARED`` of the other."""
-    threads = torch.get_num_threads()
-    return direct / threads < transforms * (1 - SHARED + SHARED / threads)
-
-
-def direct_cost(pairs: int, side: int) -> float:
-    r"""Return the time that direct convolution takes in nanoseconds a channel, on the core of ``tile_cost``.
-
-    .. math:: N (70 + 0.95 P^2)
-
-    for N pairs of a strip of 64 bytes by 4 rows and a layer present in it, and PSFs of P x P pixels.
-
-    Example:
-        >>> f"{direct_cost(29_650, 23) * 3e-6:.0f} ms"
-        '51 ms'
-    """
-    return pairs * (70 + 0.95 * side**2)
 
 
 class _GatherDirectly(torch.autograd.Function):

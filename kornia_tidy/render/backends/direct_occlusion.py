@@ -10,6 +10,7 @@ tiles.
 from __future__ import annotations
 
 import ctypes
+import math
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from kornia_tidy.render.backends.dense_occlusion import OcclusionPlanes
 from kornia_tidy.render.backends.tile_plan import WINDOWS, choose_grid
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.backends.window_plan import WindowPlan, plan_windows
+from kornia_tidy.render.cost_model import DirectOcclusionWork
 from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import LayeredScene
 
@@ -28,7 +30,7 @@ SOURCE = KERNELS / "occlusion.c"
 BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
 SMALLEST_SIDE = BAND - 1  # px, of PSFs; smaller ones are made as large
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
-COUNTED = 12  # bands of blocks in the sample that costs are estimated from
+COUNTED, FEWEST_COUNTED = 12, 3  # bands of blocks that are counted to know the work
 
 
 class _Scene(ctypes.Structure):
@@ -72,11 +74,13 @@ def can_go_directly(plane: Tensor, psfs: Tensor) -> bool:
     return psfs.dtype == plane.dtype and refusal(output_size, psfs) is None
 
 
-def scene_cost(scene: LayeredScene) -> float:
-    """Return the time that a scene takes in nanoseconds a channel, see :func:`direct_cost`."""
+def scene_work(scene: LayeredScene) -> DirectOcclusionWork:
+    """Return the work for a scene, counted in every few bands of blocks."""
     index, weight = scene.sorted_layers
     counts = count(scene.plane, scene.psfs, index, weight)
-    return direct_cost(*counts, max(scene.psfs.shape[-1], SMALLEST_SIDE))
+    (batch, channels), pixels = scene.image.shape[:2], math.prod(scene.output_size)
+    side, itemsize = max(scene.psfs.shape[-1], SMALLEST_SIDE), scene.image.element_size()
+    return DirectOcclusionWork(batch * pixels, *counts, side, len(scene.psfs), channels, itemsize)
 
 
 def occlude_scene(planes: OcclusionPlanes, labels: Labels) -> Tensor:
@@ -113,31 +117,12 @@ class _OccludeDirectly(torch.autograd.Function):
         return *occlusion_gradients(planes, plan, grad_outputs[0], ctx.needs_input_grad), None
 
 
-def direct_cost(alone: int, pairs: int, columns: int, edges: int, side: int) -> float:
-    r"""Return the time that this takes in nanoseconds a channel, on the core of ``windows_cost``.
-
-    .. math:: A (250 + 3.7 P^2) + (320 + 3 P) N + 2.3 K + 12 E
-
-    Fitted to 7 to 65 pixels a side, nearest and linear layers, flat scenes and noise: within 15 %.
-
-    Args:
-        alone: A, pairs of blocks whose window is all of one layer; in float64 blocks are half as wide.
-        pairs: N, pairs of another block and a layer present in its window.
-        columns: K, columns of PSFs that meet a row of light, or of shared weights.
-        edges: E, where runs of whole weights begin and end.
-        side: P, of PSFs.
-
-    Example:
-        >>> f"{direct_cost(2_139, 21_603, 5_606_383, 534_148, 23) * 3e-6:.0f} ms"  # Aloe in 21 layers
-        '97 ms'
-    """
-    return alone * (250 + 3.7 * side**2) + (320 + 3 * side) * pairs + 2.3 * columns + 12 * edges
-
-
 def count(plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None) -> list[int]:
-    """Return the counts for :func:`direct_cost`, estimated from a sample of the bands of blocks."""
+    """Return the counts of a :class:`~kornia_tidy.render.cost_model.DirectOcclusionWork`, from every few bands."""
     scene, kept = _scene(plane, psfs, layer_index, layer_weight, None)
-    every = max(1, scene.images * scene.height // (BAND * COUNTED))
+    # Small PSFs are rendered in little more time than it takes to count, and are the fastest by far.
+    counted = min(COUNTED, max(FEWEST_COUNTED, scene.side // 4))
+    every = max(1, scene.images * scene.height // (BAND * counted))
     counts = (ctypes.c_int64 * 4)()
     if _library(plane.dtype).count(ctypes.byref(scene), ctypes.c_int64(every), counts):
         raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")

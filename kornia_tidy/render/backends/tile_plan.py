@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.cost_model import TiledOcclusionWork, TiledWork, seconds_of
+from kornia_tidy.render.cost_profile import CostProfile
+from kornia_tidy.render.cost_store import settled_profile
 from kornia_tidy.render.layers import SAMPLE, Labels
 
-TILE_FACTOR = 1.1  # time of all windows over their cost in the choice of a grid
-PIXEL_NANOSECONDS = 8.5  # of a pixel and each layer that it takes light from
-SHARED = 0.5  # of the work by transforms that threads share
+TileWork = TiledWork | TiledOcclusionWork
 
 
 @dataclass(frozen=True)
@@ -142,8 +143,8 @@ def choose_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind = BLO
     return grids[0] if len(grids) == 1 else cheapest_grid(labels, layers, psf_size, kind)[1]
 
 
-def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> tuple[float, Grid]:
-    """Return the lowest cost in nanoseconds a channel, and the grid that has it.
+def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> tuple[TileWork, Grid]:
+    """Return the work of the grid that takes the least time, in float32 and for one channel, and the grid.
 
     The layers of each candidate's blocks are found on every eighth row and column.
 
@@ -153,18 +154,34 @@ def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) ->
         psf_size: side P of the PSFs.
         kind: of the tiles.
     """
-    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
+    grids, blended = (
+        candidates(tuple(labels.layer_index.shape), psf_size, kind),
+        1 if labels.layer_weight is None else 2,
+    )
     sample = labels.every(SAMPLE)
-    costs = _costs(grids, [grid.present(sample, layers, SAMPLE).sum(1) for grid in grids], kind)
-    return min(zip(costs, grids, strict=True), key=lambda pair: pair[0])
+    works = _works(grids, [grid.present(sample, layers, SAMPLE) for grid in grids], blended, kind)
+    return _cheapest(works, grids, settled_profile())
 
 
 @lru_cache(maxsize=256)
-def least_cost(shape: tuple[int, ...], psf_size: int, kind: TileKind) -> float:
-    """Return the cost of labels of a shape with one layer in each block, in nanoseconds a channel."""
+def least_work(shape: tuple[int, ...], psf_size: int, blended: int, kind: TileKind, profile: CostProfile) -> TileWork:
+    """Return the work for labels of a shape with one layer in each block, in float32 and for one channel."""
     grids = candidates(shape, psf_size, kind)
-    held = [torch.ones(grid.blocks, dtype=torch.int64) for grid in grids]
-    return min(_costs(grids, held, kind))
+    works = _works(grids, [torch.ones(grid.blocks, 1, dtype=torch.bool) for grid in grids], blended, kind)
+    return _cheapest(works, grids, profile)[0]
+
+
+def least_windows(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> TileWork:
+    """Return the work where larger windows hold no more layers than the smallest ones do on average."""
+    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
+    held = float(grids[0].present(labels.every(SAMPLE), layers, SAMPLE).sum(1).double().mean())
+    few = max(1, int(held))  # some windows hold so many, the rest one more
+    works = []
+    for grid in grids:
+        more = int((held - few) * grid.blocks) if held > few else 0
+        counts = (*(0 for _ in range(few)), grid.blocks - more, more)
+        works.append(TiledOcclusionWork(grid.size, counts, grid.batch * grid.height * grid.width))
+    return _cheapest(works, grids, settled_profile())[0]
 
 
 def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -> list[Grid]:
@@ -188,68 +205,19 @@ def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: T
     return Grid(batch, height, width, size, tile, kind.across, reach, rows, columns)
 
 
-def _costs(grids: list[Grid], held: list[Tensor], kind: TileKind) -> list[float]:
-    """Return the cost of each grid from the number of layers that each of its blocks holds. Waits once for a device."""
+def _works(grids: list[Grid], present: list[Tensor], blended: int, kind: TileKind) -> list[TileWork]:
+    """Return the work of each grid from the layers that each of its blocks holds. Waits once for a device."""
+    pixels = [grid.batch * grid.height * grid.width for grid in grids]
     if kind.windowed:
-        return torch.stack([windows_cost(own, grid.size) for grid, own in zip(grids, held, strict=True)]).tolist()
-    pairs = torch.stack([own.sum() for own in held]).tolist()
-    return [tile_cost(grid.size, len(own), count) for grid, own, count in zip(grids, held, pairs, strict=True)]
+        layers = present[0].shape[1]
+        held = torch.stack([torch.bincount(own.sum(1), minlength=layers + 1) for own in present]).tolist()
+        return [TiledOcclusionWork(grid.size, tuple(own), n) for grid, own, n in zip(grids, held, pixels, strict=True)]
+    layers, *pairs = torch.stack([present[0].any(0).sum(), *(own.sum() for own in present)]).tolist()
+    return [
+        TiledWork(grid.size, grid.blocks, count, layers, n, blended)
+        for grid, count, n in zip(grids, pairs, pixels, strict=True)
+    ]
 
 
-def transforms_seconds(nanoseconds: float) -> float:
-    """Return the time in seconds of work by transforms that takes some nanoseconds on one core.
-
-    Of such work torch's threads share :data:`SHARED`.
-    """
-    return nanoseconds * (1 - SHARED + SHARED / torch.get_num_threads()) * 1e-9
-
-
-def tile_cost(size: int, blocks: int, pairs: int) -> float:
-    r"""Return the time that windows take in nanoseconds a channel, on a core of a 2.5 GHz Xeon in float32.
-
-    .. math:: n^2 \left( B (t + 1.8) + N (t + 1.5) \right) + 2000 N, \qquad t = 0.09 \log_2 n^2
-
-    for B blocks and N pairs with windows of n x n samples: t to transform a sample, 1.8 to cut it out of the image,
-    1.5 to fetch its spectrum and multiply it; and 2000 to call for a pair at all.
-
-    Example:
-        >>> f"{tile_cost(72, 299, 1044) * 3e-6:.0f} ms"
-        '62 ms'
-    """
-    transform = 0.09 * math.log2(size**2)
-    return size**2 * (blocks * (transform + 1.8) + pairs * (transform + 1.5)) + 2000 * pairs
-
-
-def transforms_cost(windows: float, pixels: int, terms: int) -> float:
-    """Return the time of rendering by transforms in nanoseconds a channel, like :func:`tile_cost`.
-
-    Args:
-        windows: what windows and spectra take, from :func:`tile_cost`.
-        pixels: of the output, over the batch.
-        terms: layers that a pixel takes light from, 1 or 2.
-
-    Example:
-        >>> f"{transforms_cost(tile_cost(72, 299, 1044), 1110 * 1282, 1) * 3e-6:.0f} ms"
-        '105 ms'
-    """
-    return TILE_FACTOR * windows + PIXEL_NANOSECONDS * pixels * terms
-
-
-def windows_cost(layers: Tensor, size: int) -> Tensor:
-    r"""Return the time that windows take in nanoseconds a channel, on a core of a 2.5 GHz Xeon.
-
-    .. math:: n^2 \left( 0.6 + \frac{n}{130} \right) \sum_w \max(6, 17 d_w + 7 (d_w - 2)) + 15000 \sum_w d_w
-
-    for windows of n x n samples, of which the w-th holds :math:`d_w` layers: a window of a single layer is computed in
-    float32; larger windows leave the cache; and each layer is called for. Fitted to 48 to 288 samples.
-
-    Args:
-        layers: d, the number of layers of each window.
-        size: n.
-
-    Example:
-        >>> f"{float(windows_cost(torch.tensor([1, 2, 3]), 64)) * 1e-6:.2f} ms"
-        '0.53 ms'
-    """
-    each = torch.where(layers < 2, 6, 17 * layers + 7 * (layers - 2))
-    return each.sum() * (size**2 * (0.6 + size / 130)) + 15000 * layers.sum()
+def _cheapest(works: list[TileWork], grids: list[Grid], profile: CostProfile) -> tuple[TileWork, Grid]:
+    return min(zip(works, grids, strict=True), key=lambda pair: seconds_of(pair[0], profile))

@@ -6,8 +6,8 @@ are made by the functions of :mod:`kornia_tidy.render.backends.dense`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -23,14 +23,14 @@ from kornia_tidy.render.backends.tile_plan import (
     TileKind,
     cheapest_grid,
     choose_grid,
-    least_cost,
-    tile_cost,
-    transforms_cost,
-    transforms_seconds,
+    least_windows,
+    least_work,
 )
 from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
 from kornia_tidy.render.backends.tiled_occlusion import occlude_tiled
 from kornia_tidy.render.borders import pad_border
+from kornia_tidy.render.cost_model import TiledOcclusionWork, TiledWork, Work
+from kornia_tidy.render.cost_store import settled_profile
 from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import LayeredScene
 
@@ -52,19 +52,19 @@ class TiledBackend:
     def refusal(self, scene: LayeredScene) -> None:
         """Return None: it supports every scene."""
 
-    def seconds(self, scene: LayeredScene) -> float:
-        """Return the estimated time with the best tiles for the scene."""
+    def work(self, scene: LayeredScene) -> Work:
+        """Return the work with the best tiles for the scene."""
         kind = self.windows if scene.compositing == "occlusion" else self.blocks
-        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psfs.shape[-1], kind)
-        scene.grids[kind] = grid
-        if scene.compositing != "occlusion":
-            cost += tile_cost(grid.size, 0, scene.sampled_layers)  # the spectra of the PSFs
-        return _seconds(scene, cost)
+        work, scene.grids[kind] = cheapest_grid(scene.labels, len(scene.psfs), scene.psfs.shape[-1], kind)
+        return _of_scene(work, scene)
 
-    def least_seconds(self, scene: LayeredScene) -> float:
-        """Return the time of a scene with one layer in each tile."""
+    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
+        """Yield the work for a scene with one layer in each tile; for windows then with as many as small ones hold."""
         kind = self.windows if scene.compositing == "occlusion" else self.blocks
-        return _seconds(scene, least_cost(tuple(scene.labels.layer_index.shape), scene.psfs.shape[-1], kind))
+        shape, blended = tuple(scene.labels.layer_index.shape), 1 if scene.layer_weight is None else 2
+        yield _of_scene(least_work(shape, scene.psfs.shape[-1], blended, kind, settled_profile()), scene)
+        if scene.compositing == "occlusion":
+            yield _of_scene(least_windows(scene.labels, len(scene.psfs), scene.psfs.shape[-1], self.windows), scene)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
@@ -85,12 +85,11 @@ class TiledBackend:
         return _Gather.apply(plane, scene.psfs, weight, plan)
 
 
-def _seconds(scene: LayeredScene, cost: float) -> float:
-    """Return the time in seconds from the cost of the windows in nanoseconds a channel."""
-    if scene.compositing != "occlusion":  # which is computed in float64 anyway
-        pixels, terms = scene.labels.layer_index.numel(), 1 if scene.layer_weight is None else 2
-        cost = transforms_cost(cost, pixels, terms) * scene.image.element_size() / 4
-    return transforms_seconds(cost) * scene.image.shape[1]
+def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work:
+    """Return work for the channels and the precision of a scene. Occlusion is computed in float64 anyway."""
+    if isinstance(work, TiledOcclusionWork):
+        return replace(work, channels=scene.image.shape[1])
+    return replace(work, channels=scene.image.shape[1], itemsize=scene.image.element_size())
 
 
 class _Gather(torch.autograd.Function):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
@@ -17,7 +16,6 @@ from kornia_tidy.render.backends.direct import (
     SOURCE,
     STRIP_ROWS,
     count_pairs,
-    direct_cost,
     mix_directly,
 )
 from kornia_tidy.render.borders import BORDERS
@@ -240,7 +238,3 @@ class TestChoice(BaseTester):
         environment = {**os.environ, "CC": "false", "XDG_CACHE_HOME": str(tmp_path)}
         run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
         assert run.stdout.count("direct convolution needs a C compiler") == 2
-
-    def test_feature_cost_grows_with_pairs_and_samples(self):
-        assert direct_cost(200, 23) == pytest.approx(2 * direct_cost(100, 23))
-        assert math.isclose(direct_cost(100, 46) / direct_cost(100, 23), 4, rel_tol=0.2)

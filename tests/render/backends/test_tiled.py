@@ -218,7 +218,8 @@ class TestTiledRender(RenderTester):
             assert coded.requires_grad
             return sum(size for size, _ in kept.values())
 
-        assert kept_bytes(42) - kept_bytes(2) <= 40 * (5 * 5 * 4 + 3 * 8)
+        hanging = 2 * 64 * 64 * 4  # other tiles may hang over the image by less than themselves
+        assert kept_bytes(42) - kept_bytes(2) <= 40 * (5 * 5 * 4 + 3 * 8) + hanging
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     def test_feature_no_tensor_is_larger_than_the_image_or_a_chunk(self, compositing, device):
