@@ -2,7 +2,7 @@
 // where it is.
 //
 // A block is BAND rows of LANES pixels, and its sums stay in registers. All that is added up is positive, so that
-// sample by sample in REAL it keeps its relative accuracy however small it is (transforms do not, see occlusion.py).
+// sample by sample in REAL it keeps its relative accuracy however small it is (transforms do not).
 //
 // - Light is convolved, masked to a layer. A row of it above and one below the window's middle together serve each of
 //   the block's rows once: no product is wasted.
@@ -20,20 +20,20 @@ typedef double dvec __attribute__((vector_size(64)));
 typedef double dloose __attribute__((vector_size(64), aligned(8), may_alias));
 typedef REAL part __attribute__((vector_size(DOUBLES * sizeof(REAL))));
 
-static const REAL EPSILON = 1e-6;  // as in occlusion.py
+static const REAL EPSILON = 1e-6;  // as in dense_occlusion.py
 
-// The fields of `_Panes` in direct_occlusion.py. Widths and heights are those of the output; planes are larger by side - 1.
+// The fields of `_Scene` in occlusion_ops.py. Widths and heights are those of the output; planes are larger by side - 1.
 typedef struct {
     int64_t images, channels, height, width, layers, side, threads;
     int64_t plane_image, plane_channel, plane_row, map_image, map_row;
     const REAL *plane;  // light
-    const REAL *psfs;   // (layers, channels, side, side), turned, columns first
+    const REAL *psfs;   // (layers, channels, side, side), flipped, columns first
     const REAL *lower;  // layers of the plane's pixels; `layers` and more: in none
     const REAL *share;  // below 1: of the next layer; like lower, or null
-    const REAL *mean;   // (images, channels) light that the veil spreads, or null
-    const REAL *veil;   // (layers, channels)
+    const REAL *mean;   // (images, channels) light that strays, or null
+    const REAL *stray_light;   // (layers, channels)
     REAL *out;          // (images, channels, height, width)
-} panes;
+} scene_parameters;
 
 // Pixels of one row and one `lower`, up to the next run: either all of them share light with the next layer, or none.
 typedef struct {
@@ -79,17 +79,17 @@ typedef struct {
     outline outline;
     void *all[20];
     int count;
-} desk;
+} workspace;
 
 // ---- Tables: sums over the ends of a PSF's rows.
 // rows (side + 2 BAND - 2, pitch): row BAND - 1 + k holds, rising by u, the sum of row k's samples from column
 // side + LANES - 2 - u on; rows beyond the PSF hold zeros. Then the sums of all rows from k = side + BAND - 2 - u on.
 
-static int64_t table_pitch(const panes *s) { return s->side + 2 * LANES; }
-static int64_t table_rows(const panes *s) { return s->side + 2 * BAND - 2; }
-static int64_t table_size(const panes *s) { return table_rows(s) * (table_pitch(s) + 1) + DOUBLES; }
+static int64_t table_pitch(const scene_parameters *s) { return s->side + 2 * LANES; }
+static int64_t table_rows(const scene_parameters *s) { return s->side + 2 * BAND - 2; }
+static int64_t table_size(const scene_parameters *s) { return table_rows(s) * (table_pitch(s) + 1) + DOUBLES; }
 
-static void fill_table(const panes *s, const REAL *psf, double *table) {
+static void fill_table(const scene_parameters *s, const REAL *psf, double *table) {
     int64_t pitch = table_pitch(s), rows = table_rows(s);
     double *ends = table + rows * pitch;
     memset(table, 0, table_size(s) * sizeof(double));
@@ -107,7 +107,7 @@ static void fill_table(const panes *s, const REAL *psf, double *table) {
 
 // ---- Runs.
 
-static void find_runs(const panes *s, const REAL *lower, const REAL *share, run *runs) {
+static void find_runs(const scene_parameters *s, const REAL *lower, const REAL *share, run *runs) {
     int64_t width = s->width + s->side - 1, count = 0;
     for (int64_t x = 0; x < width; x++) {
         int shared = share && share[x] > 0;
@@ -119,7 +119,7 @@ static void find_runs(const panes *s, const REAL *lower, const REAL *share, run 
     runs[count] = (run){width, 0, 0};
 }
 
-static void find_runs_of_band(const panes *s, desk *d, int64_t image, int64_t y) {
+static void find_runs_of_band(const scene_parameters *s, workspace *d, int64_t image, int64_t y) {
     int64_t rows = s->side + BAND - 1, width = s->width + s->side - 1, height = s->height + s->side - 1;
     for (int64_t r = y; r < y + rows; r++) {
         int64_t slot = r % rows, at = image * s->map_image + r * s->map_row;
@@ -131,7 +131,7 @@ static void find_runs_of_band(const panes *s, desk *d, int64_t image, int64_t y)
 }
 
 // Goes on to a window further right in the same rows; says whether all of it is one layer's.
-static int move_heads(desk *d, int64_t rows, int64_t x, int64_t span) {
+static int move_heads(workspace *d, int64_t rows, int64_t x, int64_t span) {
     int alone = 1;
     for (int64_t r = 0; r < rows; r++) {
         const run *p = d->heads[r];
@@ -142,7 +142,7 @@ static int move_heads(desk *d, int64_t rows, int64_t x, int64_t span) {
     return alone;
 }
 
-INLINE int meet(desk *d, int count, int32_t layer) {
+INLINE int meet(workspace *d, int count, int32_t layer) {
     if (d->stamps[layer] == d->window) return count;
     d->stamps[layer] = d->window;
     int n = count;
@@ -152,7 +152,7 @@ INLINE int meet(desk *d, int count, int32_t layer) {
 }
 
 // Lists the layers of a window, near to far.
-static int list_layers(const panes *s, desk *d, int64_t rows, int64_t x, int64_t span) {
+static int list_layers(const scene_parameters *s, workspace *d, int64_t rows, int64_t x, int64_t span) {
     int count = 0;
     d->window++;
     for (int64_t r = 0; r < rows; r++)
@@ -173,7 +173,7 @@ INLINE void reach(extent *e, int32_t from, int32_t to) {
     e->to = to;
 }
 
-INLINE ray ray_of(const panes *s, extent e, const REAL *light, const REAL *nothing) {
+INLINE ray ray_of(const scene_parameters *s, extent e, const REAL *light, const REAL *nothing) {
     if (e.to == 0) return (ray){nothing, s->side, 0};
     return (ray){light, e.from < LANES ? 0 : e.from - LANES + 1, least(e.to, s->side)};
 }
@@ -188,7 +188,7 @@ INLINE void start_row(region *a, int64_t at, int whole) {
 }
 
 // Where a layer is in a window.
-static void draw_outline(const panes *s, desk *d, int64_t x, int32_t layer, int64_t pitch) {
+static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int32_t layer, int64_t pitch) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1;
     outline *o = &d->outline;
     o->own.column_count = o->own.row_count = o->own.open = 0;
@@ -257,7 +257,7 @@ static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec tot
 }
 
 // The blur of whole weights, from where their runs begin and end.
-static void add_edges(const panes *s, const double *table, const region *a, vec total[BAND]) {
+static void add_edges(const scene_parameters *s, const double *table, const region *a, vec total[BAND]) {
     int64_t pitch = table_pitch(s);
     dvec constant = {0}, sums[BAND][PARTS];
     for (const edge *e = a->rows; e < a->rows + a->row_count; e++)
@@ -291,7 +291,7 @@ INLINE vec only(vec x, __typeof__((vec){0} == (vec){0}) mask) {
 enum { LIGHT, LOWER, UPPER };
 
 // A layer's light, or its shared weights, in the rows that hold any.
-INLINE void mask_rows(const panes *s, const ray *rays, int32_t layer, int what, const REAL *lower, const REAL *share,
+INLINE void mask_rows(const scene_parameters *s, const ray *rays, int32_t layer, int what, const REAL *lower, const REAL *share,
                       const REAL *light, REAL *out, int64_t pitch) {
     const vec own = (REAL)layer - (vec){0}, below = (REAL)(layer - 1) - (vec){0};
     for (int64_t r = 0; r < s->side + BAND - 1; r++) {
@@ -311,18 +311,18 @@ INLINE void mask_rows(const panes *s, const ray *rays, int32_t layer, int what, 
     }
 }
 
-static void mask_light(const panes *s, const ray *rays, int32_t layer, const REAL *lower, const REAL *share,
+static void mask_light(const scene_parameters *s, const ray *rays, int32_t layer, const REAL *lower, const REAL *share,
                        const REAL *light, REAL *out, int64_t pitch) {
     if (share) mask_rows(s, rays, layer, LIGHT, lower, share, light, out, pitch);
     else mask_rows(s, rays, layer, LIGHT, lower, 0, light, out, pitch);
 }
 
-static int64_t window_pitch(const panes *s) { return (s->side + 2 * LANES) / LANES * LANES; }
+static int64_t window_pitch(const scene_parameters *s) { return (s->side + 2 * LANES) / LANES * LANES; }
 
 // ---- Blocks.
 
 // A block of two strips whose window is all of one layer.
-static void lay_alone(const panes *s, desk *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
+static void lay_alone(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int32_t layer = d->heads[0]->layer;
     int64_t area = s->side * s->side, rows = s->side + BAND - 1;
     for (int64_t c = 0; c < s->channels; c++) {
@@ -338,17 +338,17 @@ static void lay_alone(const panes *s, desk *d, const double *tables, int64_t ima
             }
             convolve_two(d->rays, s->psfs + (layer * s->channels + c) * area, s->side, light);
         }
-        REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
-        REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
+        REAL stray_light = s->stray_light && layer < s->layers ? s->stray_light[layer * s->channels + c] : 0;
+        REAL background = s->stray_light ? stray_light * s->mean[image * s->channels + c] * whole : 0;
         REAL divisor = (whole > 0 ? whole : 0) + EPSILON;
         for (int v = skip; v < BAND; v++)
             for (int strip = 0; strip < 2; strip++)
-                *(loose *)(out + v * s->width + strip * LANES) = ((1 - veil) * light[strip][v] + glow) / divisor;
+                *(loose *)(out + v * s->width + strip * LANES) = ((1 - stray_light) * light[strip][v] + background) / divisor;
     }
 }
 
 // A block of one strip, layer over layer.
-static void lay_over(const panes *s, desk *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
+static void lay_over(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int64_t area = s->side * s->side, rows = s->side + BAND - 1, pitch = window_pitch(s);
     int count = list_layers(s, d, rows, x, s->side + LANES - 1);
     int64_t corner = image * s->map_image + y * s->map_row + x;
@@ -384,11 +384,11 @@ static void lay_over(const panes *s, desk *d, const double *tables, int64_t imag
                 convolve_one(o->upper, psf, s->side, weight);
                 for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v];
             }
-            REAL veil = s->veil ? s->veil[layer * s->channels + c] : 0;
-            REAL glow = s->veil ? veil * s->mean[image * s->channels + c] : 0;
+            REAL stray_light = s->stray_light ? s->stray_light[layer * s->channels + c] : 0;
+            REAL background = s->stray_light ? stray_light * s->mean[image * s->channels + c] : 0;
             for (int v = 0; v < BAND; v++) {
                 vec passed = through[c][v] / (only(seen[v], seen[v] > 0) + EPSILON);
-                total[c][v] += passed * ((1 - veil) * light[0][v] + glow * own[0][v]);
+                total[c][v] += passed * ((1 - stray_light) * light[0][v] + background * own[0][v]);
                 through[c][v] -= passed * own[0][v];
             }
         }
@@ -412,7 +412,7 @@ static int64_t count_columns(const ray *rays, int64_t side) {
     return columns;
 }
 
-static void count_block(const panes *s, desk *d, int64_t x, int64_t counts[COUNTS]) {
+static void count_block(const scene_parameters *s, workspace *d, int64_t x, int64_t counts[COUNTS]) {
     int count = list_layers(s, d, s->side + BAND - 1, x, s->side + LANES - 1);
     const outline *o = &d->outline;
     counts[PAIRS] += count;
@@ -425,15 +425,15 @@ static void count_block(const panes *s, desk *d, int64_t x, int64_t counts[COUNT
     }
 }
 
-// ---- Desks.
+// ---- Workspaces.
 
-static void *take(desk *d, int64_t bytes) {
+static void *take(workspace *d, int64_t bytes) {
     void *memory = aligned_alloc(64, (bytes + 127) / 64 * 64);
     if (memory) memset(memory, 0, bytes);
     return d->all[d->count++] = memory;
 }
 
-static int set_up(const panes *s, desk *d) {
+static int set_up(const scene_parameters *s, workspace *d) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1, pitch = window_pitch(s);
     outline *o = &d->outline;
     d->count = 0, d->window = 0;
@@ -454,18 +454,18 @@ static int set_up(const panes *s, desk *d) {
     o->behind.columns = take(d, rows * span * sizeof(edge));
     o->own.rows = take(d, rows * sizeof(edge));
     o->behind.rows = take(d, rows * sizeof(edge));
-    int well = 1;
-    for (int n = 0; n < d->count; n++) well &= d->all[n] != 0;
-    for (int64_t r = 0; well && r < rows; r++) d->made[r] = -1;
-    return well;
+    int ok = 1;
+    for (int n = 0; n < d->count; n++) ok &= d->all[n] != 0;
+    for (int64_t r = 0; ok && r < rows; r++) d->made[r] = -1;
+    return ok;
 }
 
-static void tear_down(desk *d) {
+static void tear_down(workspace *d) {
     for (int n = 0; n < d->count; n++) free(d->all[n]);
 }
 
 // Lays the layers of a band, or with `counts` only counts what that would cost.
-static void lay_band(const panes *s, desk *d, const double *tables, int64_t band, int64_t *counts) {
+static void lay_band(const scene_parameters *s, workspace *d, const double *tables, int64_t band, int64_t *counts) {
     int64_t bands = (s->height + BAND - 1) / BAND, rows = s->side + BAND - 1, image = band / bands;
     int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
     int skip = top - y;  // rows that the band before has made, maybe on another thread
@@ -483,17 +483,17 @@ static void lay_band(const panes *s, desk *d, const double *tables, int64_t band
 }
 
 // Adds up what every `every`-th band would cost. Returns 0, or 1 if there is no memory.
-int count(const panes *s, int64_t every, int64_t *counts) {
+int count(const scene_parameters *s, int64_t every, int64_t *counts) {
     int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
-    desk d;
-    int well = set_up(s, &d);
-    for (int64_t n = every / 2; well && n < bands; n += every) lay_band(s, &d, 0, n, counts);
+    workspace d;
+    int ok = set_up(s, &d);
+    for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
     tear_down(&d);
-    return !well;
+    return !ok;
 }
 
 // Lays the layers of a scene over one another. Returns 0, or 1 if there is no memory.
-int occlude(const panes *s) {
+int occlude(const scene_parameters *s) {
     int64_t bands = (s->height + BAND - 1) / BAND, all = s->layers * s->channels, failed = 0;
     double *tables = malloc(all * table_size(s) * sizeof(double));
     if (!tables) return 1;
@@ -501,15 +501,15 @@ int occlude(const panes *s) {
     {
 #pragma omp for
         for (int64_t n = 0; n < all; n++) fill_table(s, s->psfs + n * s->side * s->side, tables + n * table_size(s));
-        desk d;
-        int well = set_up(s, &d);
-        if (!well) {
+        workspace d;
+        int ok = set_up(s, &d);
+        if (!ok) {
 #pragma omp atomic write
             failed = 1;
         }
 #pragma omp for schedule(dynamic, 4)
         for (int64_t n = 0; n < s->images * bands; n++)
-            if (well) lay_band(s, &d, tables, n, 0);
+            if (ok) lay_band(s, &d, tables, n, 0);
         tear_down(&d);
     }
     free(tables);

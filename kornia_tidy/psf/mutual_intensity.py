@@ -15,17 +15,16 @@ Source: Goodman, Statistical Optics, 5.2, for the mutual intensity.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.build import KERNELS, REALS, compiled
+from kornia_tidy.kernels.build import REALS, compiled
+from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
 from kornia_tidy.psf.checkpointed_sum import recomputed
 from kornia_tidy.runtime.tracing import is_followed
 
-SOURCE = KERNELS / "mutual_intensity.c"
 LARGEST_WINDOW = (
     65  # px, in C: 0.6 (23 px) to 0.85 (61 px) of the time of matrix products, beyond 100 px more than they
 )
@@ -49,7 +48,7 @@ def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
         tensor([[[16.]]])
     """
     if _is_plain(field, weights, kernels) and goes_in_c(kernels.shape[1], field.real.dtype):
-        return _energies_in_c(field, weights, kernels)
+        return mutual_intensity_energies(field, weights.to(field.real.dtype), kernels)
     weights = weights.to(field.real.dtype)[:, None, None]
     plain, turned = _columns(field), _columns(field * weights * (1 + 1j))
     left = torch.view_as_real(kernels).flatten(-2)
@@ -74,24 +73,6 @@ def _is_plain(*tensors: Tensor) -> bool:
     if is_followed() or any(x.device.type != "cpu" for x in tensors):
         return False
     return not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
-
-
-def _energies_in_c(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
-    """What :func:`mutual_energies` returns, by mutual_intensity.c: waves and intensities of a row stay in its cache."""
-    real = field.real.dtype
-    field, kernels = (x.detach().resolve_conj().contiguous() for x in (field, kernels))
-    weights = weights.detach().to(real).contiguous()
-    depths, window, order, cells = kernels.shape
-    energies = torch.empty(depths, window, window, dtype=real)
-    library = compiled(SOURCE, real)
-    assert library is not None
-    failed = library.mutual_energies(
-        *(ctypes.c_void_p(x.data_ptr()) for x in (field, weights, kernels, energies)),
-        *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
-    )
-    if failed:
-        raise MemoryError(f"no memory for PSFs of {window}x{window} pixels")
-    return energies
 
 
 def _columns(field: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ class TestInC(BaseTester):
 
     def test_feature_only_without_gradients_and_for_small_windows(self, monkeypatch):
         taken = []
-        monkeypatch.setattr(mutual_intensity, "_energies_in_c", lambda *x: taken.append(x[2].shape[1]))
+        monkeypatch.setattr(mutual_intensity, "mutual_intensity_energies", lambda *x: taken.append(x[2].shape[1]))
         for window in (9, LARGEST_WINDOW + 2):
             field, kernels = (torch.randn(*shape, dtype=torch.complex64) for shape in ((2, 8, 8), (2, window, 2, 8)))
             mutual_energies(field, torch.ones(2), kernels)
