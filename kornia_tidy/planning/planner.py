@@ -40,7 +40,7 @@ from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes, guarded
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
-from kornia_tidy.render.backends.tile_plan import Labels
+from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.borders import pad_border
 from kornia_tidy.render.cost_model import (
     Tiles,

@@ -23,8 +23,8 @@ from kornia_tidy.psf.mutual_intensity import goes_in_c
 from kornia_tidy.psf.propagation import energy_operations
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.render.backends.direct import can_go_directly, count_pairs, direct_cost, is_direct_faster
-from kornia_tidy.render.backends.tile_plan import CHUNK_BYTES, SAMPLE, Labels, choose_grid, tile_cost, transforms_cost
-from kornia_tidy.render.layers import assign_layers
+from kornia_tidy.render.backends.tile_plan import BLOCKS, choose_grid, tile_cost, transforms_cost
+from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 
 BANK_RATE = {False: 52e9, True: 57e9}  # operations a second of a PSF bank in float32, and in float64, counted twice
 BANK_RATE_C = {False: 90e9, True: 115e9}  # in C, by the mutual intensity
@@ -152,8 +152,8 @@ def count_tiles(labels: Labels, layers: int, window: int, *, gathers: bool = Tru
     pairs, present = int(here.sum()), int(here.any(0).sum())
     directly = gathers and can_go_directly(labels, torch.float32)
     strips = count_pairs(labels, torch.float32) if directly else None
-    terms = 1 if labels.fraction is None else 2
-    return Tiles(grid.size, grid.blocks, pairs, present, labels.lower.numel(), terms, strips)
+    terms = 1 if labels.layer_weight is None else 2
+    return Tiles(grid.size, grid.blocks, pairs, present, labels.layer_index.numel(), terms, strips)
 
 
 def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:
@@ -207,7 +207,7 @@ def rendering_bytes(tiles: Tiles, channels: int, fidelity: Fidelity) -> int:
     if direct is not None and is_direct_faster(direct, transforms):
         return tiles.pixels * (2 * channels * real + 2 * 8)
     plane = 2 * real * tiles.size**2
-    chunk = 3 * max(CHUNK_BYTES["cpu"], plane * math.ceil(tiles.pairs / tiles.blocks))
+    chunk = 3 * max(BLOCKS.chunk_bytes, plane * math.ceil(tiles.pairs / tiles.blocks))
     return 2 * tiles.layers * channels * plane + chunk + tiles.pixels * (4 * channels * real + 2 * 8)
 
 

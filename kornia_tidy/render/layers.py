@@ -1,10 +1,13 @@
 """Layer assignment: how much of each pixel's light belongs to each defocus layer of a PSF bank.
 
-A bank knows its PSFs at a few nodes of defocus. A pixel between two nodes lies at a ``fraction`` of the way from node
-``lower`` to node ``lower + 1``; all weights follow from these two numbers, so no (B, D, H, W) tensor is needed.
+A bank knows its PSFs at a few nodes of defocus. A pixel between two nodes has a layer index, that of the node below it,
+and a layer weight, the fraction of the way to the next node. All weights follow from these two numbers, so no
+(B, D, H, W) tensor is needed.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,6 +16,45 @@ from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
 
 LAYER_MODES = ("nearest", "linear")
+SAMPLE = 8  # px between the rows and columns of a sample of the labels
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The layers of each pixel: all light to one layer, or a weight to the next one.
+
+    Args:
+        layer_index: (B, H, W) int64 index of a layer, from :func:`assign_layers`.
+        layer_weight: (B, H, W) weight of the next layer, or None for nearest layers.
+        weight_gradient: a layer with a weight of zero counts too, for its gradient.
+    """
+
+    layer_index: Tensor
+    layer_weight: Tensor | None
+    weight_gradient: bool = False
+
+    @classmethod
+    def of(cls, layer_index: Tensor, layer_weight: Tensor | None) -> Labels:
+        """Return labels for layers as assigned; ``weight_gradient`` where a gradient of ``layer_weight`` is wanted."""
+        if layer_weight is None:
+            return cls(layer_index, None)
+        return cls(layer_index, layer_weight.detach(), layer_weight.requires_grad and torch.is_grad_enabled())
+
+    def every(self, step: int = SAMPLE) -> Labels:
+        """Return the labels of every ``step``-th row and column."""
+        kept = (slice(None), slice(None, None, step), slice(None, None, step))
+        weight = self.layer_weight
+        return Labels(self.layer_index[kept], None if weight is None else weight[kept], self.weight_gradient)
+
+    def terms(self, *where: slice) -> list[Tensor]:
+        """Return the one or two layers of each pixel there: the same twice if it lies in one."""
+        index = self.layer_index[where]
+        if self.layer_weight is None:
+            return [index]
+        if self.weight_gradient:
+            return [index, index + 1]
+        weight = self.layer_weight[where]
+        return [index + (weight == 1), index + (weight > 0)]
 
 
 def clamp_defocus(defocus: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
@@ -39,7 +81,7 @@ def clamp_defocus(defocus: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Tensor]:
-    r"""Return the layer below each pixel's defocus and the fraction of its light that belongs to the next one.
+    r"""Return the layer below each pixel's defocus and the weight of the next layer.
 
     .. math:: t = \frac{\psi - \psi_i}{\psi_{i+1} - \psi_i}, \qquad \psi_i \le \psi \le \psi_{i+1}
 
@@ -49,8 +91,8 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         mode: ``"linear"`` shares the light between two layers, ``"nearest"`` gives all of it to one.
 
     Returns:
-        ``lower``, the int64 index i of a layer, and ``fraction``, t in [0, 1], both (B, 1, H, W). Layer i has the
-        weight 1 - t and layer i + 1 the weight t. For ``"nearest"`` the fraction is zero.
+        The layer index i in int64 and the layer weight t in [0, 1], both (B, 1, H, W). Layer i has the weight 1 - t and
+        layer i + 1 the weight t. For ``"nearest"`` t is zero.
 
     Raises:
         ValueError: if ``mode`` is not known, or the nodes do not ascend (not checked while compiling).
@@ -63,8 +105,8 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     Example:
         >>> import torch
         >>> defocus = torch.tensor([-4.0, 0.5, 3.0, 9.0]).view(1, 1, 1, 4)
-        >>> lower, fraction = assign_layers(defocus, torch.tensor([-2.0, 0.0, 4.0]), "linear")
-        >>> lower.flatten().tolist(), fraction.flatten().tolist()
+        >>> index, weight = assign_layers(defocus, torch.tensor([-2.0, 0.0, 4.0]), "linear")
+        >>> index.flatten().tolist(), weight.flatten().tolist()
         ([0, 1, 1, 1], [0.0, 0.125, 0.75, 1.0])
     """
     check_choice("layers", mode, LAYER_MODES)
@@ -73,30 +115,30 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
-    spacing = _even_spacing(nodes)
+    spacing = None if is_followed() else _even_spacing(nodes)
     if mode == "nearest" and spacing is not None:
         steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
         return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
     if mode == "nearest" or len(nodes) == 1:
         middles = (nodes[1:] + nodes[:-1]) / 2
-        lower = torch.bucketize(defocus.detach().contiguous(), middles.detach())
-        return lower, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
+        index = torch.bucketize(defocus.detach().contiguous(), middles.detach())
+        return index, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
     if spacing is not None:
         steps = (defocus - nodes[0]).div_(spacing).clamp_(0, len(nodes) - 1)
-        lower = steps.detach().floor().clamp_(max=len(nodes) - 2)
-        return lower.long(), steps - lower
+        index = steps.detach().floor().clamp_(max=len(nodes) - 2)
+        return index.long(), steps - index
     clamped = defocus.clamp(nodes[0], nodes[-1])
     # Inner nodes only: the end nodes belong to the first and last interval.
-    lower = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
-    return lower, (clamped - nodes.take(lower)) / nodes.diff().take(lower)
+    index = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
+    return index, (clamped - nodes.take(index)) / nodes.diff().take(index)
 
 
 def _even_spacing(nodes: Tensor) -> Tensor | None:
-    """The distance between nodes if it is the same everywhere, to rounding: a search in a list takes ten times as long.
+    """Return the distance between nodes if it is the same everywhere, to rounding: a search takes ten times as long.
 
     None too where nodes are learnt, or on a device that one would have to wait for.
     """
-    if is_followed() or nodes.device.type != "cpu" or nodes.requires_grad or len(nodes) == 1:
+    if nodes.device.type != "cpu" or nodes.requires_grad or len(nodes) == 1:
         return None
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
     even = nodes[0] + spacing * torch.arange(len(nodes), dtype=nodes.dtype)
@@ -104,24 +146,24 @@ def _even_spacing(nodes: Tensor) -> Tensor | None:
     return spacing if bool(((nodes - even).abs() <= rounding).all()) else None
 
 
-def layer_weight(lower: Tensor, fraction: Tensor | None, index: int | Tensor) -> Tensor:
+def weight_of_layer(layer_index: Tensor, layer_weight: Tensor | None, layer: int | Tensor) -> Tensor:
     """Return the weight of one layer at every pixel, from what :func:`assign_layers` returned.
 
     Args:
-        lower: (B, 1, H, W) int64 index of the layer below.
-        fraction: (B, 1, H, W) share of the layer above, or None for none.
-        index: the layer wanted, or a tensor of layers that broadcasts with the pixels.
+        layer_index: (B, 1, H, W) int64 index of the layer below.
+        layer_weight: (B, 1, H, W) weight of the next layer, or None for nearest layers.
+        layer: the layer wanted, or a tensor of layers that broadcasts with the pixels.
 
     Returns:
-        (B, 1, H, W) weight in [0, 1], of ``fraction``'s dtype, or bool if that is None.
+        (B, 1, H, W) weight in [0, 1], of ``layer_weight``'s dtype, or bool if that is None.
     """
-    if fraction is None:
-        return lower == index
-    return torch.where(lower == index, 1 - fraction, torch.where(lower == index - 1, fraction, 0))
+    if layer_weight is None:
+        return layer_index == layer
+    return torch.where(layer_index == layer, 1 - layer_weight, torch.where(layer_index == layer - 1, layer_weight, 0))
 
 
 def layer_weights(defocus: Tensor, nodes: Tensor, mode: str) -> Tensor:
-    """Return the weights of all layers at once; a renderer asks for one at a time with :func:`layer_weight`.
+    """Return the weights of all layers at once; a renderer asks for one at a time with :func:`weight_of_layer`.
 
     Args:
         defocus: (B, 1, H, W) defocus in radians.
@@ -139,20 +181,44 @@ def layer_weights(defocus: Tensor, nodes: Tensor, mode: str) -> Tensor:
         >>> layer_weights(defocus, torch.tensor([-2.0, 0.0, 4.0]), "nearest").flatten()
         tensor([0., 1., 0.])
     """
-    lower, fraction = assign_layers(defocus, nodes, mode)
-    return torch.cat([layer_weight(lower, fraction, index) for index in range(len(nodes))], dim=1)
+    index, weight = assign_layers(defocus, nodes, mode)
+    return torch.cat([weight_of_layer(index, weight, layer) for layer in range(len(nodes))], dim=1)
 
 
-def present_layers(lower: Tensor, fraction: Tensor | None, count: int) -> list[int]:
+def blend_of_layers(values: Tensor, layer_index: Tensor, layer_weight: Tensor | None) -> Tensor:
+    """Return each pixel's mean of a value that every layer and channel has.
+
+    Args:
+        values: (D, C).
+        layer_index: (B, 1, H, W) int64 index of the layer below.
+        layer_weight: (B, 1, H, W) weight of the next layer, or None for nearest layers.
+
+    Returns:
+        (B, C, H, W).
+
+    Example:
+        >>> import torch
+        >>> values, pixels = torch.tensor([[0.0], [10.0]]), torch.zeros(1, 1, 1, 2, dtype=torch.int64)
+        >>> blend_of_layers(values, pixels, torch.tensor([[[[0.25, 1.0]]]])).flatten()
+        tensor([ 2.5000, 10.0000])
+    """
+    below = torch.cat([channel.take(layer_index) for channel in values.unbind(1)], dim=1)
+    if layer_weight is None:
+        return below
+    above = (layer_index + 1).clamp(max=len(values) - 1)
+    return torch.lerp(below, torch.cat([channel.take(above) for channel in values.unbind(1)], dim=1), layer_weight)
+
+
+def present_layers(layer_index: Tensor, layer_weight: Tensor | None, count: int) -> list[int]:
     """Return the layers out of ``count`` that a scene contains, ascending. Waits for the device once, for all layers.
 
     While compiling or under torch.func, all layers are returned: which are present depends on the data. Where gradients
     with respect to defocus are wanted, both neighbours of a pixel count: on a node the next layer's weight is zero, its
-    slope is not.
+    gradient is not.
 
     Args:
-        lower: (B, 1, H, W) int64 index of the layer below, from :func:`assign_layers`.
-        fraction: (B, 1, H, W) share of the layer above, or None for none.
+        layer_index: (B, 1, H, W) int64 index of the layer below, from :func:`assign_layers`.
+        layer_weight: (B, 1, H, W) weight of the next layer, or None for nearest layers.
         count: the number of layers D.
 
     Example:
@@ -162,11 +228,11 @@ def present_layers(lower: Tensor, fraction: Tensor | None, count: int) -> list[i
     """
     if is_followed():
         return list(range(count))
-    present = torch.zeros(count, dtype=torch.bool, device=lower.device)
-    if fraction is None:
-        present[lower] = True
-        return [index for index, here in enumerate(present.tolist()) if here]
-    sloped = fraction.requires_grad
-    present[lower if sloped else torch.where(fraction < 1, lower, lower + 1)] = True
-    present[lower + 1 if sloped else torch.where(fraction > 0, lower + 1, lower)] = True
-    return [index for index, here in enumerate(present.tolist()) if here]
+    present = torch.zeros(count, dtype=torch.bool, device=layer_index.device)
+    if layer_weight is None:
+        present[layer_index] = True
+        return [layer for layer, here in enumerate(present.tolist()) if here]
+    next_layer, with_gradient = layer_index + 1, layer_weight.requires_grad
+    present[layer_index if with_gradient else torch.where(layer_weight < 1, layer_index, next_layer)] = True
+    present[next_layer if with_gradient else torch.where(layer_weight > 0, next_layer, layer_index)] = True
+    return [layer for layer, here in enumerate(present.tolist()) if here]

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from kornia_tidy.render.backends import direct_occlusion
 from kornia_tidy.render.backends.direct import is_direct_faster
-from kornia_tidy.render.backends.occlusion_tile_plan import CHUNK_BYTES, choose_grid, layers_of_windows, windows_cost
-from kornia_tidy.render.backends.tile_plan import Labels
+from kornia_tidy.render.backends.tile_plan import WINDOWS, choose_grid, windows_cost
+from kornia_tidy.render.layers import SAMPLE, Labels
 
 _PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.99 to 1.46 of what was measured
 
@@ -22,7 +22,7 @@ _PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.9
 class Windows:
     """What the renderer does for a scene with occlusion.
 
-    See :mod:`kornia_tidy.render.backends.occlusion_tile_plan` and :mod:`kornia_tidy.render.backends.direct_occlusion`.
+    See :mod:`kornia_tidy.render.backends.window_plan` and :mod:`kornia_tidy.render.backends.direct_occlusion`.
 
     Args:
         size: side of the windows in pixels.
@@ -52,16 +52,14 @@ def count_windows(labels: Labels, layers: int, window: int) -> Windows:
         >>> count_windows(flat, 3, 9).held.unique().tolist()
         [1]
     """
-    terms = labels.terms()
-    height, width = (side - window + 1 for side in labels.lower.shape[-2:])
-    grid = choose_grid(terms, (height, width), layers, window)
-    here = layers_of_windows(terms, grid, layers)
-    scene = torch.empty(labels.lower[:, None].shape), torch.zeros(layers, 1, window, window)
+    grid = choose_grid(labels, layers, window, WINDOWS)
+    here = grid.present(labels.every(SAMPLE), layers, SAMPLE)
+    scene = torch.empty(labels.layer_index[:, None].shape), torch.zeros(layers, 1, window, window)
     direct = None
-    if labels.lower.device.type == "cpu" and direct_occlusion.can_go_directly(*scene):
-        counts = direct_occlusion.count(*scene, labels.lower, labels.fraction)
+    if labels.layer_index.device.type == "cpu" and direct_occlusion.can_go_directly(*scene):
+        counts = direct_occlusion.count(*scene, labels.layer_index, labels.layer_weight)
         direct = direct_occlusion.direct_cost(*counts, max(window, direct_occlusion.SMALLEST_SIDE))
-    return Windows(grid.size, here.sum(1), int(here.any(0).sum()), labels.lower.numel(), direct)
+    return Windows(grid.size, here.sum(1), int(here.any(0).sum()), labels.layer_index.numel(), direct)
 
 
 def windows_seconds(windows: Windows, channels: int, itemsize: int = 4) -> float:
@@ -95,5 +93,5 @@ def windows_bytes(windows: Windows, channels: int, itemsize: int) -> int:
     if windows.direct is not None and is_direct_faster(windows.direct * itemsize / 4, tiles):
         return windows.pixels * (2 * channels * itemsize + 4 * 8)
     plane = 16 * channels * windows.size**2
-    chunk = max(CHUNK_BYTES["cpu"], 2 * plane * int(windows.held.max()))
+    chunk = max(WINDOWS.chunk_bytes, 2 * plane * int(windows.held.max()))
     return 2 * windows.layers * plane + _PLANES * chunk + windows.pixels * (2 * channels * itemsize + 4 * 8)

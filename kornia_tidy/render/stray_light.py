@@ -14,6 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.render.layers import blend_of_layers
+from kornia_tidy.render.scene import LayeredScene
+
 _RINGS = 128  # at most; in larger images neighbours stand together, each group's light spread evenly over its pixels
 
 
@@ -80,7 +83,24 @@ def spread_evenly(light: Tensor, psf_size: int, border: str) -> Tensor:
     return mean * share_within(*light.shape[-2:], psf_size, light.device).to(light.dtype)
 
 
-def normalised_share(veil: Tensor, psfs: Tensor, shape: Sequence[int], border: str) -> Tensor:
+def stray_light_of(scene: LayeredScene) -> Tensor:
+    """Return the stray light that gather or scatter adds to a scene, broadcastable to (B, C, h, w).
+
+    Gather takes it by the layer of the pixel that it falls on, scatter by the layer of the pixel that it comes from.
+
+    Args:
+        scene: with stray light.
+    """
+    assert scene.stray_light is not None
+    if scene.compositing == "scatter":
+        strayed = blend_of_layers(scene.stray_light, scene.layer_index, scene.layer_weight) * scene.image
+        return spread_evenly(strayed, scene.psf_size, scene.border)
+    index, weight = scene.sorted_layers
+    taken = blend_of_layers(scene.stray_light, index[:, None], None if weight is None else weight[:, None])
+    return taken * spread_evenly(scene.image, scene.psf_size, scene.border)
+
+
+def normalised_share(stray_light: Tensor, psfs: Tensor, shape: Sequence[int], border: str) -> Tensor:
     r"""Return how much of the light that a pixel is seen to have is stray, where PSFs are normalised to what they see.
 
     .. math:: v' = \frac{v \, \overline{w}}{\overline{h * 1} + v \, \overline{w}}
@@ -89,16 +109,17 @@ def normalised_share(veil: Tensor, psfs: Tensor, shape: Sequence[int], border: s
     is v itself.
 
     Args:
-        veil: v, (D, C).
+        stray_light: v, (D, C).
         psfs: h, (D, C, P, P).
         shape: height and width of the image.
         border: what lies beyond the image.
     """
     if border != "zero":
-        return veil
-    stray = veil * share_within(*shape, psfs.shape[-1], veil.device).mean().to(veil.dtype)
-    held = share_in_frame(psfs, shape).to(veil.dtype)
-    return stray / (held + stray).clamp(min=torch.finfo(veil.dtype).tiny)
+        return stray_light
+    dtype, device = stray_light.dtype, stray_light.device
+    stray = stray_light * share_within(*shape, psfs.shape[-1], device).mean().to(dtype)
+    held = share_in_frame(psfs, shape).to(dtype)
+    return stray / (held + stray).clamp(min=torch.finfo(dtype).tiny)
 
 
 def share_in_frame(psfs: Tensor, shape: Sequence[int]) -> Tensor:

@@ -1,36 +1,38 @@
-r"""Occlusion: near layers hide far ones, each normalised by how much of its PSF falls on what it can be seen against.
+r"""Occlusion in plain operations of torch: near layers hide far ones, each normalised by what its PSF sees.
 
 A plain sum over layers is wrong at the outline of a near object: gather does not let its blur reach over what lies
-behind, scatter darkens or brightens the seam. Here layers are laid over one another as panes of blurred opacity.
+behind, scatter darkens or brightens the seam. Here layers of blurred opacity are laid over one another.
 
 A pixel takes light from a layer through a quotient, and where it sees little of a layer the divisor is small: the
 round-off of a transform in float32, some 1e-7, would be divided by as little as ``EPSILON``. So layers are blurred in
-float64 whatever the type of the image. Sums made sample by sample need not be, see
+float64 whatever the type of the image. Direct sums need not be, see
 :mod:`kornia_tidy.render.backends.direct_occlusion`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.render.borders import from_spectrum, pad_border, to_spectrum
-from kornia_tidy.render.layers import layer_weight, present_layers
+from kornia_tidy.render.layers import present_layers, weight_of_layer
+from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.stray_light import normalised_share
 
 EPSILON = 1e-6  # added to the divisor: white stays white to this, over the share of the PSF that a layer is seen by
 
 
 def lay_over(layers: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
-    r"""Lay blurred layers over one another.
+    r"""Composite blurred layers from near to far.
 
     .. math:: I = \sum_d \frac{l_d}{E_d + \epsilon} \prod_{j > d} \left( 1 - \frac{a_j}{E_j + \epsilon} \right)
 
     Args:
-        layers: from near to far, three planes each: l, the blurred light of the layer's pixels; a, their blurred
-            weights; E, the blurred weights of these and of all that lies behind them.
+        layers: from near to far, three planes each: l, the blurred light of the layer's pixels; a, the layer's alpha,
+            their blurred weights; E, the cumulative alpha, the blurred weights of these and of all layers behind.
 
     Returns:
         The image.
@@ -44,68 +46,80 @@ def lay_over(layers: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
         0.275
     """
     planes = iter(layers)
-    light, own, seen = next(planes)
-    divisor = seen.clamp(min=0) + EPSILON  # round-off makes it fall below zero
-    total, through = light / divisor, 1 - own / divisor
-    for light, own, seen in planes:
-        share = through / (seen.clamp(min=0) + EPSILON)
-        total, through = total.addcmul(share, light), through.addcmul(share, own, value=-1)
+    light, alpha, cumulative_alpha = next(planes)
+    normaliser = cumulative_alpha.clamp(min=0) + EPSILON  # round-off makes it fall below zero
+    total, transmitted = light / normaliser, 1 - alpha / normaliser
+    for light, alpha, cumulative_alpha in planes:
+        scale = transmitted / (cumulative_alpha.clamp(min=0) + EPSILON)
+        total, transmitted = total.addcmul(scale, light), transmitted.addcmul(scale, alpha, value=-1)
     return total
 
 
-def weight_behind(lower: Tensor, fraction: Tensor | None, index: int | Tensor) -> Tensor:
-    """Return how much of each pixel lies in a layer or behind it: the sum of :func:`layer_weight` up to ``index``.
+def cumulative_weight(layer_index: Tensor, layer_weight: Tensor | None, layer: int | Tensor) -> Tensor:
+    """Return each pixel's weight in a layer and all layers behind it: the sum of the layers' weights up to ``layer``.
 
     Example:
-        >>> weight_behind(torch.tensor([0, 1, 2]), torch.tensor([0.5, 0.25, 0.5]), 1)
+        >>> cumulative_weight(torch.tensor([0, 1, 2]), torch.tensor([0.5, 0.25, 0.5]), 1)
         tensor([1.0000, 0.7500, 0.0000])
     """
-    if fraction is None:
-        return lower <= index
-    return torch.where(lower == index, 1 - fraction, (lower < index).to(fraction.dtype))
+    if layer_weight is None:
+        return layer_index <= layer
+    return torch.where(layer_index == layer, 1 - layer_weight, (layer_index < layer).to(layer_weight.dtype))
 
 
-def occlude_dense(
-    image: Tensor, lower: Tensor, fraction: Tensor | None, psfs: Tensor, *, veil: Tensor | None, border: str
-) -> Tensor:
-    """Render with occlusion, the whole image for every layer: the definition. See :func:`lay_over`."""
-    radius = psfs.shape[-1] // 2
-    # Black beyond the border has no weight; let it lie in layers that are there anyway.
-    sides = "replicate" if border == "zero" else border
-    lower = pad_border(lower.to(image.dtype), radius, sides).long()[:, 0]
-    fraction = None if fraction is None else pad_border(fraction, radius, sides)[:, 0]
-    inside = pad_border(torch.ones_like(image[:1, 0]), radius, "zero") if border == "zero" else None
-    mean = None if veil is None else image.mean((-2, -1))
-    veil = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
-    return occlude_planes(pad_border(image, radius, border), psfs, fraction, mean, veil, lower=lower, inside=inside)
-
-
-def occlude_planes(
-    light: Tensor,
-    psfs: Tensor,
-    fraction: Tensor | None,
-    mean: Tensor | None,
-    veil: Tensor | None,
-    *,
-    lower: Tensor,
-    inside: Tensor | None,
-) -> Tensor:
-    """Render planes that hold what lies beyond the border, by transforms of the whole for every layer.
+class OcclusionPlanes(NamedTuple):
+    """The planes of a scene with occlusion, with what lies beyond the border.
 
     Args:
         light: (B, C, H + P - 1, W + P - 1).
         psfs: (D, C, P, P).
-        fraction: share of the next layer, (B or 1, H + P - 1, W + P - 1), or None.
-        mean: (B, C) mean light of each image, where there is a veil.
-        veil: (D, C) how much of it each layer takes on, or None.
-        lower: index of each pixel's layer, of the fraction's shape.
+        layer_weight: (B or 1, H + P - 1, W + P - 1) weight of the next layer, or None.
+        mean: (B, C) mean light of each image, where there is stray light.
+        stray_light: (D, C) fraction of the mean light that each layer takes on, or None.
+        layer_index: (B or 1, H + P - 1, W + P - 1) int64.
         inside: (1, H + P - 1, W + P - 1) 1 on the image and 0 in the dark beyond it, or None for no dark.
+    """
+
+    light: Tensor
+    psfs: Tensor
+    layer_weight: Tensor | None
+    mean: Tensor | None
+    stray_light: Tensor | None
+    layer_index: Tensor
+    inside: Tensor | None
+
+
+def occlusion_planes(scene: LayeredScene) -> OcclusionPlanes:
+    """Return the planes that a scene with occlusion is rendered from."""
+    image, stray_light, inside = scene.image, scene.stray_light, None
+    if scene.border == "zero":
+        inside = pad_border(torch.ones_like(image[:1, 0]), scene.psf_size // 2, "zero")
+    mean = None if stray_light is None else image.mean((-2, -1))
+    if stray_light is not None:
+        stray_light = normalised_share(stray_light, scene.psfs, image.shape[-2:], scene.border)
+    index, weight = scene.sorted_layers
+    return OcclusionPlanes(scene.plane, scene.psfs, weight, mean, stray_light, index, inside)
+
+
+def occlude_dense(
+    light: Tensor,
+    psfs: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None,
+    stray_light: Tensor | None,
+    layer_index: Tensor,
+    inside: Tensor | None,
+) -> Tensor:
+    """Render with occlusion by transforms of the whole plane for every layer, see :func:`lay_over`.
+
+    Args:
+        light: as the other arguments in :class:`OcclusionPlanes`.
 
     Returns:
         (B, C, H, W) float64.
     """
-    light, psfs = light.double(), psfs.double()
-    lower, fraction = lower[:, None], None if fraction is None else fraction[:, None].double()
+    light, psfs, index = light.double(), psfs.double(), layer_index[:, None]
+    weight = None if layer_weight is None else layer_weight[:, None].double()
     size, side = (light.shape[-2], light.shape[-1]), psfs.shape[-1]
 
     def blur(plane: Tensor, spectrum: Tensor) -> Tensor:
@@ -113,13 +127,13 @@ def occlude_planes(
         return from_spectrum(to_spectrum(plane, size) * spectrum, size, side)
 
     def near_to_far() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        for index in reversed(present_layers(lower, fraction, len(psfs))):
-            spectrum = to_spectrum(psfs[index], size)
-            own = layer_weight(lower, fraction, index).double()
-            behind = weight_behind(lower, fraction, index).double()
+        for layer in reversed(present_layers(index, weight, len(psfs))):
+            spectrum = to_spectrum(psfs[layer], size)
+            own = weight_of_layer(index, weight, layer).double()
+            cumulative = cumulative_weight(index, weight, layer).double()
             lit = light
-            if mean is not None and veil is not None:  # both or none
-                lit = torch.lerp(light, mean.double()[..., None, None], veil[index, :, None, None].double())
-            yield blur(own * lit, spectrum), blur(own, spectrum), blur(behind, spectrum)
+            if mean is not None and stray_light is not None:  # both or none
+                lit = torch.lerp(light, mean.double()[..., None, None], stray_light[layer, :, None, None].double())
+            yield blur(own * lit, spectrum), blur(own, spectrum), blur(cumulative, spectrum)
 
     return lay_over(near_to_far())

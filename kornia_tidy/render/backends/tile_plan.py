@@ -1,88 +1,96 @@
-"""Tiles: how a plane is cut up so that each piece meets only the layers it contains.
+"""Tiles: how a plane is cut into pieces that each meet only the layers they contain.
 
-A block is ``tile`` rows by ``2 tile`` columns: two tiles side by side. Seen through PSFs of P pixels, a tile needs a
-window of ``size = tile + P - 1`` pixels a side. The left window is the real and the right one the imaginary part of a
-single complex plane: PSFs are real, so one complex transform serves both, at half the price of two.
-
-A pair is a block and a layer present in it. Each pair owns a complex plane of ``size`` x ``size``, and each pixel has
-one place in the planes of each of its layers; channels are worked on one after the other. Blocks are numbered image by
-image, row by row; pairs by block, then by layer.
+Seen through PSFs of P pixels, a tile needs a window of ``size = tile + P - 1`` pixels a side, which is transformed.
+Larger tiles waste less on their overlap, smaller ones hold fewer layers: the grid with the lowest cost is chosen from a
+sample of the scene's labels. Gather and scatter work on blocks of two tiles (:data:`BLOCKS`), occlusion on single
+windows (:data:`WINDOWS`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
-from typing import NamedTuple
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.layers import SAMPLE, Labels
 
-# Sides of transforms whose samples take the least time.
-SIZES = (
-    *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
-    *(512, 576, 768, 1024, 1536, 2048),
-)
-# Bytes that the planes of a chunk may take in one channel: near a processor's cache (and see kept_memory.py), or enough
-# to keep an accelerator busy.
-CHUNK_BYTES = {"cpu": 5 << 20}
-CHUNK_BYTES_ACCELERATOR = 256 << 20
 TILE_FACTOR = 1.1  # of what windows take over the cost by which they are chosen
 PIXEL_NANOSECONDS = 8.5  # of a pixel and each layer that it takes light from
-SAMPLE = 8  # px between the rows and columns on which the layers of candidates are counted
+SHARED = 0.5  # of the work by transforms that threads share
 
 
 @dataclass(frozen=True)
-class Labels:
-    """The layers of each pixel: all light to layer ``lower``, or a share of it to the next one.
+class TileKind:
+    """What all tiles of one kind have in common.
 
     Args:
-        lower: (B, H, W) int64 index of a layer, from :func:`~kornia_tidy.render.layers.assign_layers`.
-        fraction: (B, H, W) share of the next layer, or None for nearest layers.
-        sloped: a layer with a share of zero counts too, for its gradient.
+        sizes: sides of windows to choose from, in samples.
+        candidates: how many of them are tried at most.
+        across: tiles that stand side by side in a block.
+        windowed: a layer counts wherever it lies in the window, not only in the tile.
+        chunk_bytes: that the planes of a chunk may take on a processor, near its cache (see allocator.py), and
+        accelerator_bytes: on an accelerator, enough to keep it busy.
     """
 
-    lower: Tensor
-    fraction: Tensor | None
-    sloped: bool = False
+    sizes: tuple[int, ...]
+    candidates: int
+    across: int
+    windowed: bool
+    chunk_bytes: int
+    accelerator_bytes: int = 256 << 20
 
-    @classmethod
-    def of(cls, lower: Tensor, fraction: Tensor | None) -> Labels:
-        """Return the labels of layers as they were assigned, sloped where a gradient of ``fraction`` is wanted."""
-        if fraction is None:
-            return cls(lower, None)
-        return cls(lower, fraction.detach(), fraction.requires_grad and torch.is_grad_enabled())
+    def bytes_on(self, device: torch.device) -> int:
+        """Return the bytes that the planes of a chunk may take on a device."""
+        return self.chunk_bytes if device.type == "cpu" else self.accelerator_bytes
 
-    def every(self, step: int) -> Labels:
-        """Return the labels of every ``step``-th row and column."""
-        kept = (slice(None), slice(None, None, step), slice(None, None, step))
-        return Labels(self.lower[kept], None if self.fraction is None else self.fraction[kept], self.sloped)
 
-    def terms(self, *where: slice) -> list[Tensor]:
-        """Return the one or two layers of each pixel there: the same twice if it lies in one."""
-        lower = self.lower[where]
-        if self.fraction is None:
-            return [lower]
-        if self.sloped:
-            return [lower, lower + 1]
-        share = self.fraction[where]
-        return [lower + (share == 1), lower + (share > 0)]
+# Sides of transforms whose samples take the least time. A block is two tiles: the left window is the real and the right
+# one the imaginary part of a complex plane, so that one transform serves both. Bytes are those of one channel.
+BLOCKS = TileKind(
+    sizes=(
+        *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
+        *(512, 576, 768, 1024, 1536, 2048),
+    ),
+    candidates=8,
+    across=2,
+    windowed=False,
+    chunk_bytes=5 << 20,
+)
+# With occlusion, light may be hidden by, or come from, what lies beside a tile. Bytes are those of all channels.
+WINDOWS = TileKind(
+    sizes=(16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024),
+    candidates=17,
+    across=1,
+    windowed=True,
+    chunk_bytes=4 << 20,
+)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Blocks over a batch of planes of ``height`` x ``width`` pixels."""
+    """Blocks over a batch of planes of ``height`` x ``width`` pixels, numbered image by image, row by row.
+
+    Args:
+        batch: images.
+        height: of a plane, in pixels.
+        width: of a plane, in pixels.
+        size: side of a window in pixels.
+        tile: side of a tile in pixels.
+        across: tiles that stand side by side in a block.
+        reach: pixels beyond its lower and right end in which a layer counts as a block's own.
+    """
 
     batch: int
     height: int
     width: int
     size: int
     tile: int
+    across: int = 2
+    reach: int = 0
 
     @property
     def rows(self) -> int:
@@ -92,7 +100,7 @@ class Grid:
     @property
     def columns(self) -> int:
         """Blocks from left to right."""
-        return math.ceil(self.width / (2 * self.tile))
+        return math.ceil(self.width / (self.across * self.tile))
 
     @property
     def covered_height(self) -> int:
@@ -102,7 +110,7 @@ class Grid:
     @property
     def covered_width(self) -> int:
         """Width of all blocks."""
-        return self.columns * 2 * self.tile
+        return self.columns * self.across * self.tile
 
     @property
     def blocks(self) -> int:
@@ -111,147 +119,108 @@ class Grid:
 
     def number(self, images: Tensor, y: Tensor, x: Tensor) -> Tensor:
         """Return the block of pixels, (images, y, x), by their indices along each axis."""
-        rows, columns = y // self.tile, x // (2 * self.tile)
+        rows, columns = y // self.tile, x // (self.across * self.tile)
+        rows, columns = rows.clamp_(max=self.rows - 1), columns.clamp_(max=self.columns - 1)
         return (images[:, None, None] * self.rows + rows[:, None]) * self.columns + columns
+
+    def corner(self, number: int) -> tuple[int, int, int]:
+        """Return the image of a block, its first row and its first column."""
+        rest, column = divmod(number, self.columns)
+        image, row = divmod(rest, self.rows)
+        return image, row * self.tile, column * self.across * self.tile
 
     def present(self, labels: Labels, layers: int, step: int = 1) -> Tensor:
         """Return (blocks, layers) bool: which of the layers a block contains. Labels are of every ``step``-th pixel."""
-        device = labels.lower.device
+        device = labels.layer_index.device
         images = torch.arange(self.batch, device=device)
-        y, x = (torch.arange(0, side, step, device=device) for side in (self.height, self.width))
+        y, x = (torch.arange(0, side + self.reach, step, device=device) for side in (self.height, self.width))
         row, column = self.number(images, y, x[:1]) * layers, self.number(images[:1], y[:1], x) * layers
+        reached_y = self._reached(y, self.tile, self.rows)
+        reached_x = self._reached(x, self.across * self.tile, self.columns)
         present = torch.zeros(self.blocks * layers, dtype=torch.bool, device=device)
         for first in range(0, len(y), 64):  # in a processor's cache
             part = slice(first, first + 64)
             for layer in labels.terms(slice(None), part):
-                present.index_fill_(0, (layer + column).add_(row[:, part]).reshape(-1), True)
+                keys = (layer + column).add_(row[:, part])
+                present.index_fill_(0, keys.reshape(-1), True)
+                if self.reach:
+                    left, above = keys[..., reached_x] - layers, reached_y[part]
+                    present.index_fill_(0, left.reshape(-1), True)
+                    for reaching in (keys, left):  # the blocks above
+                        present.index_fill_(0, reaching[:, above].sub_(self.columns * layers).reshape(-1), True)
         return present.view(-1, layers)
 
-
-class Run(NamedTuple):
-    """Pairs of one block whose layers follow one another: one product with their spectra serves them all."""
-
-    block: int
-    pairs: slice
-    layers: slice
+    def _reached(self, pixels: Tensor, block: int, blocks: int) -> Tensor:
+        """Return which pixels along an axis count for the block before their own too, bool."""
+        own = (pixels // block).clamp_(max=blocks - 1)
+        return (pixels - own * block < self.reach) & (own > 0)
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """Blocks that are worked on together: some images, or some rows of one image, or a part of one row.
-
-    Args:
-        batch: images.
-        rows: rows of blocks.
-        columns: columns of blocks.
-        y: rows of pixels.
-        x: columns of pixels.
-        block: (N,) block of each pair, counted from the chunk's first.
-        layer: (N,) layer of each pair, as an index into :attr:`Plan.present`.
-        counts: pairs of each block.
-    """
-
-    batch: slice
-    rows: slice
-    columns: slice
-    y: slice
-    x: slice
-    block: Tensor
-    layer: Tensor
-    counts: list[int]
-
-    @property
-    def extent(self) -> tuple[int, int, int]:
-        """Images, rows and columns of blocks."""
-        images, rows, columns = (part.stop - part.start for part in (self.batch, self.rows, self.columns))
-        return images, rows, columns
-
-    @cached_property
-    def runs(self) -> list[Run]:
-        """Its pairs, in as few runs as they make."""
-        block, layer = self.block.tolist(), self.layer.tolist()
-        starts = [
-            pair
-            for pair in range(len(block))
-            if pair == 0 or block[pair] != block[pair - 1] or layer[pair] != layer[pair - 1] + 1
-        ]
-        return [
-            Run(block[start], slice(start, stop), slice(layer[start], layer[stop - 1] + 1))
-            for start, stop in pairwise([*starts, len(block)])
-        ]
-
-    @property
-    def pixels(self) -> tuple[slice, slice, slice]:
-        """Index of its pixels in (B, H, W)."""
-        return self.batch, self.y, self.x
+def choose_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind = BLOCKS) -> Grid:
+    """Return the grid with the lowest cost, see :func:`cheapest_grid`."""
+    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
+    return grids[0] if len(grids) == 1 else cheapest_grid(labels, layers, psf_size, kind)[1]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What is computed for one scene.
+def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> tuple[float, Grid]:
+    """Return the lowest cost in nanoseconds a channel, and the grid that has it.
+
+    The layers of each candidate's blocks are found on every eighth row and column.
 
     Args:
-        grid: the blocks.
-        present: (D',) the layers that the scene contains.
-        labels: the layers of each pixel.
-        start: (blocks, D) where the plane of a block and layer starts among its chunk's, in floats; of no meaning if
-            they are not a pair.
-        chunks: the blocks in the order they are worked on.
+        labels: of all pixels of the scene.
+        layers: number of layers D.
+        psf_size: side P of the PSFs.
+        kind: of the tiles.
     """
-
-    grid: Grid
-    present: Tensor
-    labels: Labels
-    start: Tensor
-    chunks: list[Chunk]
-
-
-def make_plan(labels: Labels, layers: int, psf_size: int) -> Plan:
-    """Choose the tiles for a scene, list the pairs of block and layer, and group them into chunks."""
-    device = labels.lower.device
-    grid = choose_grid(labels, layers, psf_size)
-    stride = 2 * grid.size**2
-    itemsize = 4 if labels.fraction is None else labels.fraction.element_size()
-    limit = CHUNK_BYTES.get(device.type, CHUNK_BYTES_ACCELERATOR) // (stride * itemsize)
-
-    here = grid.present(labels, layers)
-    used = here.any(0)
-    block, layer = here.nonzero().unbind(1)
-    number = (used.cumsum(0) - 1)[layer]
-    ends = [0, *here.sum(1).cumsum(0).tolist()]
-    start = torch.zeros(grid.blocks, layers, dtype=torch.int64, device=device)
-    chunks = []
-    for extent, first, last in _split(grid, ends, limit):
-        own = slice(ends[first], ends[last])
-        start[block[own], layer[own]] = torch.arange(0, (own.stop - own.start) * stride, stride, device=device)
-        counts = [stop - start for start, stop in pairwise(ends[first : last + 1])]
-        chunks.append(_chunk(grid, extent, block[own] - first, number[own], counts))
-    return Plan(grid, used.nonzero().squeeze(-1), labels, start, chunks)
-
-
-def choose_grid(labels: Labels, layers: int, psf_size: int) -> Grid:
-    """Return the grid with the lowest cost.
-
-    Larger tiles waste less on their overlap, smaller ones hold fewer layers. The pairs of each candidate are counted
-    on every eighth row and column.
-    """
-    grids = candidates(tuple(labels.lower.shape), psf_size)
-    if len(grids) == 1:
-        return grids[0]
+    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
     sample = labels.every(SAMPLE)
-    counts = [grid.present(sample, layers, SAMPLE).sum() for grid in grids]
-    counted = zip(grids, torch.stack(counts).tolist(), strict=True)
-    costs = [tile_cost(grid.size, grid.blocks, pairs) for grid, pairs in counted]
-    return grids[costs.index(min(costs))]
+    costs = _costs(grids, [grid.present(sample, layers, SAMPLE).sum(1) for grid in grids], kind)
+    return min(zip(costs, grids, strict=True), key=lambda pair: pair[0])
 
 
-def candidates(shape: tuple[int, ...], psf_size: int) -> list[Grid]:
+@lru_cache(maxsize=256)
+def least_cost(shape: tuple[int, ...], psf_size: int, kind: TileKind) -> float:
+    """Return the cost of labels of a shape with one layer in each block, in nanoseconds a channel."""
+    grids = candidates(shape, psf_size, kind)
+    return min(_costs(grids, [torch.ones(grid.blocks, dtype=torch.int64) for grid in grids], kind))
+
+
+def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -> list[Grid]:
     """Return the grids to choose from, for labels of a shape."""
     batch, height, width = shape
+    if kind.windowed:  # labels are those of the windows
+        height, width = height - psf_size + 1, width - psf_size + 1
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
-    whole = psf_size - 1 + max(height, math.ceil(width / 2))
-    sizes = [size for size in SIZES if smallest <= size < 2 * whole][:8] or [next_fast_size(smallest)]
-    return [_fitting_grid(batch, height, width, size, psf_size) for size in sizes]
+    whole = psf_size - 1 + max(height, math.ceil(width / kind.across))
+    sizes = [size for size in kind.sizes if smallest <= size < 2 * whole][: kind.candidates]
+    return [_grid(batch, height, width, size, psf_size, kind) for size in sizes or [next_fast_size(smallest)]]
+
+
+def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: TileKind) -> Grid:
+    """Return the grid of the fewest blocks; where overlap is free, in tiles no larger than needed."""
+    tile = size - psf_size + 1
+    if kind.windowed:
+        return Grid(batch, height, width, size, tile, kind.across, psf_size - 1)
+    rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
+    needed = max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2)
+    return Grid(batch, height, width, size, min(tile, needed), kind.across)
+
+
+def _costs(grids: list[Grid], held: list[Tensor], kind: TileKind) -> list[float]:
+    """Return the cost of each grid from the number of layers that each of its blocks holds. Waits once for a device."""
+    if kind.windowed:
+        return torch.stack([windows_cost(own, grid.size) for grid, own in zip(grids, held, strict=True)]).tolist()
+    pairs = torch.stack([own.sum() for own in held]).tolist()
+    return [tile_cost(grid.size, grid.blocks, count) for grid, count in zip(grids, pairs, strict=True)]
+
+
+def transforms_seconds(nanoseconds: float) -> float:
+    """Return the time in seconds of work by transforms that takes some nanoseconds on one core.
+
+    Of such work torch's threads share :data:`SHARED`.
+    """
+    return nanoseconds * (1 - SHARED + SHARED / torch.get_num_threads()) * 1e-9
 
 
 def tile_cost(size: int, blocks: int, pairs: int) -> float:
@@ -285,46 +254,21 @@ def transforms_cost(windows: float, pixels: int, terms: int) -> float:
     return TILE_FACTOR * windows + PIXEL_NANOSECONDS * pixels * terms
 
 
-def _fitting_grid(batch: int, height: int, width: int, size: int, psf_size: int) -> Grid:
-    """Return the grid of the fewest blocks, in tiles no larger than needed: the last hang over the least."""
-    largest = size - psf_size + 1
-    rows, columns = math.ceil(height / largest), math.ceil(width / (2 * largest))
-    tile = max(math.ceil(height / rows), math.ceil(width / (2 * columns)), (size + 1) // 2)
-    return Grid(batch, height, width, size, min(tile, largest))
+def windows_cost(layers: Tensor, size: int) -> Tensor:
+    r"""Return the time that windows take in nanoseconds a channel, on a core of a 2.5 GHz Xeon.
 
+    .. math:: n^2 \left( 0.6 + \frac{n}{130} \right) \sum_w \max(6, 17 d_w + 7 (d_w - 2)) + 15000 \sum_w d_w
 
-Extent = tuple[tuple[int, int], ...]  # first and last image, row and column of blocks
+    for windows of n x n samples, of which the w-th holds :math:`d_w` layers: a window of a single layer is computed in
+    float32; larger windows leave the cache; and each layer is called for. Fitted to 48 to 288 samples.
 
+    Args:
+        layers: d, the number of layers of each window.
+        size: n.
 
-def _split(grid: Grid, ends: list[int], limit: int) -> Iterator[tuple[Extent, int, int]]:
-    """Halve the blocks, images first, then rows, then columns, until a part has ``limit`` pairs or is one block.
-
-    ``ends`` counts the pairs before each block. Yields parts in order, with their first and last block.
+    Example:
+        >>> f"{float(windows_cost(torch.tensor([1, 2, 3]), 64)) * 1e-6:.2f} ms"
+        '0.53 ms'
     """
-    stack: list[Extent] = [((0, grid.batch), (0, grid.rows), (0, grid.columns))]
-    while stack:
-        extent = stack.pop()
-        (image, last_image), (row, last_row), (column, last_column) = extent
-        first = (image * grid.rows + row) * grid.columns + column
-        last = ((last_image - 1) * grid.rows + last_row - 1) * grid.columns + last_column
-        axis = next((a for a in range(3) if extent[a][1] - extent[a][0] > 1), None)
-        if axis is None or ends[last] - ends[first] <= limit:
-            yield extent, first, last
-            continue
-        start, stop = extent[axis]
-        middle = (start + stop) // 2
-        stack += [(*extent[:axis], half, *extent[axis + 1 :]) for half in ((middle, stop), (start, middle))]
-
-
-def _chunk(grid: Grid, extent: Extent, block: Tensor, layer: Tensor, counts: list[int]) -> Chunk:
-    images, rows, columns = extent
-    return Chunk(
-        batch=slice(*images),
-        rows=slice(*rows),
-        columns=slice(*columns),
-        y=slice(rows[0] * grid.tile, min(rows[1] * grid.tile, grid.height)),
-        x=slice(columns[0] * 2 * grid.tile, min(columns[1] * 2 * grid.tile, grid.width)),
-        block=block,
-        layer=layer,
-        counts=counts,
-    )
+    each = torch.where(layers < 2, 6, 17 * layers + 7 * (layers - 2))
+    return each.sum() * (size**2 * (0.6 + size / 130)) + 15000 * layers.sum()

@@ -1,0 +1,225 @@
+"""The workspace of gather and scatter by tiles: the four steps that forward and backward passes are made of.
+
+Overlap-save for gather, overlap-add for scatter. Each is the other's transpose, so both are made of the same steps: cut
+windows out of a plane, add windows to a plane, scatter pixels to the planes of their layers, gather pixels from the
+planes of their layers. The planes of one chunk of tiles exist at a time, in one channel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.render.backends.block_plan import BlockPlan, Chunk
+
+
+class Offsets(NamedTuple):
+    """Offsets of pixels in the planes of their layers, in floats; and in those of the next layers, with its weight."""
+
+    below: Tensor
+    above: tuple[Tensor, Tensor] | None
+
+
+class TileWorkspace:
+    """The steps of one pass over a plan, for one channel of one chunk each, in memory that all of them use again.
+
+    Fetching memory from the system takes as long as the transforms in it.
+
+    Args:
+        plan: what to compute.
+        psfs: (D, C, P, P).
+        offset: where a tile's first pixel stands in its window, down and across.
+    """
+
+    def __init__(self, plan: BlockPlan, psfs: Tensor, offset: int) -> None:
+        self.plan, self._psfs = plan, psfs
+        self._memory: dict[tuple[str, torch.dtype], Tensor] = {}
+        self._dtype, self._device = psfs.dtype, psfs.device
+        size, tile = plan.grid.size, plan.grid.tile
+        images = torch.arange(max(chunk.batch.stop - chunk.batch.start for chunk in plan.chunks), device=psfs.device)
+        y = torch.arange(max(chunk.y.stop - chunk.y.start for chunk in plan.chunks), device=psfs.device)
+        x = torch.arange(plan.grid.width, device=psfs.device)
+        # A pixel's block times the number of layers, and where it stands in its window, counted in floats: alike for
+        # all rows of blocks.
+        self._number = plan.grid.number(images, y, x) * plan.start.shape[1]
+        self._inside = ((y % tile + offset) * (2 * size))[:, None] + (2 * (x % tile + offset) + x // tile % 2)
+
+    @cached_property
+    def spectra(self) -> Tensor:
+        """(C, D', size, size) spectra of the PSFs of the layers that are present."""
+        psfs = self._psfs.transpose(0, 1).index_select(1, self.plan.present)
+        return torch.fft.fft2(psfs, s=(self.plan.grid.size, self.plan.grid.size))
+
+    @cached_property
+    def conjugate(self) -> Tensor:
+        """Spectra of the PSFs flipped by 180 degrees: correlation is the transpose of convolution."""
+        return torch.conj_physical(self.spectra)
+
+    def no_spectra(self) -> Tensor:
+        """Return zeros of the shape of :attr:`spectra`."""
+        shape = (self._psfs.shape[1], len(self.plan.present), self.plan.grid.size, self.plan.grid.size)
+        return self._psfs.new_zeros(shape, dtype=self._dtype.to_complex())
+
+    def steps(self) -> Iterator[tuple[Chunk, Offsets, int]]:
+        """Yield each channel of each chunk, and the offsets of the chunk's pixels, which all channels share."""
+        for chunk in self.plan.chunks:
+            offsets = self.offsets(chunk)
+            for channel in range(self._psfs.shape[1]):
+                yield chunk, offsets, channel
+
+    def _buffer(self, name: str, shape: Sequence[int], dtype: torch.dtype | None = None) -> Tensor:
+        """Return memory by name, with whatever was left in it."""
+        count, key = math.prod(shape), (name, dtype or self._dtype)
+        if key not in self._memory or len(self._memory[key]) < count:
+            self._memory[key] = torch.empty(count, dtype=key[1], device=self._device)
+        return self._memory[key][:count].view(*shape)
+
+    def _planes(self, name: str, *count: int) -> Tensor:
+        """Return complex planes by name, (*count, size, size), with whatever was left in them."""
+        size = self.plan.grid.size
+        return self._buffer(name, (*count, size, size), self._dtype.to_complex())
+
+    def windows(self, plane: Tensor, chunk: Chunk) -> Tensor:
+        """Cut a chunk's windows out of a (B, H', W') plane, black beyond its ends: (blocks, size, size) complex."""
+        size, tile = self.plan.grid.size, self.plan.grid.tile
+        images, rows, columns = chunk.extent
+        height, width = (rows - 1) * tile + size, (2 * columns - 1) * tile + size
+        part = plane[chunk.batch, chunk.y.start : chunk.y.start + height, chunk.x.start : chunk.x.start + width]
+        if part.shape[1:] != (height, width):
+            whole = self._buffer("part", (images, height, width))
+            whole[:, part.shape[1] :] = 0
+            whole[:, : part.shape[1], part.shape[2] :] = 0
+            whole[:, : part.shape[1], : part.shape[2]] = part
+            part = whole
+        tiles, cut = part.unfold(1, size, tile).unfold(2, size, tile), self._planes("windows", *chunk.extent)
+        return torch.complex(tiles[:, :, 0::2], tiles[:, :, 1::2], out=cut).flatten(0, 2)
+
+    def add_windows(self, plane: Tensor, windows: Tensor, chunk: Chunk) -> None:
+        """Add a chunk's windows to a plane where :meth:`windows` cuts them: its transpose."""
+        size, tile = self.plan.grid.size, self.plan.grid.tile
+        rows, columns = chunk.extent[1:]
+        halves = torch.view_as_real(windows).unflatten(0, chunk.extent).movedim(-1, 0)
+        for half, light in enumerate(halves):
+            left = chunk.x.start + half * tile
+            across = plane[chunk.batch, :, left : left + (columns - 1) * 2 * tile + size]
+            # Of every second tile, windows overlap with the row above and below only, by less than a tile: first the
+            # tiles, then what hangs over, so that no pixel is met twice in one addition.
+            for start, stop in ((0, tile), (tile, size)):
+                if start < stop:
+                    top = chunk.y.start + start
+                    down = across[:, top : top + (rows - 1) * tile + stop - start]
+                    down.unfold(1, stop - start, tile).unfold(2, size, 2 * tile).add_(light[..., start:stop, :])
+
+    def tiled_plane(self, plane: Tensor) -> Tensor:
+        """Return a black plane that holds the windows of all blocks."""
+        grid = self.plan.grid
+        overlap = grid.size - grid.tile
+        return plane.new_zeros(*plane.shape[:2], grid.covered_height + overlap, grid.covered_width + overlap)
+
+    def blur(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
+        """Return each pair's light times the spectrum of its layer, (pairs, size, size)."""
+        pairs = self._planes("pairs", len(chunk.layer))
+        if not self.plan.by_slices:
+            return torch.index_select(spectra, 0, chunk.layer, out=pairs).mul_(light.index_select(0, chunk.block))
+        for run in chunk.runs:
+            torch.mul(spectra[run.layers], light[run.block], out=pairs[run.pairs])
+        return pairs
+
+    def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
+        """Return each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
+        total = self._planes("windows", len(chunk.counts))
+        if not self.plan.by_slices:
+            own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(own))))
+            return total.zero_().index_add_(0, chunk.block, own)
+        for run in chunk.runs:
+            own[run.pairs].mul_(spectra[run.layers])
+        for block, pairs in zip(total, own.split(chunk.counts), strict=True):
+            torch.sum(pairs, 0, out=block)
+        return total
+
+    def offsets(self, chunk: Chunk) -> Offsets:
+        """Find each of a chunk's pixels in the planes of its layers."""
+        images, y, x = chunk.pixels
+        number = self._number[: images.stop - images.start, : y.stop - y.start, x]
+        # Blocks are counted from the first of the chunk's first row.
+        start = self.plan.start[(images.start * self.plan.grid.rows + chunk.rows.start) * self.plan.grid.columns :]
+        key = self._buffer("key", number.shape, torch.int64)
+        found = []
+        for layer in self.plan.labels.terms(images, y, x):
+            torch.add(layer, number, out=key)
+            offset = self._buffer(f"offset {len(found)}", (key.numel(),), torch.int64)
+            torch.index_select(start.view(-1), 0, key.view(-1), out=offset)
+            found.append(offset.view(key.shape).add_(self._inside[: y.stop - y.start, x]))
+        weight = self.plan.labels.layer_weight
+        return Offsets(found[0], None if weight is None else (found[1], weight[images, y, x]))
+
+    def gather_from_planes(self, blended: Tensor, planes: Tensor, offsets: Offsets) -> None:
+        """Write each pixel's mean over its layers into ``blended``."""
+        floats = torch.view_as_real(planes)
+        torch.take(floats, offsets.below, out=blended)
+        if offsets.above is not None:
+            above, weight = offsets.above
+            blended.lerp_(torch.take(floats, above, out=self._buffer("above", blended.shape)), weight)
+
+    def scatter_to_planes(self, light: Tensor, offsets: Offsets, chunk: Chunk) -> Tensor:
+        """Split each pixel over the planes of its layers, the transpose of gathering: (pairs, size, size) complex."""
+        planes = self._planes("pairs", len(chunk.layer)).zero_()
+        floats = torch.view_as_real(planes).view(-1)
+        if offsets.above is not None:
+            above, weight = offsets.above
+            weighted = light * weight
+            floats.index_put_((above,), weighted)  # put_ is refused where determinism is asked for
+            light = torch.where(offsets.below == above, light, light - weighted)
+        floats.index_put_((offsets.below,), light)
+        return planes
+
+
+class TileGradients:
+    """Gradients that a backward pass collects chunk by chunk, where they are wanted.
+
+    Args:
+        wanted: of plane, PSFs and layer weight.
+        plane: light.
+        workspace: of the pass.
+    """
+
+    def __init__(self, wanted: Sequence[bool], plane: Tensor, workspace: TileWorkspace) -> None:
+        self._plan = workspace.plan
+        self.plane = wanted[0]
+        self.psfs = workspace.no_spectra() if wanted[1] else None
+        self.layer_weight = plane.new_zeros(self._plan.labels.layer_index.shape) if wanted[2] else None
+
+    def add_layer_weight(self, blurred: Tensor, factor: Tensor, offsets: Offsets, chunk: Chunk) -> None:
+        """Add what a pixel gains when its light moves to the next layer, times the gradient or the light it has."""
+        assert self.layer_weight is not None
+        assert offsets.above is not None
+        floats = torch.view_as_real(blurred)
+        self.layer_weight[chunk.pixels] += (floats.take(offsets.above[0]) - floats.take(offsets.below)) * factor
+
+    def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk, channel: int) -> None:
+        """Add the correlation of the layers' own pixels with the light of their windows."""
+        assert self.psfs is not None
+        light, sums = torch.conj_physical(light), self.psfs[channel]
+        if not self._plan.by_slices:
+            sums.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
+            return
+        for run in chunk.runs:
+            sums[run.layers].addcmul_(light[run.block], own[run.pairs])
+
+    def of_psfs(self, psfs: Tensor, *, conjugate: bool) -> Tensor | None:
+        """Return the gradient of the PSFs, where it is wanted.
+
+        Left and right tiles correlate with themselves in the real part, with each other in the imaginary part.
+        """
+        if self.psfs is None:
+            return None
+        side = psfs.shape[-1]
+        gradient = torch.zeros_like(psfs)
+        found = torch.fft.ifft2(self.psfs.conj() if conjugate else self.psfs).real[..., :side, :side]
+        gradient[self._plan.present] = found.transpose(0, 1)
+        return gradient

@@ -1,0 +1,141 @@
+"""The choice of a backend: the cheapest one that supports a scene, or the one asked for by name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.render.backend import Backend
+from kornia_tidy.render.backends.dense import DenseBackend
+from kornia_tidy.render.backends.direct import DirectBackend
+from kornia_tidy.render.backends.tiled import TiledBackend
+from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.stray_light import stray_light_of
+from kornia_tidy.runtime.tracing import is_followed
+
+BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
+METHODS = ("auto", *BACKENDS)
+
+
+def render_scene(scene: LayeredScene, method: str = "auto") -> Tensor:
+    """Render a layered scene by the cheapest backend, or by one that is named.
+
+    Args:
+        scene: from :func:`kornia_tidy.render.scene.layered_scene`.
+        method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``.
+
+    Returns:
+        (B, C, h, w) light in the scene's dtype.
+
+    Raises:
+        ValueError: if the method is not known, or does not support the scene.
+    """
+    return render_with(choose(scene, method), scene)
+
+
+def render_with(backend: Backend, scene: LayeredScene) -> Tensor:
+    """Render a layered scene by a backend, with its stray light."""
+    coded = backend.render(scene)
+    if scene.stray_light is None or scene.compositing == "occlusion":
+        return coded
+    return coded + stray_light_of(scene)
+
+
+def choose(scene: LayeredScene, method: str = "auto") -> Backend:
+    """Return the backend that :func:`render_scene` takes.
+
+    Of those that support the scene it is the one with the least estimated time. A dense gradient keeps a spectrum for
+    each layer: where gradients are wanted, dense is taken only if nothing else supports the scene.
+
+    Args:
+        scene: to be rendered.
+        method: ``"auto"``, or the name of the backend.
+
+    Raises:
+        ValueError: as :func:`render_scene`.
+    """
+    check_choice("method", method, METHODS)
+    if method != "auto":
+        why = refusal(BACKENDS[method], scene)
+        if why is not None:
+            raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
+        return BACKENDS[method]
+    able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
+    if len(able) > 1 and _wants_gradients(scene):
+        able.remove(BACKENDS["dense"])
+    best, least = able[0], math.inf
+    for backend in able if len(able) > 1 else ():
+        if backend.least_seconds(scene) < least and (seconds := backend.seconds(scene)) < least:
+            best, least = backend, seconds
+    return best
+
+
+def refusal(backend: Backend, scene: LayeredScene) -> str | None:
+    """Return why a backend does not support a scene, or None if it does.
+
+    This alone decides what runs while torch compiles or transforms the renderer.
+    """
+    if backend.name != "dense" and is_followed():
+        return "torch.compile, torch.func and forward-mode derivatives need plain operations of torch"
+    return backend.refusal(scene)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Which backend renders a scene and why, see :func:`explain`.
+
+    Args:
+        scene: the scene in words.
+        backend: name of the one that ``method="auto"`` takes.
+        seconds: estimated time of each backend that supports the scene, by name.
+        refusals: why each of the others does not, by name.
+        gradients: whether gradients are wanted, for which dense is not considered.
+    """
+
+    scene: str
+    backend: str
+    seconds: dict[str, float]
+    refusals: dict[str, str]
+    gradients: bool
+
+    def __str__(self) -> str:
+        lines = [f"{self.scene}: {self.backend}"]
+        for name, seconds in sorted(self.seconds.items(), key=lambda item: item[1]):
+            passed = " (not taken: it keeps every layer for the gradients)" if self.gradients and name == "dense" else ""
+            lines.append(f"  {name:7} about {1e3 * seconds:.3g} ms{passed}")
+        lines += [f"  {name:7} no: {why}" for name, why in self.refusals.items()]
+        return "\n".join(lines)
+
+
+def explain(scene: LayeredScene) -> Explanation:
+    """Return which backend ``method="auto"`` takes for a scene, what each would cost and why others are refused.
+
+    Args:
+        scene: from :func:`kornia_tidy.render.scene.layered_scene`.
+
+    Example:
+        >>> import torch
+        >>> from kornia_tidy.render.scene import layered_scene
+        >>> image, psi, nodes = torch.rand(1, 3, 2, 40), torch.zeros(1, 1, 2, 40), torch.tensor([0.0, 4.0])
+        >>> explanation = explain(layered_scene(image, psi, nodes, torch.rand(2, 3, 3, 3), compositing="scatter"))
+        >>> explanation.refusals
+        {'direct': 'direct convolution gathers light and does not scatter it'}
+    """
+    (height, width), batch = scene.output_size, len(scene.image)
+    layers = len(torch.cat([layer.flatten() for layer in scene.labels.every().terms()]).unique())
+    words = (
+        f"{scene.compositing} of {batch} x {height}x{width} px, {scene.image.shape[1]} channels, {layers} of "
+        f"{len(scene.psfs)} layers, PSFs of {scene.psf_size}x{scene.psf_size} px, {torch.get_num_threads()} threads"
+    )
+    refusals = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
+    seconds = {name: backend.seconds(scene) for name, backend in BACKENDS.items() if name not in refusals}
+    return Explanation(words, choose(scene).name, seconds, refusals, _wants_gradients(scene))
+
+
+def _wants_gradients(scene: LayeredScene) -> bool:
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
