@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.render.backend import Backend
-from kornia_tidy.render.backends.dense import DenseBackend
+from kornia_tidy.render.backends.dense import DenseBackend, memory_objection
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.scene import LayeredScene
@@ -48,8 +48,8 @@ def render_with(backend: Backend, scene: LayeredScene) -> Tensor:
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """Return the backend that :func:`render_scene` takes.
 
-    Of those that support the scene it is the one with the least estimated time. A dense gradient keeps a spectrum for
-    each layer: where gradients are wanted, dense is taken only if nothing else supports the scene.
+    Of those that support the scene it is the one with the least estimated time. Dense rendering is taken only while
+    its memory stays small, or if nothing else supports the scene.
 
     Args:
         scene: to be rendered.
@@ -65,7 +65,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return BACKENDS[method]
     able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
-    if len(able) > 1 and _wants_gradients(scene):
+    if len(able) > 1 and memory_objection(scene) is not None:
         able.remove(BACKENDS["dense"])
     best, least = able[0], math.inf
     for backend in able if len(able) > 1 else ():
@@ -92,27 +92,23 @@ class Explanation:
         scene: the scene in words.
         backend: name of the one that ``method="auto"`` takes.
         seconds: estimated time of each backend that supports the scene, by name.
-        refusals: why each of the others does not, by name.
-        gradients: whether gradients are wanted, for which dense is not considered.
+        objections: why a backend does not support the scene, or is not taken for its memory, by name.
     """
 
     scene: str
     backend: str
     seconds: dict[str, float]
-    refusals: dict[str, str]
-    gradients: bool
+    objections: dict[str, str]
 
     def __str__(self) -> str:
-        lines = [f"{self.scene}: {self.backend}"]
-        for name, seconds in sorted(self.seconds.items(), key=lambda item: item[1]):
-            passed = " (not taken: it keeps every layer for the gradients)" if self.gradients and name == "dense" else ""
-            lines.append(f"  {name:7} about {1e3 * seconds:.3g} ms{passed}")
-        lines += [f"  {name:7} no: {why}" for name, why in self.refusals.items()]
-        return "\n".join(lines)
+        words = {name: f"about {1e3 * self.seconds[name]:.3g} ms" for name in sorted(self.seconds, key=self.seconds.get)}
+        for name, why in self.objections.items():
+            words[name] = f"{words[name]}, but {why}" if name in words else why
+        return "\n".join([f"{self.scene}: {self.backend}", *(f"  {name}: {why}" for name, why in words.items())])
 
 
 def explain(scene: LayeredScene) -> Explanation:
-    """Return which backend ``method="auto"`` takes for a scene, what each would cost and why others are refused.
+    """Return which backend ``method="auto"`` takes for a scene, what each would cost and why others are not taken.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
@@ -122,20 +118,16 @@ def explain(scene: LayeredScene) -> Explanation:
         >>> from kornia_tidy.render.scene import layered_scene
         >>> image, psi, nodes = torch.rand(1, 3, 2, 40), torch.zeros(1, 1, 2, 40), torch.tensor([0.0, 4.0])
         >>> explanation = explain(layered_scene(image, psi, nodes, torch.rand(2, 3, 3, 3), compositing="scatter"))
-        >>> explanation.refusals
-        {'direct': 'direct convolution gathers light and does not scatter it'}
+        >>> sorted(explanation.seconds), explanation.objections
+        (['dense', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
     """
-    (height, width), batch = scene.output_size, len(scene.image)
-    layers = len(torch.cat([layer.flatten() for layer in scene.labels.every().terms()]).unique())
+    (height, width), (batch, channels) = scene.output_size, scene.image.shape[:2]
     words = (
-        f"{scene.compositing} of {batch} x {height}x{width} px, {scene.image.shape[1]} channels, {layers} of "
+        f"{scene.compositing} of {batch} x {channels} channels of {height}x{width} px, {scene.sampled_layers} of "
         f"{len(scene.psfs)} layers, PSFs of {scene.psf_size}x{scene.psf_size} px, {torch.get_num_threads()} threads"
     )
-    refusals = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
-    seconds = {name: backend.seconds(scene) for name, backend in BACKENDS.items() if name not in refusals}
-    return Explanation(words, choose(scene).name, seconds, refusals, _wants_gradients(scene))
-
-
-def _wants_gradients(scene: LayeredScene) -> bool:
-    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
-    return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
+    objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
+    seconds = {name: backend.seconds(scene) for name, backend in BACKENDS.items() if name not in objections}
+    if len(seconds) > 1 and (why := memory_objection(scene)) is not None:
+        objections["dense"] = why
+    return Explanation(words, choose(scene).name, seconds, objections)

@@ -40,7 +40,7 @@ class Labels:
             return cls(layer_index, None)
         return cls(layer_index, layer_weight.detach(), layer_weight.requires_grad and torch.is_grad_enabled())
 
-    def every(self, step: int = SAMPLE) -> Labels:
+    def every(self, step: int) -> Labels:
         """Return the labels of every ``step``-th row and column."""
         kept = (slice(None), slice(None, None, step), slice(None, None, step))
         weight = self.layer_weight

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.render.borders import check_border, pad_border
-from kornia_tidy.render.layers import Labels, assign_layers
+from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,12 @@ class LayeredScene:
         """:attr:`sorted_layers` for each image of the batch, (B, h', w')."""
         (index, weight), batch = self.sorted_layers, len(self.image)
         return Labels.of(index.expand(batch, -1, -1), None if weight is None else weight.expand(batch, -1, -1))
+
+    @cached_property
+    def sampled_layers(self) -> int:
+        """Number of layers in a sample of the scene: every eighth row and column of :attr:`labels`."""
+        terms = [layer.flatten() for layer in self.labels.every(SAMPLE).terms()]
+        return int((torch.bincount(torch.cat(terms)) > 0).sum())
 
 
 def layered_scene(

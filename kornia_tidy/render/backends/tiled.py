@@ -25,6 +25,7 @@ from kornia_tidy.render.backends.tile_plan import (
     cheapest_grid,
     choose_grid,
     least_cost,
+    tile_cost,
     transforms_cost,
     transforms_seconds,
 )
@@ -54,9 +55,10 @@ class TiledBackend:
 
     def seconds(self, scene: LayeredScene) -> float:
         """Return the estimated time with the best tiles for the scene."""
-        kind = self._kind(scene)
-        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, kind)
+        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, self._kind(scene))
         scene.found[self.name] = grid
+        if scene.compositing != "occlusion":
+            cost += tile_cost(grid.size, 0, scene.sampled_layers)  # the spectra of the PSFs
         return _seconds(scene, cost)
 
     def least_seconds(self, scene: LayeredScene) -> float:
