@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.dispatch import render_scene
-from kornia_tidy.render.scene import layered_scene
+from kornia_tidy.render.dispatch import METHODS, render_scene
+from kornia_tidy.render.render_ops import render_layers
+from kornia_tidy.render.scene import check_scene, layered_scene
+from kornia_tidy.runtime.tracing import is_transformed
 
 
 class Bank(Protocol):
@@ -60,7 +62,7 @@ def render(
         correlate: flip the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
         method: the backend. ``"auto"`` takes the cheapest that supports the scene, see
             :func:`kornia_tidy.render.dispatch.explain`; ``"direct"``, ``"tiled"`` and ``"dense"`` ask for one.
-            ``torch.compile``, ``torch.func`` and forward-mode derivatives are for dense alone.
+            ``torch.func`` and forward-mode derivatives are for dense alone; ``torch.compile`` is for all.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or
@@ -249,6 +251,10 @@ def _composite(
     image: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, stray_light: Tensor | None, *, method: str, **options: str
 ) -> Tensor:
     """Render in float32 or better, whatever autocast says, and return the image's type."""
-    with torch.autocast(image.device.type, enabled=False):
-        coded = render_scene(layered_scene(image, defocus, nodes, psfs, stray_light, **options), method)
-    return coded.to(image.dtype)
+    if is_transformed():
+        with torch.autocast(image.device.type, enabled=False):
+            scene = layered_scene(image, defocus, nodes, psfs, stray_light, **options)
+            return render_scene(scene, method).to(image.dtype)
+    check_choice("method", method, METHODS)
+    check_scene(image, defocus, nodes, psfs, stray_light, options["border"])
+    return render_layers(image, defocus, nodes, psfs, stray_light, method=method, **options)

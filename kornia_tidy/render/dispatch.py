@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.backend import Backend
-from kornia_tidy.render.backends.dense import DenseBackend, memory_objection
+from kornia_tidy.render.backend import Backend, GradientPairs
+from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients, memory_objection
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.stray_light import stray_light_of
-from kornia_tidy.runtime.tracing import is_followed
+from kornia_tidy.runtime.tracing import is_transformed
 
 BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
 METHODS = ("auto", *BACKENDS)
@@ -38,11 +39,82 @@ def render_scene(scene: LayeredScene, method: str = "auto") -> Tensor:
 
 
 def render_with(backend: Backend, scene: LayeredScene) -> Tensor:
-    """Render a layered scene by a backend, with its stray light."""
+    """Render a layered scene by a backend, with its stray light.
+
+    The result has gradients with respect to image, layer weight, PSFs and stray light. The backend makes them, for
+    gradients that are differentiated in turn the dense one.
+    """
+    if is_transformed():
+        return render_unrecorded(backend, scene)
+    return _Rendered.apply(backend, scene, scene.image, scene.layer_weight, scene.psfs, scene.stray_light)
+
+
+def render_unrecorded(backend: Backend, scene: LayeredScene) -> Tensor:
+    """Return what :func:`render_with` returns, with those gradients only that torch makes of the backend's operations."""
     coded = backend.render(scene)
     if scene.stray_light is None or scene.compositing == "occlusion":
         return coded
     return coded + stray_light_of(scene)
+
+
+@torch.enable_grad()
+def scene_gradients(backend: Backend, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+    """Return the gradients of tensors that were made of the scene's, where they require gradients.
+
+    Args:
+        backend: makes them.
+        scene: tensors that autograd records.
+        gradient: (B, C, h, w) gradient of the rendered light.
+    """
+    pairs = backend.gradients(scene, gradient.to(scene.image.dtype))
+    if scene.stray_light is not None and scene.compositing != "occlusion":
+        stray_light = stray_light_of(scene)
+        if stray_light.requires_grad:
+            pairs.append((stray_light, gradient.to(stray_light.dtype).sum_to_size(stray_light.shape)))
+    return pairs
+
+
+def chain_gradients(pairs: GradientPairs, leaves: list[Tensor]) -> list[Tensor | None]:
+    """Return the gradients of leaves from those of tensors that were made of them.
+
+    Args:
+        pairs: from :func:`scene_gradients`.
+        leaves: tensors that the scene was made of; each has its gradient, or None.
+    """
+    if not pairs or not leaves:
+        return [None] * len(leaves)
+    tensors, gradients = zip(*pairs, strict=True)
+    return list(torch.autograd.grad(tensors, leaves, gradients, allow_unused=True))
+
+
+class _Rendered(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, backend: Backend, scene: LayeredScene, *tensors: Tensor | None) -> Tensor:
+        ctx.backend, ctx.scene = backend, scene
+        ctx.save_for_backward(*tensors)
+        return render_unrecorded(backend, scene)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), wanted = grad_outputs, ctx.needs_input_grad[2:]
+
+        def scene_of(*tensors: Tensor | None) -> LayeredScene:
+            image, weight, psfs, stray_light = tensors
+            return replace(ctx.scene, image=image, layer_weight=weight, psfs=psfs, stray_light=stray_light)
+
+        if torch.is_grad_enabled():  # it is differentiated in turn
+
+            def render(*tensors: Tensor | None) -> Tensor:
+                return render_unrecorded(BACKENDS["dense"], scene_of(*tensors))
+
+            return None, None, *differentiable_gradients(render, ctx.saved_tensors, gradient, wanted)
+        own = [
+            None if x is None else x.detach().requires_grad_(want)
+            for x, want in zip(ctx.saved_tensors, wanted, strict=True)
+        ]
+        leaves = [x for x in own if x is not None and x.requires_grad]
+        found = iter(chain_gradients(scene_gradients(ctx.backend, scene_of(*own), gradient), leaves))
+        return None, None, *(next(found) if x is not None and x.requires_grad else None for x in own)
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
@@ -75,12 +147,9 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:
-    """Return why a backend does not support a scene, or None if it does.
-
-    This alone decides what runs while torch compiles or transforms the renderer.
-    """
-    if backend.name != "dense" and is_followed():
-        return "torch.compile, torch.func and forward-mode derivatives need plain operations of torch"
+    """Return why a backend does not support a scene, or None if it does."""
+    if backend.name != "dense" and is_transformed():
+        return "torch.func and forward-mode derivatives need plain operations of torch"
     return backend.refusal(scene)
 
 

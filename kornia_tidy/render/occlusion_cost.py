@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.occlusion_ops import SMALLEST_SIDE, count_work
 from kornia_tidy.render.backends import direct_occlusion
 from kornia_tidy.render.backends.direct import is_direct_faster
 from kornia_tidy.render.backends.tile_plan import WINDOWS, choose_grid, windows_cost
@@ -57,8 +58,8 @@ def count_windows(labels: Labels, layers: int, window: int) -> Windows:
     scene = torch.empty(labels.layer_index[:, None].shape), torch.zeros(layers, 1, window, window)
     direct = None
     if labels.layer_index.device.type == "cpu" and direct_occlusion.can_go_directly(*scene):
-        counts = direct_occlusion.count(*scene, labels.layer_index, labels.layer_weight)
-        direct = direct_occlusion.direct_cost(*counts, max(window, direct_occlusion.SMALLEST_SIDE))
+        counts = count_work(*scene, labels.layer_index, labels.layer_weight, direct_occlusion.COUNTED)
+        direct = direct_occlusion.direct_cost(*counts, max(window, SMALLEST_SIDE))
     return Windows(grid.size, here.sum(1), int(here.any(0).sum()), labels.layer_index.numel(), direct)
 
 

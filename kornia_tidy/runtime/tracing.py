@@ -24,9 +24,19 @@ def is_followed() -> bool:
         >>> torch.func.grad(lambda x: x * is_followed())(torch.tensor(0.0)), is_followed()
         (tensor(1.), False)
     """
-    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
-        return True
-    return torch._C._functorch.peek_interpreter_stack() is not None
+    return torch.compiler.is_compiling() or is_transformed()
+
+
+def is_transformed() -> bool:
+    """Whether torch.func or forward-mode derivatives need plain operations of torch, compiled or not.
+
+    Example:
+        >>> torch.func.grad(lambda x: x * is_transformed())(torch.tensor(0.0)), is_transformed()
+        (tensor(1.), False)
+    """
+    functorch = torch._C._functorch
+    # While compiling, the empty stack is an object that stands for None: it is not None, and not an interpreter.
+    return forward_ad._current_level >= 0 or isinstance(functorch.peek_interpreter_stack(), functorch.CInterpreter)
 
 
 def is_value_unknown() -> bool:
