@@ -100,7 +100,7 @@ class _Rendered(torch.autograd.Function):
 
         def scene_of(*tensors: Tensor | None) -> LayeredScene:
             image, weight, psfs, stray_light = tensors
-            return replace(ctx.scene, image=image, layer_weight=weight, psfs=psfs, stray_light=stray_light)
+            return replace(ctx.scene, image=image, layer_weight=weight, psfs=psfs, stray_light=stray_light, found={})
 
         if torch.is_grad_enabled():  # it is differentiated in turn
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -26,7 +25,7 @@ class LayeredScene:
         stray_light: (D, C) fraction of a point's light that is spread evenly, or None for none.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        found: what backends found out about the scene, by their names, so that it is found once.
+        found: what was found out about the scene, by its name, so that it is found once.
     """
 
     image: Tensor
@@ -36,7 +35,7 @@ class LayeredScene:
     stray_light: Tensor | None
     border: str
     compositing: str
-    found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    found: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def psf_size(self) -> int:
@@ -49,18 +48,27 @@ class LayeredScene:
         lost = self.psf_size - 1 if self.border == "valid" else 0
         return self.image.shape[-2] - lost, self.image.shape[-1] - lost
 
-    @cached_property
+    # What follows is made when it is first asked for. functools.cached_property has a lock, which torch.compile refuses.
+
+    @property
     def plane(self) -> Tensor:
         """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels."""
-        return pad_border(self.image, self.psf_size // 2, self.border)
+        if "plane" not in self.found:
+            self.found["plane"] = pad_border(self.image, self.psf_size // 2, self.border)
+        return self.found["plane"]
 
-    @cached_property
+    @property
     def sorted_layers(self) -> tuple[Tensor, Tensor | None]:
         """Layer index and layer weight of the pixels that backends sort, (B or 1, h', w').
 
         Gather sorts the pixels of the output, scatter and occlusion those of :attr:`plane`. What lies beyond a border
         of zeros has no weight there, and takes the layers of the nearest pixels.
         """
+        if "sorted_layers" not in self.found:
+            self.found["sorted_layers"] = self._sort_layers()
+        return self.found["sorted_layers"]
+
+    def _sort_layers(self) -> tuple[Tensor, Tensor | None]:
         index, weight, radius = self.layer_index, self.layer_weight, self.psf_size // 2
         if self.compositing != "gather":
             sides = "replicate" if self.border == "zero" else self.border
@@ -71,22 +79,27 @@ class LayeredScene:
             weight = None if weight is None else weight[..., radius:-radius, radius:-radius]
         return index[:, 0], None if weight is None else weight[:, 0]
 
-    @cached_property
+    @property
     def batch_weight(self) -> Tensor | None:
         """Layer weight of :attr:`sorted_layers` for each image of the batch, (B, h', w')."""
         weight = self.sorted_layers[1]
         return None if weight is None else weight.expand(len(self.image), -1, -1)
 
-    @cached_property
+    @property
     def labels(self) -> Labels:
         """:attr:`sorted_layers` for each image of the batch, (B, h', w')."""
-        return Labels.of(self.sorted_layers[0].expand(len(self.image), -1, -1), self.batch_weight)
+        if "labels" not in self.found:
+            index = self.sorted_layers[0].expand(len(self.image), -1, -1)
+            self.found["labels"] = Labels.of(index, self.batch_weight)
+        return self.found["labels"]
 
-    @cached_property
+    @property
     def sampled_layers(self) -> int:
         """Number of layers in a sample of the scene: every eighth row and column of :attr:`labels`."""
-        terms = [layer.flatten() for layer in self.labels.every(SAMPLE).terms()]
-        return int((torch.bincount(torch.cat(terms)) > 0).sum())
+        if "sampled_layers" not in self.found:
+            terms = [layer.flatten() for layer in self.labels.every(SAMPLE).terms()]
+            self.found["sampled_layers"] = int((torch.bincount(torch.cat(terms)) > 0).sum())
+        return self.found["sampled_layers"]
 
 
 def layered_scene(

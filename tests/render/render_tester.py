@@ -1,30 +1,56 @@
-"""What tests of the fast renderers share: comparisons with the dense one."""
+"""What tests of the backends share: rendering by a backend, and comparisons with the dense one."""
 
 from __future__ import annotations
 
-import torch
+from dataclasses import replace
 
+import torch
+from torch import Tensor
+
+from kornia_tidy.render.backend import Backend
+from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS
+from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.compositing import render
+from kornia_tidy.render.dispatch import render_with
+from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import Bank
 
+METHODS = ("auto", "tiled", "dense")  # those that support small scenes too
+SMALL = {"chunk_bytes": 40_000, "accelerator_bytes": 40_000}
+# Tiles so small, and chunks of so few of them, that a small scene has many of both.
+SMALL_TILES = TiledBackend(
+    replace(BLOCKS, sizes=(8, 12, 16), **SMALL),
+    replace(WINDOWS, sizes=(8, 12, 16), **SMALL),
+)
+
+
+def render_by(
+    method: str | Backend, image: Tensor, defocus: Tensor, bank: Bank, compositing: str = "gather", **options
+) -> Tensor:
+    """Render by a backend, given itself or by its name."""
+    if isinstance(method, str):
+        return render(image, defocus, bank, compositing, method=method, **options)
+    scene = layered_scene(image, defocus, bank.defocus, bank.psfs, bank.veil, compositing=compositing, **options)
+    return render_with(method, scene).to(image.dtype)
+
 
 class RenderTester(BaseTester):
-    def assert_equals_dense(self, image, defocus, bank, compositing, atol, **options) -> None:
+    def assert_equals_dense(self, method, image, defocus, bank, compositing, atol, **options) -> None:
         expected = render(image, defocus, bank, compositing, method="dense", **options)
-        self.assert_close(render(image, defocus, bank, compositing, **options), expected, rtol=0, atol=atol)
+        self.assert_close(render_by(method, image, defocus, bank, compositing, **options), expected, rtol=0, atol=atol)
 
-    def assert_gradients_equal_dense(self, image, defocus, bank, compositing, atol, **options) -> None:
+    def assert_gradients_equal_dense(self, method, image, defocus, bank, compositing, atol, **options) -> None:
         """To image, defocus, PSFs and veil, within ``atol`` of the largest; nearest layers have none to defocus."""
-        slopes = []
-        for method in ("dense", "tiled"):
+        gradients = []
+        for way in ("dense", method):
             inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs, bank.veil)]
             scene = Bank(inputs[2], bank.defocus, inputs[3])
-            coded = render(inputs[0], inputs[1], scene, compositing, method=method, **options)
-            slopes.append(torch.autograd.grad(coded.square().mean(), inputs, allow_unused=True))
-        assert [expected is None for expected in slopes[0]] == [False, options["layers"] == "nearest", False, False]
-        for expected, slope in zip(*slopes, strict=True):
+            coded = render_by(way, inputs[0], inputs[1], scene, compositing, **options)
+            gradients.append(torch.autograd.grad(coded.square().mean(), inputs, allow_unused=True))
+        assert [expected is None for expected in gradients[0]] == [False, options["layers"] == "nearest", False, False]
+        for expected, gradient in zip(*gradients, strict=True):
             if expected is None:
-                assert slope is None
+                assert gradient is None
             else:
-                self.assert_close(slope, expected, rtol=0, atol=atol * float(expected.abs().max()))
+                self.assert_close(gradient, expected, rtol=0, atol=atol * float(expected.abs().max()))

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.signal import convolve2d
 
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import METHODS, gather, render, scatter
+from kornia_tidy.render.compositing import gather, render, scatter
 from tests.base import BaseTester, oracle
+from tests.render.render_tester import METHODS
 from tests.render.scenes import Bank, brute_render, brute_weights, make_bank, make_scene
 
 COMPOSITINGS = ("gather", "scatter")

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import METHODS, render
+from kornia_tidy.render.compositing import render
 from tests.base import BaseTester
+from tests.render.render_tester import METHODS
 from tests.render.scenes import Bank, make_bank, make_scene
 
 COMPOSITINGS = ("gather", "scatter")
@@ -34,7 +35,7 @@ class TestRenderNumerics(BaseTester):
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("method", METHODS)
-    def test_feature_defocus_exactly_on_a_node_has_the_slope_above(self, compositing, method, device):
+    def test_feature_defocus_exactly_on_a_node_has_the_gradient_above(self, compositing, method, device):
         """The next layer has no weight anywhere, and yet the gradient must see it."""
         bank = make_bank(3, 1, 3, device=device)
         image, _ = make_scene(bank, 1, 6, 6)
@@ -45,9 +46,9 @@ class TestRenderNumerics(BaseTester):
             return (render(image, defocus, bank, compositing, method=method) * ramp).sum()
 
         defocus = torch.full((1, 1, 6, 6), -11.0, device=device, dtype=torch.float64, requires_grad=True)
-        slope = torch.autograd.grad(total(defocus), defocus)[0].sum()
+        gradient = torch.autograd.grad(total(defocus), defocus)[0].sum()
         above = (total(defocus.detach() + step) - total(defocus.detach())) / step
-        self.assert_close(slope, above, rtol=1e-6, atol=1e-8)
+        self.assert_close(gradient, above, rtol=1e-6, atol=1e-8)
 
     # Memory
 
@@ -132,10 +133,10 @@ class TestRenderNumerics(BaseTester):
         bank = make_bank(3, 3, 5, dtype=torch.float32, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank)
         compiled = torch.compile(render, fullgraph=True, dynamic=False)
-        slopes = []
+        gradients = []
         for function in (render, compiled):
             inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs, bank.veil)]
             coded = function(inputs[0], inputs[1], Bank(inputs[2], bank.defocus, inputs[3]), compositing)
-            slopes.append((coded, *torch.autograd.grad(coded.square().sum(), inputs)))
-        for eager, other in zip(*slopes, strict=True):
+            gradients.append((coded, *torch.autograd.grad(coded.square().sum(), inputs)))
+        for eager, other in zip(*gradients, strict=True):
             self.assert_close(other, eager, rtol=1e-4, atol=1e-5)

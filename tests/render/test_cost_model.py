@@ -13,7 +13,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.planning.planner import Planner
 from kornia_tidy.psf.psf_cache import BankMemory
-from kornia_tidy.render.backends.tile_plan import make_plan
+from kornia_tidy.render.backends.block_plan import plan_blocks
+from kornia_tidy.render.backends.tile_plan import BLOCKS, choose_grid
 from kornia_tidy.render.cost_model import (
     Tiles,
     bank_operations,
@@ -26,6 +27,10 @@ from kornia_tidy.render.cost_model import (
 from tests.base import BaseTester, needs_data
 from tests.capture_memory import predicted_over_used
 from tests.scenes import load_scene
+
+
+def _plan(labels, layers, psf_size):
+    return plan_blocks(labels, layers, choose_grid(labels, layers, psf_size), BLOCKS)
 
 
 class TestCost(BaseTester):
@@ -45,7 +50,7 @@ class TestCost(BaseTester):
         rows = torch.linspace(-10, 10, 300).view(1, 1, -1, 1).expand(1, 1, 300, 400)
         nodes = tuple(float(psi) for psi in range(-20, 21, 2))
         labels = label_pixels(rows, 2, nodes, "linear")
-        counted, plan = count_tiles(labels, len(nodes), 31), make_plan(labels, len(nodes), 31)
+        counted, plan = count_tiles(labels, len(nodes), 31), _plan(labels, len(nodes), 31)
         assert (counted.size, counted.blocks) == (plan.grid.size, plan.grid.blocks)
         assert 0.7 < counted.pairs / sum(len(chunk.block) for chunk in plan.chunks) <= 1
         assert counted.layers == len(plan.present) == 11

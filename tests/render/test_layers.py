@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.render.layers import assign_layers, clamp_defocus, layer_weight, layer_weights, present_layers
+from kornia_tidy.render.layers import assign_layers, clamp_defocus, layer_weights, present_layers, weight_of_layer
 from tests.base import BaseTester
 from tests.render.scenes import brute_weights
 
@@ -84,7 +84,7 @@ class TestLayerWeights(BaseTester):
         nodes = torch.tensor([-2.0, 0.0, 4.0], device=device, dtype=dtype)
         defocus = row(-2.0, 0.0, 4.0, device=device, dtype=dtype).requires_grad_()
         for layer, expected in ((1, [0.5, -0.25, -0.25]), (2, [0.0, 0.25, 0.25])):
-            weight = layer_weight(*assign_layers(defocus, nodes, "linear"), layer)
+            weight = weight_of_layer(*assign_layers(defocus, nodes, "linear"), layer)
             assert torch.autograd.grad(weight.sum(), defocus)[0].flatten().tolist() == expected
 
     def test_feature_nearest_has_no_gradient(self, device, dtype):

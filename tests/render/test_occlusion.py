@@ -3,39 +3,27 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.render.backends import occlusion_tile_plan, tiled_occlusion
-from kornia_tidy.render.backends.dense_occlusion import EPSILON, lay_over, weight_behind
-from kornia_tidy.render.backends.occlusion_tile_plan import choose_grid, make_plan
+from kornia_tidy.render.backends.dense_occlusion import EPSILON, cumulative_weight, lay_over
+from kornia_tidy.render.backends.tile_plan import WINDOWS, choose_grid
+from kornia_tidy.render.backends.tiled import TiledBackend
+from kornia_tidy.render.backends.window_plan import plan_windows
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import METHODS, gather, occlusion, render
-from kornia_tidy.render.layers import layer_weights
+from kornia_tidy.render.compositing import gather, occlusion, render
+from kornia_tidy.render.layers import Labels, layer_weights
 from tests.base import BaseTester, oracle
 from tests.render.backends.test_tiled import KINDS, LargestTensor, depth_map
-from tests.render.render_tester import RenderTester
+from tests.render.render_tester import METHODS, SMALL_TILES, RenderTester, render_by
 from tests.render.scenes import Bank, brute_render, make_bank, make_scene
 from tests.rounding import gamma
 
 ATOL = {torch.float32: 2e-5, torch.float64: 1e-12}
-
-
-@pytest.fixture
-def tiles_only(monkeypatch):
-    """Direct convolution has tests of its own."""
-    monkeypatch.setattr(tiled_occlusion, "goes_directly", lambda *_: False)
-
-
-@pytest.fixture
-def small_tiles(monkeypatch):
-    """Tiles so small, and chunks of so few, that a small scene has many of both."""
-    monkeypatch.setattr(occlusion_tile_plan, "SIZES", (8, 12, 16))
-    monkeypatch.setitem(occlusion_tile_plan.CHUNK_BYTES, "cpu", 40_000)
-    monkeypatch.setattr(occlusion_tile_plan, "CHUNK_BYTES_ACCELERATOR", 40_000)
 
 
 def steps(bank, height, width, side=11):
@@ -112,7 +100,7 @@ class TestOcclusion(BaseTester):
         expected = occlusion(image, defocus, bank.defocus, bank.psfs, bank.veil, **options)
         assert torch.equal(render(image, defocus, bank, "occlusion", **options), expected)
 
-    def test_feature_weight_behind_adds_up_the_layers(self, device):
+    def test_feature_cumulative_weight_adds_up_the_layers(self, device):
         bank = make_bank(6, device=device)
         _, defocus = make_scene(bank)
         lower = torch.bucketize(defocus.clamp(-20, 20), bank.defocus[1:-1])
@@ -120,8 +108,8 @@ class TestOcclusion(BaseTester):
         weights = layer_weights(defocus, bank.defocus, "linear")
         for index in range(6):
             expected = weights[:, : index + 1].sum(1, keepdim=True)
-            self.assert_close(weight_behind(lower, fraction, index), expected, rtol=0, atol=1e-14)
-            assert torch.equal(weight_behind(lower, None, index), lower <= index)
+            self.assert_close(cumulative_weight(lower, fraction, index), expected, rtol=0, atol=1e-14)
+            assert torch.equal(cumulative_weight(lower, None, index), lower <= index)
 
     def test_feature_a_negative_divisor_counts_as_none(self, device, dtype):
         """Interpolated PSFs can be negative in places."""
@@ -239,13 +227,12 @@ class TestOcclusion(BaseTester):
         bank.psfs[[0, 3, 4, 5]] = float("nan")
         assert torch.equal(render(image, defocus, bank, "occlusion", method=method), expected)
 
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_one_defocus_map_serves_all_images(self, device, dtype):
         bank = make_bank(dtype=dtype, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, batch=3)
-        together = render(image, defocus[:1], bank, "occlusion")
+        together = render_by(SMALL_TILES, image, defocus[:1], bank, "occlusion")
         for b in range(3):
-            alone = render(image[b : b + 1], defocus[:1], bank, "occlusion")
+            alone = render_by(SMALL_TILES, image[b : b + 1], defocus[:1], bank, "occlusion")
             self.assert_close(together[b : b + 1], alone, rtol=0, atol=1e-6 if dtype == torch.float32 else 1e-13)
 
     def test_exception_names_the_shape_that_does_not_fit(self):
@@ -261,27 +248,24 @@ class TestOcclusion(BaseTester):
         self.assert_close(function(image, defocus), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.usefixtures("tiles_only")
 class TestTiledOcclusion(RenderTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_equals_the_dense_render(self, layers, border, device, dtype):
         for batch, channels, size, height, width in ((2, 3, 5, 31, 46), (1, 1, 7, 64, 33), (3, 2, 1, 17, 40)):
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
             for psi in (defocus, steps(bank, height, width), steps(bank, height, width, 30)):
-                self.assert_equals_dense(image, psi, bank, "occlusion", ATOL[dtype], **options)
+                self.assert_equals_dense(SMALL_TILES, image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_equals_the_dense_render_of_hard_scenes(self, layers, kind, device, dtype):
         bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 37, 51)
         defocus = depth_map(kind, bank, 37, 51)
-        self.assert_equals_dense(image, defocus, bank, "occlusion", ATOL[dtype], layers=layers)
+        self.assert_equals_dense(SMALL_TILES, image, defocus, bank, "occlusion", ATOL[dtype], layers=layers)
 
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
@@ -299,7 +283,7 @@ class TestTiledOcclusion(RenderTester):
         defocus = steps(bank, height, width, draw(st.integers(1, 60)))
         layers = draw(st.sampled_from(["nearest", "linear"]))
         expected = render(image, defocus, bank, "occlusion", layers=layers, border=border, method="dense")
-        coded = render(image, defocus, bank, "occlusion", layers=layers, border=border)
+        coded = render(image, defocus, bank, "occlusion", layers=layers, border=border, method="tiled")
         self.assert_close(coded, expected, rtol=0, atol=1e-11)
 
     @pytest.mark.parametrize("border", ["zero", "replicate"])
@@ -308,14 +292,13 @@ class TestTiledOcclusion(RenderTester):
             bank = make_bank(3, 1, size, device=device)
             image, defocus = make_scene(bank, 2, height, width)
             expected = render(image, defocus, bank, "occlusion", border=border, layers="nearest", method="dense")
-            coded = render(image, defocus, bank, "occlusion", border=border, layers="nearest")
+            coded = render(image, defocus, bank, "occlusion", border=border, layers="nearest", method="tiled")
             self.assert_close(coded, expected, rtol=0, atol=1e-9)
 
     # Gradients
 
-    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("method", [SMALL_TILES, "dense"], ids=["tiled", "dense"])
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_gradcheck(self, method, border, device):
         bank = make_bank(3, 2, 3, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 9, 15)
@@ -324,58 +307,51 @@ class TestTiledOcclusion(RenderTester):
         defocus = middles[torch.stack([y + x, 2 * y + x]) % 4][:, None]
 
         def function(image, defocus, psfs, veil):
-            return render(image, defocus, Bank(psfs, bank.defocus, veil), "occlusion", border=border, method=method)
+            return render_by(method, image, defocus, Bank(psfs, bank.defocus, veil), "occlusion", border=border)
 
         self.gradcheck(function, (image, defocus, bank.psfs, bank.veil))
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", ["reflect", "zero", "valid"])
     @pytest.mark.parametrize("maps", [1, 2])
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_gradients_equal_those_of_the_dense_render(self, layers, border, maps, device, dtype):
         bank = make_bank(5, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 31, 46)
         defocus = steps(bank, 31, 46, 15).expand(maps, -1, -1, -1) + 0.5
         atol = 2e-5 if dtype == torch.float32 else 1e-10
-        self.assert_gradients_equal_dense(image, defocus, bank, "occlusion", atol, layers=layers, border=border)
+        options = {"layers": layers, "border": border}
+        self.assert_gradients_equal_dense(SMALL_TILES, image, defocus, bank, "occlusion", atol, **options)
 
     @pytest.mark.parametrize("kind", ["an odd number of tiles of one layer", "depths on the nodes"])
-    @pytest.mark.usefixtures("small_tiles")
-    def test_feature_gradients_of_hard_scenes_equal_those_of_the_dense_render(self, kind, device, monkeypatch):
-        monkeypatch.setattr(occlusion_tile_plan, "SIZES", (12,))  # 8 x 8 pixels a tile: 3 tiles
+    def test_feature_gradients_of_hard_scenes_equal_those_of_the_dense_render(self, kind, device):
+        tiles = TiledBackend(windows=replace(SMALL_TILES.windows, sizes=(12,)))  # 8 x 8 pixels a tile: 3 tiles
         bank = make_bank(4, 1, 5, device=device)
         image, _ = make_scene(bank, 1, 8, 24)
         odd = kind.startswith("an odd")
         defocus = bank.defocus[1].expand(1, 1, 8, 24) if odd else steps(bank, 8, 24, 5)
-        slopes = []
-        for method in METHODS:
+        gradients = []
+        for method in (tiles, "dense"):
             inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs)]
             scene = Bank(inputs[2], bank.defocus)
-            coded = render(*inputs[:2], scene, "occlusion", layers="nearest" if odd else "linear", method=method)
+            coded = render_by(method, *inputs[:2], scene, "occlusion", layers="nearest" if odd else "linear")
             wanted = [inputs[0], inputs[2]] if odd else inputs
-            slopes.append(torch.autograd.grad(coded.square().sum(), wanted))
-        for slope, expected in zip(*slopes, strict=True):
+            gradients.append(torch.autograd.grad(coded.square().sum(), wanted))
+        for gradient, expected in zip(*gradients, strict=True):
             self.assert_close(
-                slope, expected, rtol=0, atol=1e-6 * float(expected.abs().max())
-            )  # slopes reach 1 / epsilon
+                gradient, expected, rtol=0, atol=1e-6 * float(expected.abs().max())
+            )  # gradients reach 1 / epsilon
 
     @pytest.mark.parametrize("wanted", range(4))
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_each_gradient_can_be_had_alone(self, wanted, device):
         bank = make_bank(4, 1, 5, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 31, 46)
         inputs = [image, steps(bank, 31, 46, 20) + 0.5, bank.psfs, bank.veil]
         inputs[wanted] = inputs[wanted].clone().requires_grad_()
-        slopes = [
-            torch.autograd.grad(
-                render(*inputs[:2], Bank(inputs[2], bank.defocus, inputs[3]), "occlusion", method=method)
-                .square()
-                .sum(),
-                inputs[wanted],
-            )[0]
-            for method in ("tiled", "dense")
-        ]
-        self.assert_close(*slopes, rtol=1e-9, atol=1e-11)
+        gradients = []
+        for method in (SMALL_TILES, "dense"):
+            coded = render_by(method, *inputs[:2], Bank(inputs[2], bank.defocus, inputs[3]), "occlusion")
+            gradients.append(torch.autograd.grad(coded.square().sum(), inputs[wanted])[0])
+        self.assert_close(*gradients, rtol=1e-9, atol=1e-11)
 
     def test_feature_second_gradients_are_those_of_the_dense_render(self, device):
         bank = make_bank(2, 1, 3, device=device)
@@ -384,8 +360,8 @@ class TestTiledOcclusion(RenderTester):
         for method in ("dense", "tiled"):
             psfs = bank.psfs.clone().requires_grad_()
             coded = render(image, defocus, Bank(psfs, bank.defocus), "occlusion", method=method)
-            slope = torch.autograd.grad(coded.square().sum(), psfs, create_graph=True)[0].square().sum()
-            found.append(torch.autograd.grad(slope, psfs)[0])
+            gradient = torch.autograd.grad(coded.square().sum(), psfs, create_graph=True)[0].square().sum()
+            found.append(torch.autograd.grad(gradient, psfs)[0])
         self.assert_close(found[1], found[0], rtol=1e-4, atol=1e-4 * float(found[0].abs().max()))
 
     # Memory, numeric types and the plan
@@ -397,29 +373,26 @@ class TestTiledOcclusion(RenderTester):
         image = torch.rand(1, 1, 128, 128, device=device).requires_grad_()
         defocus = torch.empty(1, 1, 128, 128, device=device).uniform_(-20, 20).requires_grad_()
         largest = LargestTensor()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(occlusion_tile_plan.CHUNK_BYTES, "cpu", 200_000)
-            patch.setattr(occlusion_tile_plan, "CHUNK_BYTES_ACCELERATOR", 200_000)
-            with largest:
-                render(image, defocus, bank, "occlusion").sum().backward()
+        windows = replace(WINDOWS, chunk_bytes=200_000, accelerator_bytes=200_000)
+        with largest:
+            render_by(TiledBackend(windows=windows), image, defocus, bank, "occlusion").sum().backward()
         assert largest.bytes < 1_600_000  # two tiles of 20 layers at least; the planes of all layers are 5 MB and more
 
     @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_half_is_the_dense_render_to_its_last_place(self, half, device):
         bank = make_bank(6, 3, 7, dtype=torch.float32, device=device, light=0.8, veil=True).to(half)
         image, defocus = make_scene(make_bank(6, 3, 7, dtype=torch.float32, device=device), 2, 44, 37)
-        coded = render(image.to(half), defocus, bank, "occlusion")
+        coded = render_by(SMALL_TILES, image.to(half), defocus, bank, "occlusion")
         expected = render(image.to(half), defocus, bank, "occlusion", method="dense")
         assert coded.dtype == half
         self.assert_close(coded, expected, rtol=torch.finfo(half).eps, atol=1e-6)
 
     @pytest.mark.parametrize("dark", [False, True])
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_the_plan_holds_each_tile_once_with_the_layers_of_its_window(self, dark, device):
         lower = torch.zeros(2, 41, 55, dtype=torch.int64, device=device)  # 37 x 51 pixels and a PSF of 5
         lower[0, 20:, 30:], lower[1, :, :9], lower[1, 3, 40] = 2, 5, 4
-        plan = make_plan(lower, None, (37, 51), (6, 1, 5), sloped=False, dark=dark)
+        labels, windows = Labels(lower, None), SMALL_TILES.windows
+        plan = plan_windows(labels, 6, 1, choose_grid(labels, 6, 5, windows), windows, dark=dark)
         size, seen = plan.grid.size, []
         for chunk in plan.chunks:
             for place, (image, y, x) in enumerate(chunk.corners):
@@ -437,6 +410,6 @@ class TestTiledOcclusion(RenderTester):
         sides = []
         for layers in (1, 100):
             x = torch.arange(622, device=device) * layers // 622
-            sides.append(choose_grid([x.expand(1, 522, 622)], (500, 600), 100, 23).size)
+            sides.append(choose_grid(Labels(x.expand(1, 522, 622), None), 100, 23, WINDOWS).size)
         assert sides[0] > sides[1]
         assert all(side - 23 + 1 >= 23 - 1 for side in sides)

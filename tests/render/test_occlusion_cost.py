@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from kornia_tidy.render.backends.occlusion_tile_plan import choose_grid, make_plan
+from kornia_tidy.render.backends.tile_plan import WINDOWS, choose_grid
+from kornia_tidy.render.backends.window_plan import plan_windows
 from kornia_tidy.render.cost_model import label_pixels
 from kornia_tidy.render.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
 from tests.base import BaseTester
@@ -25,7 +26,8 @@ class TestCost(BaseTester):
         """Against the plan that the renderer makes, where every pixel is looked at."""
         labels = label_pixels(ramp(330, 430), 1, NODES, mode)
         counted = count_windows(labels, len(NODES), 31)
-        plan = make_plan(labels.lower, labels.fraction, (300, 400), (len(NODES), 3, 31), sloped=False, dark=False)
+        grid = choose_grid(labels, len(NODES), 31, WINDOWS)
+        plan = plan_windows(labels, len(NODES), 3, grid, WINDOWS, dark=False)
         held = torch.cat([chunk.layers.new_full((len(chunk.layers),), chunk.layers.shape[1]) for chunk in plan.chunks])
         assert counted.size == plan.grid.size
         assert 0.8 < counted.held.sum() / held.sum() <= 1
@@ -34,8 +36,8 @@ class TestCost(BaseTester):
 
     def test_feature_wide_psfs_do_not_get_windows_beyond_the_cache(self):
         """A flat scene has one layer whatever the tiles; where there are many, small windows are cheaper a sample."""
-        many = label_pixels(ramp(200, 200), 1, NODES, "nearest").terms()
-        assert choose_grid(many, (200, 200), len(NODES), 65).size == 144
+        many = label_pixels(ramp(264, 264), 1, NODES, "nearest")  # an image of 200 x 200 pixels, padded
+        assert choose_grid(many, len(NODES), 65, WINDOWS).size == 144
 
     def test_feature_time_grows_with_channels_and_with_layers(self):
         few, many = (Windows(64, torch.full((40,), number), 21, 2**16) for number in (2, 4))

@@ -72,7 +72,7 @@ class DirectBackend:
             grid = choose_grid(labels, layers, scene.psf_size, WINDOWS)
             return occlusion_gradients(occlusion_planes(scene), labels, grid, WINDOWS, gradient)
         tensors = scene.plane, scene.psfs, scene.batch_weight
-        plane, psfs, index, weight = scene.plane.detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
+        plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
         if wants_gradient(tensors[0]):
             plan = plan_blocks(labels, layers, choose_grid(labels, layers, scene.psf_size), BLOCKS)

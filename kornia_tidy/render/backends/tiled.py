@@ -53,8 +53,9 @@ class TiledBackend:
 
     def seconds(self, scene: LayeredScene) -> float:
         """Return the estimated time with the best tiles for the scene."""
-        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, self._kind(scene))
-        scene.found[self.name] = grid
+        kind = self._kind(scene)
+        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, kind)
+        scene.found[kind] = grid
         if scene.compositing != "occlusion":
             cost += tile_cost(grid.size, 0, scene.sampled_layers)  # the spectra of the PSFs
         return _seconds(scene, cost)
@@ -68,7 +69,7 @@ class TiledBackend:
         """Return the rendered light."""
         keep_memory()
         labels, layers, kind = scene.labels, len(scene.psfs), self._kind(scene)
-        grid = scene.found.get(self.name) or choose_grid(labels, layers, scene.psf_size, kind)
+        grid = scene.found.get(kind) or choose_grid(labels, layers, scene.psf_size, kind)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
         plan = plan_blocks(labels, layers, grid, kind)

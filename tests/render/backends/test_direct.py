@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.kernels import gather_ops
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends import tiled
 from kornia_tidy.render.backends.direct import (
     SOURCE,
-    STRIP_ROWS,
-    can_go_directly,
     count_pairs,
     direct_cost,
-    goes_directly,
-    mix_directly,
 )
-from kornia_tidy.render.backends.tile_plan import Labels
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
+from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
+from kornia_tidy.render.layers import Labels
+from kornia_tidy.render.scene import LayeredScene, layered_scene
 from tests.base import BaseTester
 from tests.render.backends.test_tiled import ATOL, KINDS, depth_map
 from tests.render.render_tester import RenderTester
@@ -33,46 +34,21 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(autouse=True, scope="module")
-def directly():
-    """Wherever it is possible, also where transforms are faster; a test that comes this way without it must fail."""
-    ways = []
-
-    def possible(labels, layers, side, dtype):
-        ways.append(can_go_directly(labels, dtype))
-        return ways[-1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiled, "goes_directly", possible)
-        yield ways
-
-
-@pytest.fixture
-def all_direct(directly):
-    """Nothing in this test goes by transforms."""
-    directly.clear()
-    yield
-    assert directly
-    assert all(directly)
-
-
 class TestDirectRender(RenderTester):
     @pytest.fixture
     def device(self):
         """Direct convolution is for processors."""
         return torch.device("cpu")
 
-    @pytest.mark.usefixtures("all_direct")
     def test_smoke_a_scene_of_many_blocks(self, device, dtype):
         bank = make_bank(6, 3, 9, dtype=dtype, device=device)
         image, defocus = make_scene(bank, 2, 50, 130)
-        coded = render(image, defocus, bank)
+        coded = render(image, defocus, bank, method="direct")
         assert coded.shape == image.shape
         assert coded.dtype == dtype
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("all_direct")
     def test_feature_equals_the_dense_render(self, layers, border, device, dtype):
         """All ways to end a column of a PSF, and blocks that overlap or just fit."""
         for batch, channels, size, height, width in (
@@ -86,16 +62,15 @@ class TestDirectRender(RenderTester):
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
-            self.assert_equals_dense(image, defocus, bank, "gather", ATOL[dtype], **options)
+            self.assert_equals_dense("direct", image, defocus, bank, "gather", ATOL[dtype], **options)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.usefixtures("all_direct")
     def test_feature_equals_the_dense_render_of_hard_scenes(self, layers, kind, device, dtype):
         bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 37, 51)
         defocus = depth_map(kind, bank, 37, 51)
-        self.assert_equals_dense(image, defocus, bank, "gather", ATOL[dtype], layers=layers)
+        self.assert_equals_dense("direct", image, defocus, bank, "gather", ATOL[dtype], layers=layers)
 
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
@@ -104,36 +79,34 @@ class TestDirectRender(RenderTester):
         torch.manual_seed(draw(st.integers(0, 99)))
         dtype = draw(st.sampled_from([torch.float32, torch.float64]))
         radius, border = draw(st.integers(0, 9)), draw(st.sampled_from(BORDERS))
-        height, width = draw(st.integers(19, 60)), draw(st.integers(19, 120))
+        lost = 2 * radius if border == "valid" else 0
+        height, width = draw(st.integers(10, 60)) + lost, draw(st.integers(32, 120)) + lost
         bank = make_bank(draw(st.integers(1, 6)), draw(st.sampled_from([1, 3])), 2 * radius + 1, dtype=dtype)
         image, defocus = make_scene(bank, draw(st.integers(1, 3)), height, width)
         options = {"layers": draw(st.sampled_from(["nearest", "linear"])), "border": border}
-        self.assert_equals_dense(image, defocus, bank, "gather", ATOL[dtype], **options)
+        self.assert_equals_dense("direct", image, defocus, bank, "gather", ATOL[dtype], **options)
 
-    @pytest.mark.usefixtures("all_direct")
     def test_feature_equals_the_sum_over_pixels(self, device):
         bank = make_bank(4, 1, 5, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, 1, 12, 29)
         expected = brute_render(image, defocus, bank, compositing="gather", layers="linear", border="reflect")
-        self.assert_close(render(image, defocus, bank), expected, rtol=0, atol=1e-14)
+        self.assert_close(render(image, defocus, bank, method="direct"), expected, rtol=0, atol=1e-14)
 
-    @pytest.mark.usefixtures("all_direct")
     def test_feature_rows_of_any_stride(self, device):
         """Images and maps that lie in memory otherwise than row by row, and maps that are shared by a batch."""
         bank = make_bank(4, 3, 5, device=device)
         image, defocus = make_scene(bank, 2, 24, 40)
-        expected = render(image, defocus[:1], bank)
+        expected = render(image, defocus[:1], bank, method="direct")
         image = image.to(memory_format=torch.channels_last)
         defocus = defocus.transpose(-2, -1).contiguous().transpose(-2, -1)
         options = {"layers": "linear", "border": "valid"}
-        self.assert_close(render(image, defocus[:1], bank), expected, rtol=0, atol=1e-14)
+        self.assert_close(render(image, defocus[:1], bank, method="direct"), expected, rtol=0, atol=1e-14)
         dense = render(image, defocus, bank, method="dense", **options)
-        self.assert_close(render(image, defocus, bank, **options), dense, rtol=0, atol=1e-13)
+        self.assert_close(render(image, defocus, bank, method="direct", **options), dense, rtol=0, atol=1e-13)
 
     # Gradients
 
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("all_direct")
     def test_gradcheck(self, border, device):
         bank = make_bank(3, 2, 5, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 9, 23)
@@ -141,31 +114,29 @@ class TestDirectRender(RenderTester):
         defocus = middles[torch.randint(4, (2, 1, 9, 23), device=device)]
 
         def function(image, defocus, psfs, veil):
-            return render(image, defocus, Bank(psfs, bank.defocus, veil), border=border)
+            return render(image, defocus, Bank(psfs, bank.defocus, veil), border=border, method="direct")
 
         self.gradcheck(function, (image, defocus, bank.psfs, bank.veil))
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", ["reflect", "valid"])
     @pytest.mark.parametrize("size", [3, 5, 9])  # both remainders of rows taken four at a time
-    @pytest.mark.usefixtures("all_direct")
     def test_feature_gradients_equal_those_of_the_dense_render(self, layers, border, size, device, dtype):
         bank = make_bank(5, 2, size, dtype=dtype, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, 2, 151, 51)
         atol = 2e-5 if dtype == torch.float32 else 1e-12
-        self.assert_gradients_equal_dense(image, defocus, bank, "gather", atol, layers=layers, border=border)
+        self.assert_gradients_equal_dense("direct", image, defocus, bank, "gather", atol, layers=layers, border=border)
 
-    @pytest.mark.usefixtures("all_direct")
     def test_feature_gradients_on_nodes_are_those_of_the_interval_above(self, device):
         bank = make_bank(4, 1, 5, device=device)
         image, _ = make_scene(bank, 1, 12, 20)
-        slopes = []
-        for method in ("dense", "tiled"):
+        gradients = []
+        for method in ("dense", "direct"):
             defocus = depth_map("checkerboard of all layers", bank, 12, 20).requires_grad_()
             render(image, defocus, bank, method=method).square().sum().backward()
-            slopes.append(defocus.grad)
-        assert slopes[0].abs().max() > 0
-        self.assert_close(*slopes, rtol=1e-10, atol=1e-12)
+            gradients.append(defocus.grad)
+        assert gradients[0].abs().max() > 0
+        self.assert_close(*gradients, rtol=1e-10, atol=1e-12)
 
     def test_feature_equal_on_any_number_of_threads(self, device):
         """Captures to the last bit; gradients of PSFs are summed in as many parts as there are threads."""
@@ -176,38 +147,29 @@ class TestDirectRender(RenderTester):
             for count in (1, 2, 5):
                 torch.set_num_threads(count)
                 psfs = bank.psfs.clone().requires_grad_()
-                coded = render(image, defocus, Bank(psfs, bank.defocus), layers="nearest")
+                coded = render(image, defocus, Bank(psfs, bank.defocus), layers="nearest", method="direct")
                 coded.square().sum().backward()
                 results.append((coded.detach(), psfs.grad))
         finally:
             torch.set_num_threads(threads)
-        for coded, slope in results[1:]:
+        for coded, gradient in results[1:]:
             assert torch.equal(coded, results[0][0])
-            self.assert_close(slope, results[0][1], rtol=1e-5, atol=1e-5)
+            self.assert_close(gradient, results[0][1], rtol=1e-5, atol=1e-5)
 
     def test_feature_light_too_dim_for_normal_numbers_stays(self, device):
         """A library built for speed alone would turn denormal numbers off, for the whole process."""
         bank = make_bank(2, 1, 5, dtype=torch.float32, device=device)
         image, defocus = make_scene(bank, 1, 16, 40)
-        dim = render(image * 1e-39, defocus, bank, layers="nearest")
-        self.assert_close(1e39 * dim.double(), render(image, defocus, bank, layers="nearest"), rtol=0, atol=1e-4)
+        options = {"layers": "nearest", "method": "direct"}
+        dim = render(image * 1e-39, defocus, bank, **options)
+        self.assert_close(1e39 * dim.double(), render(image, defocus, bank, **options), rtol=0, atol=1e-4)
         assert torch.tensor(1e-39) * 0.5 > 0
-
-    @pytest.mark.parametrize("layer", [-(2**63), -1, 3, 2**40])
-    @pytest.mark.parametrize("shared", [False, True])
-    def test_exception_pixels_in_no_layer(self, layer, shared):
-        """What a depth that is not a number may come to."""
-        lower = torch.zeros(1, 9, 70, dtype=torch.int64)
-        lower[0, 8, 69] = layer
-        labels = Labels(lower, torch.full((1, 9, 70), 0.5) if shared else None)
-        with pytest.raises(IndexError, match="a pixel lies in none of the 3 layers"):
-            mix_directly(torch.rand(1, 1, 13, 74), torch.rand(3, 1, 5, 5), labels)
 
 
 class TestChoice(BaseTester):
     def test_feature_pairs_are_the_layers_that_strips_contain(self):
         """Counted pixel by pixel; 4 rows of strips, so that every fourth of them is the first."""
-        lower = torch.randint(5, (1, 4, 1, 64)).expand(1, 4, STRIP_ROWS, 64).reshape(1, 16, 64)
+        lower = torch.randint(5, (1, 4, 1, 64)).expand(1, 4, gather_ops.STRIP_ROWS, 64).reshape(1, 16, 64)
         lower[:, 4:] = lower[:, :4].repeat(1, 3, 1)
         expected = 4 * sum(len(strip.unique()) for strip in lower[0, :4].split(16, dim=1))
         assert count_pairs(Labels(lower, None), torch.float32) == expected
@@ -221,22 +183,51 @@ class TestChoice(BaseTester):
         assert count_pairs(Labels(lower, share), torch.float32) == expected
 
     def test_feature_small_psfs_go_directly_and_large_ones_by_transforms(self):
-        labels = Labels(torch.arange(400)[:, None].expand(1, 400, 600) // 50, None)
-        sides = [side for side in range(1, 131, 2) if goes_directly(labels, 8, side, torch.float32)]
-        assert sides[0] == 1
-        assert 15 < sides[-1] < 100
-        assert sides == list(range(1, sides[-1] + 1, 2))
+        psi = torch.arange(8.0)[torch.arange(400) // 50][:, None].expand(1, 1, 400, 600)
+        image, sides = torch.rand(1, 1, 400, 600), range(1, 131, 6)
+        psfs = {side: torch.rand(8, 1, side, side) for side in sides}
+        direct = [side for side in sides if choose(layered_scene(image, psi, torch.arange(8.0), psfs[side])).name == "direct"]
+        assert direct[0] == 1
+        assert 13 < direct[-1] < 100
+        assert direct == list(range(1, direct[-1] + 1, 6))
 
-    def test_feature_what_cannot_go_directly(self, monkeypatch):
-        """Half precision, planes that are smaller than a block, other devices, and machines without a compiler."""
-        labels = Labels(torch.zeros(1, 8, 64, dtype=torch.int64), None)
-        assert can_go_directly(labels, torch.float32)
-        assert not can_go_directly(labels, torch.float16)
-        assert not can_go_directly(Labels(labels.lower.to("meta"), None), torch.float32)
-        for height, width in ((3, 64), (8, 31)):
-            assert not can_go_directly(Labels(labels.lower[:, :height, :width], None), torch.float32)
-        monkeypatch.setattr("kornia_tidy.render.backends.direct.compiled", lambda source, dtype: None)
-        assert not can_go_directly(labels, torch.float32)
+    @pytest.mark.parametrize(
+        ("size", "where", "compositing", "message"),
+        [
+            ((3, 64), "cpu", "gather", "needs an output of at least 4x32 pixels, got 3x64"),
+            ((8, 31), "cpu", "gather", "needs an output of at least 4x32 pixels, got 8x31"),
+            ((8, 64), "meta", "gather", "runs on processors, and the image is on 'meta'"),
+            ((8, 64), "cpu", "scatter", "gathers light and does not scatter it"),
+        ],
+    )
+    def test_exception_names_why_a_scene_is_refused(self, size, where, compositing, message):
+        scene = LayeredScene(
+            torch.zeros(1, 1, *size, device=where),
+            torch.zeros(1, 1, *size, device=where, dtype=torch.int64),
+            None,
+            torch.zeros(1, 1, 3, 3, device=where),
+            None,
+            "reflect",
+            compositing,
+        )
+        assert message in (refusal(BACKENDS["direct"], scene) or "")
+        with pytest.raises(ValueError, match=f"method 'direct' does not support this scene: .*{message}"):
+            choose(scene, "direct")
+
+    def test_feature_without_a_compiler_it_is_refused(self, tmp_path):
+        """In a process of its own, whose compiler does nothing."""
+        code = (
+            "import torch, warnings; warnings.simplefilter('ignore')\n"
+            "from kornia_tidy.render.dispatch import explain\n"
+            "from kornia_tidy.render.scene import layered_scene\n"
+            "for compositing in ('gather', 'occlusion'):\n"
+            "    scene = layered_scene(torch.rand(1, 1, 40, 40), torch.zeros(1, 1, 40, 40), torch.zeros(1),\n"
+            "                          torch.rand(1, 1, 3, 3), compositing=compositing)\n"
+            "    print(explain(scene).objections['direct'])\n"
+        )
+        environment = {**os.environ, "CC": "false", "XDG_CACHE_HOME": str(tmp_path)}
+        run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        assert run.stdout.count("direct convolution needs a C compiler") == 2
 
     def test_feature_cost_grows_with_pairs_and_samples(self):
         assert direct_cost(200, 23) == pytest.approx(2 * direct_cost(100, 23))

@@ -8,11 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends import tiled_occlusion
-from kornia_tidy.render.backends.direct_occlusion import SOURCE, can_go_directly, goes_directly, occlude_directly
+from kornia_tidy.kernels.occlusion_ops import occlusion_direct
+from kornia_tidy.render.backends.direct_occlusion import SOURCE, can_go_directly
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
+from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.layers import assign_layers
+from kornia_tidy.render.scene import layered_scene
 from tests.render.render_tester import RenderTester
 from tests.render.scenes import Bank, make_bank, make_scene
 
@@ -25,21 +27,6 @@ needs_compiler = pytest.mark.skipif(compiled(SOURCE, torch.float32) is None, rea
 def _on_a_processor(device):
     if torch.device(device).type != "cpu":
         pytest.skip("direct convolution is for processors")
-
-
-@pytest.fixture
-def directly(monkeypatch):
-    """Whatever can go directly does; the calls that did not are counted."""
-    ways = []
-
-    def goes(plane, psfs, *_):
-        ways.append(can_go_directly(plane, psfs))
-        return ways[-1]
-
-    monkeypatch.setattr(tiled_occlusion, "goes_directly", goes)
-    yield
-    assert ways, "no scene was rendered"
-    assert all(ways), "a scene went by tiles"
 
 
 def label_map(kind: str, bank: Bank, height: int, width: int) -> torch.Tensor:
@@ -68,7 +55,6 @@ KINDS = ("one layer", "checkerboard", "ramp", "steep ramp", "squares", "speck", 
 class TestDirectOcclusion(RenderTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("directly")
     def test_feature_equals_the_dense_render(self, layers, border, device, dtype):
         for batch, channels, size, height, width in (
             (2, 3, 7, 31, 46),
@@ -80,18 +66,17 @@ class TestDirectOcclusion(RenderTester):
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
             for psi in (defocus, defocus[:1], label_map("squares", bank, height, width)):
-                self.assert_equals_dense(image, psi, bank, "occlusion", ATOL[dtype], **options)
+                self.assert_equals_dense("direct", image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", ["reflect", "zero"])
     @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.usefixtures("directly")
     def test_feature_equals_the_dense_render_however_labels_lie(self, layers, border, kind, device, dtype):
         bank = make_bank(6, 2, 11, dtype=dtype, device=device)
         image, _ = make_scene(bank, 1, 45, 83)
         psi = label_map(kind, bank, 45, 83)
         options = {"layers": layers, "border": border}
-        self.assert_equals_dense(image, psi, bank, "occlusion", ATOL[dtype], **options)
+        self.assert_equals_dense("direct", image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
@@ -106,12 +91,9 @@ class TestDirectOcclusion(RenderTester):
         psi = label_map(draw(st.sampled_from(KINDS)), bank, height, width)
         options = {"layers": draw(st.sampled_from(["nearest", "linear"])), "border": border}
         expected = render(image, psi, bank, "occlusion", method="dense", **options)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(tiled_occlusion, "goes_directly", lambda plane, psfs, *_: can_go_directly(plane, psfs))
-            coded = render(image, psi, bank, "occlusion", **options)
+        coded = render(image, psi, bank, "occlusion", method="direct", **options)
         self.assert_close(coded, expected, rtol=0, atol=1e-11)
 
-    @pytest.mark.usefixtures("directly")
     def test_feature_float32_is_float64_where_divisors_vanish(self, device):
         """PSFs with tails of 1e-9, by which layers are hardly seen."""
         psfs = torch.rand(6, 1, 15, 15, device=device, dtype=torch.float64) ** 12
@@ -122,11 +104,10 @@ class TestDirectOcclusion(RenderTester):
             defocus = label_map(kind, bank, 70, 80).float()
             for layers in ("nearest", "linear"):
                 expected = render(image, defocus.double(), bank, "occlusion", layers=layers, method="dense")
-                coded = render(image.float(), defocus, single, "occlusion", layers=layers)
+                coded = render(image.float(), defocus, single, "occlusion", layers=layers, method="direct")
                 self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
-    @pytest.mark.usefixtures("directly")
     def test_feature_threads_change_nothing(self, layers, device, dtype):
         bank = make_bank(6, 3, 9, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 91, 77)
@@ -135,32 +116,31 @@ class TestDirectOcclusion(RenderTester):
         try:
             for threads in (1, 2, 3):
                 torch.set_num_threads(threads)
-                coded.append(render(image, psi, bank, "occlusion", layers=layers))
+                coded.append(render(image, psi, bank, "occlusion", layers=layers, method="direct"))
         finally:
             torch.set_num_threads(before)
         assert torch.equal(coded[0], coded[1])
         assert torch.equal(coded[0], coded[2])
 
-    @pytest.mark.usefixtures("directly")
     def test_feature_absent_layers_are_not_looked_at(self, device, dtype):
         bank = make_bank(6, 1, 7, dtype=dtype, device=device)
         image, _ = make_scene(bank, 1, 20, 70)
         defocus = torch.full((1, 1, 20, 70), -7.0, device=device, dtype=dtype)  # between nodes 1 and 2
         defocus[..., 40:] = bank.defocus[1]
-        expected = render(image, defocus, bank, "occlusion")
+        expected = render(image, defocus, bank, "occlusion", method="direct")
         bank.psfs[[0, 3, 4, 5]] = float("nan")
-        assert torch.equal(render(image, defocus, bank, "occlusion"), expected)
+        assert torch.equal(render(image, defocus, bank, "occlusion", method="direct"), expected)
 
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", ["reflect", "zero", "valid"])
     @pytest.mark.parametrize("maps", [1, 2])
-    @pytest.mark.usefixtures("directly")
     def test_feature_gradients_equal_those_of_the_dense_render(self, layers, border, maps, device, dtype):
         bank = make_bank(5, 2, 7, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 31, 46)
         defocus = (label_map("squares", bank, 31, 46) + 0.5).expand(maps, -1, -1, -1)
         atol = 2e-5 if dtype == torch.float32 else 1e-10
-        self.assert_gradients_equal_dense(image, defocus, bank, "occlusion", atol, layers=layers, border=border)
+        options = {"layers": layers, "border": border}
+        self.assert_gradients_equal_dense("direct", image, defocus, bank, "occlusion", atol, **options)
 
     # When it is chosen
 
@@ -168,17 +148,27 @@ class TestDirectOcclusion(RenderTester):
         image = torch.rand(1, 3, 200, 240, device=device)
         for side, expected in ((11, True), (101, False)):
             bank = make_bank(6, 3, side, dtype=torch.float32, device=device)
-            lower, _ = assign_layers(torch.zeros(1, 1, 199 + side, 239 + side), bank.defocus, "nearest")
-            plane = torch.nn.functional.pad(image, (side // 2,) * 4)
-            assert goes_directly(plane, bank.psfs, lower[:, 0].float(), None) == expected
+            options = {"layers": "nearest", "compositing": "occlusion"}
+            scene = layered_scene(image, torch.zeros_like(image[:, :1]), bank.defocus, bank.psfs, **options)
+            assert (choose(scene).name == "direct") == expected
 
-    def test_feature_what_it_cannot_do_goes_by_tiles(self, device):
-        plane, psfs = torch.rand(1, 3, 46, 70, device=device), make_bank(size=7, dtype=torch.float32).psfs
-        assert can_go_directly(plane, psfs)
-        assert not can_go_directly(plane[..., :13, :], psfs)
-        assert not can_go_directly(plane[..., :37], psfs)
-        assert not can_go_directly(plane, psfs - 0.001)
-        assert not can_go_directly(plane.half(), psfs.half())
+    @pytest.mark.parametrize(
+        ("size", "below_zero", "message"),
+        [
+            ((7, 64), 0, "needs an output of at least 8x32 pixels, got 7x64"),
+            ((40, 31), 0, "needs an output of at least 8x32 pixels, got 40x31"),
+            ((40, 64), 0.001, "needs PSFs without negative values, got one with -.* of its light below zero"),
+        ],
+    )
+    def test_exception_names_why_a_scene_is_refused(self, size, below_zero, message, device):
+        image, bank = torch.rand(1, 3, *size, device=device), make_bank(size=7, dtype=torch.float32)
+        options = {"compositing": "occlusion", "border": "replicate"}
+        bank.psfs[0] -= below_zero
+        bank.psfs[0, :, 0] -= 5 * below_zero
+        scene = layered_scene(image, torch.zeros_like(image[:, :1]), bank.defocus, bank.psfs, **options)
+        with pytest.raises(ValueError, match=f"method 'direct' does not support this scene: .*{message}"):
+            choose(scene, "direct")
+        assert choose(scene).name != "direct"
 
     def test_feature_psfs_a_little_below_zero_change_nothing(self, device):
         """As interpolation and round-off leave them."""
@@ -191,7 +181,7 @@ class TestDirectOcclusion(RenderTester):
         lower, _ = assign_layers(defocus, bank.defocus, "nearest")
         planes = [torch.nn.functional.pad(x.float(), (5,) * 4, mode="reflect") for x in (image, lower)]
         assert can_go_directly(planes[0], psfs.float())
-        coded = occlude_directly(planes[0], psfs.float(), planes[1][:, 0], None, None, None, None)
+        coded = occlusion_direct(planes[0], psfs.float(), planes[1][:, 0], None, None, None, None)
         self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)
 
     @pytest.mark.parametrize("layer", [-(2.0**63), -1.0, 3.0, float("nan")])
@@ -204,6 +194,6 @@ class TestDirectOcclusion(RenderTester):
         light, psfs = torch.rand(1, 1, 40, 60, device=device), torch.rand(3, 1, 7, 7, device=device)
         inside = torch.ones(1, 40, 60, device=device)
         inside[0, 20, 30] = 0
-        coded = occlude_directly(light, psfs, lower, fraction, None, None, None)
-        expected = occlude_directly(light, psfs, torch.ones_like(lower), fraction, None, None, inside)
+        coded = occlusion_direct(light, psfs, lower, fraction, None, None, None)
+        expected = occlusion_direct(light, psfs, torch.ones_like(lower), fraction, None, None, inside)
         self.assert_close(coded, expected, rtol=0, atol=1e-6)

@@ -2,38 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kornia_tidy.render.backends import tile_plan, tiled
-from kornia_tidy.render.backends.tile_plan import Labels, choose_grid, make_plan
+from kornia_tidy.render.backends.block_plan import plan_blocks
+from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
+from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
+from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
+from kornia_tidy.render.layers import Labels
+from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
-from tests.render.render_tester import RenderTester
+from tests.render.render_tester import SMALL_TILES, RenderTester, render_by
 from tests.render.scenes import Bank, brute_render, make_bank, make_scene
 
 COMPOSITINGS = ("gather", "scatter")
 ATOL = {torch.float32: 2e-6, torch.float64: 1e-12}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def by_transforms():
-    """Not directly, which these PSFs would be; see test_direct.py for that."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiled, "goes_directly", lambda *_: False)
-        yield
-
-
-@pytest.fixture
-def small_tiles(monkeypatch):
-    """Tiles so small, and chunks of so few pairs, that a small scene has many of both."""
-    monkeypatch.setattr(tile_plan, "SIZES", (8, 12, 16))
-    monkeypatch.setitem(tile_plan.CHUNK_BYTES, "cpu", 40_000)
-    monkeypatch.setattr(tile_plan, "CHUNK_BYTES_ACCELERATOR", 40_000)
 
 
 def depth_map(kind, bank, height, width):
@@ -67,7 +57,7 @@ class TestTiledRender(RenderTester):
     def test_smoke_a_scene_of_many_tiles(self, compositing, device, dtype):
         bank = make_bank(6, 3, 9, dtype=dtype, device=device)
         image, defocus = make_scene(bank, 2, 150, 230)
-        coded = render(image, defocus, bank, compositing)
+        coded = render(image, defocus, bank, compositing, method="tiled")
         assert coded.shape == image.shape
         assert coded.dtype == dtype
 
@@ -76,23 +66,21 @@ class TestTiledRender(RenderTester):
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_equals_the_dense_render(self, compositing, layers, border, device, dtype):
         for batch, channels, size, height, width in ((2, 3, 5, 31, 46), (1, 1, 7, 64, 33), (3, 2, 1, 17, 40)):
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
-            self.assert_equals_dense(image, defocus, bank, compositing, ATOL[dtype], **options)
+            self.assert_equals_dense(SMALL_TILES, image, defocus, bank, compositing, ATOL[dtype], **options)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_equals_the_dense_render_of_hard_scenes(self, compositing, layers, kind, device, dtype):
         bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 37, 51)
         defocus = depth_map(kind, bank, 37, 51)
-        self.assert_equals_dense(image, defocus, bank, compositing, ATOL[dtype], layers=layers)
+        self.assert_equals_dense(SMALL_TILES, image, defocus, bank, compositing, ATOL[dtype], layers=layers)
 
     @given(data=st.data())
     @settings(max_examples=60, deadline=None)
@@ -110,7 +98,7 @@ class TestTiledRender(RenderTester):
             defocus = defocus[:1] if kind == "one for all" else depth_map(kind, bank, height, width)
         compositing, layers = draw(st.sampled_from(COMPOSITINGS)), draw(st.sampled_from(["nearest", "linear"]))
         expected = render(image, defocus, bank, compositing, layers=layers, border=border, method="dense")
-        coded = render(image, defocus, bank, compositing, layers=layers, border=border)
+        coded = render(image, defocus, bank, compositing, layers=layers, border=border, method="tiled")
         self.assert_close(coded, expected, rtol=0, atol=1e-12)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
@@ -120,25 +108,24 @@ class TestTiledRender(RenderTester):
             bank = make_bank(3, 1, size, device=device)
             image, defocus = make_scene(bank, 2, height, width)
             expected = render(image, defocus, bank, compositing, border=border, method="dense")
-            coded = render(image, defocus, bank, compositing, border=border)
+            coded = render(image, defocus, bank, compositing, border=border, method="tiled")
             self.assert_close(coded, expected, rtol=0, atol=1e-12)
 
     # Equal to sums over pixels, which share no code with either renderer
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_equals_the_sum_over_pixels(self, compositing, border, device):
         bank = make_bank(4, 1, 3, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, 1, 20, 29)  # several blocks of 6 x 12 pixels
         expected = brute_render(image, defocus, bank, compositing=compositing, layers="linear", border=border)
-        self.assert_close(render(image, defocus, bank, compositing, border=border), expected, rtol=0, atol=1e-14)
+        coded = render_by(SMALL_TILES, image, defocus, bank, compositing, border=border)
+        self.assert_close(coded, expected, rtol=0, atol=1e-14)
 
     # Gradients
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_gradcheck(self, compositing, border, device):
         bank = make_bank(3, 2, 3, device=device, light=0.8, veil=True)
         image, _ = make_scene(bank, 2, 9, 15)
@@ -146,7 +133,8 @@ class TestTiledRender(RenderTester):
         defocus = middles[torch.randint(4, (2, 1, 9, 15), device=device)]
 
         def function(image, defocus, psfs, veil):
-            return render(image, defocus, Bank(psfs, bank.defocus, veil), compositing, border=border)
+            scene = Bank(psfs, bank.defocus, veil)
+            return render_by(SMALL_TILES, image, defocus, scene, compositing, border=border)
 
         self.gradcheck(function, (image, defocus, bank.psfs, bank.veil))
 
@@ -154,41 +142,43 @@ class TestTiledRender(RenderTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", ["reflect", "valid"])
     @pytest.mark.parametrize("maps", [1, 2])
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_gradients_equal_those_of_the_dense_render(self, compositing, layers, border, maps, device, dtype):
         bank = make_bank(5, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
         image, defocus = make_scene(bank, 2, 31, 46)
         atol = 2e-5 if dtype == torch.float32 else 1e-12
-        self.assert_gradients_equal_dense(image, defocus[:maps], bank, compositing, atol, layers=layers, border=border)
+        options = {"layers": layers, "border": border}
+        self.assert_gradients_equal_dense(SMALL_TILES, image, defocus[:maps], bank, compositing, atol, **options)
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("wanted", range(3))
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_each_gradient_can_be_had_alone(self, compositing, wanted, device):
         bank = make_bank(4, 1, 5, device=device)
         image, defocus = make_scene(bank, 2, 31, 46)
         inputs = [image, defocus, bank.psfs]
         inputs[wanted] = inputs[wanted].clone().requires_grad_()
-        slopes = [
-            torch.autograd.grad(
-                render(*inputs[:2], Bank(inputs[2], bank.defocus), compositing, method=method).square().sum(),
-                inputs[wanted],
-            )[0]
-            for method in ("tiled", "dense")
-        ]
-        self.assert_close(*slopes, rtol=1e-10, atol=1e-12)
+        gradients = []
+        for method in (SMALL_TILES, "dense"):
+            coded = render_by(method, *inputs[:2], Bank(inputs[2], bank.defocus), compositing)
+            gradients.append(torch.autograd.grad(coded.square().sum(), inputs[wanted])[0])
+        self.assert_close(*gradients, rtol=1e-10, atol=1e-12)
 
-    @pytest.mark.parametrize("compositing", COMPOSITINGS)
-    @pytest.mark.usefixtures("small_tiles")
-    def test_feature_products_by_slices_and_of_all_pairs_are_equal(self, compositing, device, monkeypatch):
+    def test_feature_products_by_slices_and_of_all_pairs_are_equal(self, device):
+        """A processor multiplies run by run, an accelerator all pairs of a chunk at once."""
         bank = make_bank(5, 2, 5, device=device)
         image, defocus = make_scene(bank, 2, 31, 46)
+        labels = layered_scene(image, defocus, bank.defocus, bank.psfs).labels
+        plan = plan_blocks(labels, 5, choose_grid(labels, 5, 5, SMALL_TILES.blocks), SMALL_TILES.blocks)
+        plane = torch.nn.functional.pad(image, (2, 2, 2, 2))
         results = []
         for by_slices in (True, False):
-            monkeypatch.setattr(tiled, "_by_slices", lambda _, choice=by_slices: choice)
-            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs)]
-            coded = render(*inputs[:2], Bank(inputs[2], bank.defocus), compositing)
-            results.append((coded, *torch.autograd.grad(coded.square().sum(), inputs)))
+            work = TileWorkspace(replace(plan, by_slices=by_slices), bank.psfs, 4)
+            gradients, found = TileGradients((False, True, False), plane, work), []
+            for chunk, _, c in work.steps():
+                light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+                pairs = work.blur(light, work.spectra[c], chunk)
+                gradients.add_psfs(light, pairs, chunk, c)
+                found += [pairs.clone(), work.sum_layers(pairs.clone(), work.conjugate[c], chunk).clone()]
+            results.append([*found, gradients.of_psfs(bank.psfs, conjugate=False)])
         for one, other in zip(*results, strict=True):
             self.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
@@ -200,8 +190,8 @@ class TestTiledRender(RenderTester):
         for method in ("dense", "tiled"):
             psfs = bank.psfs.clone().requires_grad_()
             coded = render(image, defocus, Bank(psfs, bank.defocus), compositing, method=method)
-            slope = torch.autograd.grad(coded.square().sum(), psfs, create_graph=True)[0].square().sum()
-            found.append(torch.autograd.grad(slope, psfs)[0])
+            second = torch.autograd.grad(coded.square().sum(), psfs, create_graph=True)[0].square().sum()
+            found.append(torch.autograd.grad(second, psfs)[0])
         self.assert_close(found[1], found[0], rtol=1e-4, atol=1e-4 * float(found[0].abs().max()))
 
     # Memory
@@ -223,7 +213,7 @@ class TestTiledRender(RenderTester):
                 return tensor
 
             with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-                coded = render(image, defocus, bank, compositing, layers=layers)
+                coded = render(image, defocus, bank, compositing, layers=layers, method="tiled")
             assert coded.requires_grad
             return sum(size for size, _ in kept.values())
 
@@ -237,32 +227,22 @@ class TestTiledRender(RenderTester):
         image = torch.rand(1, 1, 256, 256, device=device).requires_grad_()
         defocus = torch.empty(1, 1, 256, 256, device=device).uniform_(-20, 20)
         largest = LargestTensor()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(tile_plan.CHUNK_BYTES, "cpu", 200_000)
-            patch.setattr(tile_plan, "CHUNK_BYTES_ACCELERATOR", 200_000)
-            with largest:
-                render(image, defocus, bank, compositing).sum().backward()
+        blocks = replace(BLOCKS, chunk_bytes=200_000, accelerator_bytes=200_000)
+        with largest:
+            render_by(TiledBackend(blocks), image, defocus, bank, compositing).sum().backward()
         assert largest.bytes < 2 * 300 * 300 * 8  # int64 labels of the padded plane; all layers' planes are 10 MB
 
     # Numeric types
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_half_is_the_dense_render_to_its_last_place(self, compositing, half, device):
         bank = make_bank(6, 3, 7, dtype=torch.float32, device=device, light=0.8, veil=True).to(half)
         image, defocus = make_scene(make_bank(6, 3, 7, dtype=torch.float32, device=device), 2, 44, 37)
-        coded = render(image.to(half), defocus, bank, compositing)
+        coded = render_by(SMALL_TILES, image.to(half), defocus, bank, compositing)
         expected = render(image.to(half), defocus, bank, compositing, method="dense")
         assert coded.dtype == half
         self.assert_close(coded, expected, rtol=torch.finfo(half).eps, atol=1e-6)
-
-    # Errors
-
-    def test_exception_unknown_method(self):
-        bank = make_bank()
-        with pytest.raises(ValueError, match="method must be one of 'tiled', 'dense', got 'sparse'"):
-            render(*make_scene(bank), bank, method="sparse")
 
 
 class LargestTensor(TorchDispatchMode):
@@ -282,13 +262,13 @@ class LargestTensor(TorchDispatchMode):
 
 class TestPlan(BaseTester):
     @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.usefixtures("small_tiles")
     def test_feature_pairs_are_the_layers_that_tiles_contain(self, kind, device):
         """Counted pixel by pixel."""
         bank = make_bank(6, 1, 5, device=device)
         psi = depth_map(kind, bank, 37, 51)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
-        plan = make_plan(Labels.of(label, None), 6, 5)
+        labels = Labels.of(label, None)
+        plan = plan_blocks(labels, 6, choose_grid(labels, 6, 5, SMALL_TILES.blocks), SMALL_TILES.blocks)
         tile = plan.grid.tile
         expected = {
             (b, y // tile, x // (2 * tile), int(label[b, y, x])) for b in range(2) for y in range(37) for x in range(51)
@@ -314,4 +294,4 @@ class TestPlan(BaseTester):
         assert all(side - 23 + 1 >= 23 - 1 for side in sides)
 
     def test_property_sizes_transform_fast(self):
-        assert all((2 * 3) ** 16 * 5**2 * 7 % size == 0 for size in tile_plan.SIZES)
+        assert all((2 * 3) ** 16 * 5**2 * 7 % size == 0 for size in BLOCKS.sizes + WINDOWS.sizes)
