@@ -248,7 +248,14 @@ COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": sc
 
 
 def _composite(
-    image: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, stray_light: Tensor | None, *, method: str, **options: str
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    stray_light: Tensor | None,
+    *,
+    method: str,
+    **options: str,
 ) -> Tensor:
     """Render in float32 or better, whatever autocast says, and return the image's type."""
     if is_transformed():

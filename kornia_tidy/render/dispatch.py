@@ -170,7 +170,9 @@ class Explanation:
     objections: dict[str, str]
 
     def __str__(self) -> str:
-        words = {name: f"about {1e3 * self.seconds[name]:.3g} ms" for name in sorted(self.seconds, key=self.seconds.get)}
+        words = {
+            name: f"about {1e3 * self.seconds[name]:.3g} ms" for name in sorted(self.seconds, key=self.seconds.get)
+        }
         for name, why in self.objections.items():
             words[name] = f"{words[name]}, but {why}" if name in words else why
         return "\n".join([f"{self.scene}: {self.backend}", *(f"  {name}: {why}" for name, why in words.items())])

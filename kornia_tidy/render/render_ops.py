@@ -15,6 +15,7 @@ from torch import Tensor
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.dispatch import chain_gradients, choose, render_unrecorded, scene_gradients
 from kornia_tidy.render.scene import LayeredScene, layered_scene
+from kornia_tidy.runtime.tracing import recording_in_operator
 
 _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
@@ -89,7 +90,7 @@ def _gradients(*arguments: Any) -> list[Tensor]:
     tensors, options = arguments[:_TENSORS], arguments[_TENSORS:]
     own = [None if x is None else x.detach().requires_grad_(want) for x, want in zip(tensors, wanted, strict=True)]
     leaves = [x for x in own if x is not None and x.requires_grad]
-    with torch.enable_grad(), torch.autocast(gradient.device.type, enabled=False):
+    with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
         scene = _scene(*own, *options)
         found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
     return [

@@ -6,11 +6,20 @@ plain operations of torch, from start to end.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 import torch
 from torch.autograd import forward_ad
 
+_KEYS_OF_RECORDING = tuple(
+    getattr(torch._C.DispatchKey, name)
+    for name in (
+        *("AutogradFunctionality", "AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"),
+        *("Conjugate", "Negative", "ZeroTensor"),
+    )
+)
 TORCHSCRIPT = (
     "a programmable camera cannot become TorchScript, which knows no PSFs computed from masks: export it with "
     "torch.export.export(optics, (image, depth)), or compile it with torch.compile"
@@ -52,6 +61,26 @@ def is_value_unknown() -> bool:
     if functorch.peek_interpreter_stack() is None:
         return False
     return any(level.key() == functorch.TransformType.Vmap for level in functorch.get_interpreter_stack() or ())
+
+
+@contextmanager
+def recording_in_operator() -> Iterator[None]:
+    """Let autograd record inside the implementation of an operator.
+
+    Where a dispatch mode is active, such as a counter of operations, torch calls implementations with autograd and lazy
+    conjugation switched off. Here both are on.
+
+    Example:
+        >>> x = torch.ones(1, requires_grad=True)
+        >>> with torch.no_grad(), recording_in_operator():
+        ...     (2 * x).requires_grad
+        True
+    """
+    included, excluded = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
+    for key in _KEYS_OF_RECORDING:
+        excluded = excluded.remove(key)
+    with torch._C._ForceDispatchKeyGuard(included, excluded), torch.enable_grad():
+        yield
 
 
 def refuse_torchscript() -> NoReturn:

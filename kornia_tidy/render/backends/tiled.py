@@ -88,9 +88,12 @@ class TiledBackend:
         scatters = scene.compositing == "scatter"
         plane = scene.plane if scatters else _plane_with_spare(scene, grid)
         tensors = plane, scene.psfs, scene.batch_weight
-        return gradient_pairs(tensors, (_scatter_gradients if scatters else gather_gradients)(
-            plane.detach(), scene.psfs.detach(), gradient, plan, [wants_gradient(x) for x in tensors]
-        ))
+        return gradient_pairs(
+            tensors,
+            (_scatter_gradients if scatters else gather_gradients)(
+                plane.detach(), scene.psfs.detach(), gradient, plan, [wants_gradient(x) for x in tensors]
+            ),
+        )
 
     def _kind(self, scene: LayeredScene) -> TileKind:
         return self.windows if scene.compositing == "occlusion" else self.blocks

@@ -110,7 +110,9 @@ def occlusion_gradients(
     return gradient_pairs(planes[:5], found)
 
 
-def _gradients(planes: OcclusionPlanes, plan: WindowPlan, grad: Tensor, wanted: Sequence[bool]) -> tuple[Tensor | None, ...]:
+def _gradients(
+    planes: OcclusionPlanes, plan: WindowPlan, grad: Tensor, wanted: Sequence[bool]
+) -> tuple[Tensor | None, ...]:
     """Return the gradients with respect to light, PSFs, layer weight, mean and stray light, where they are wanted."""
     padded, grid = _padded(planes, plan), plan.grid
     grad = pad(grad, (0, grid.covered_width - grid.width, 0, grid.covered_height - grid.height))

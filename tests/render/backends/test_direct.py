@@ -186,7 +186,9 @@ class TestChoice(BaseTester):
         psi = torch.arange(8.0)[torch.arange(400) // 50][:, None].expand(1, 1, 400, 600)
         image, sides = torch.rand(1, 1, 400, 600), range(1, 131, 6)
         psfs = {side: torch.rand(8, 1, side, side) for side in sides}
-        direct = [side for side in sides if choose(layered_scene(image, psi, torch.arange(8.0), psfs[side])).name == "direct"]
+        direct = [
+            side for side in sides if choose(layered_scene(image, psi, torch.arange(8.0), psfs[side])).name == "direct"
+        ]
         assert direct[0] == 1
         assert 13 < direct[-1] < 100
         assert direct == list(range(1, direct[-1] + 1, 6))
