@@ -40,7 +40,6 @@ from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes, guarded
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
-from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.borders import pad_border
 from kornia_tidy.render.cost_model import (
     Tiles,
@@ -52,6 +51,7 @@ from kornia_tidy.render.cost_model import (
     rendering_seconds,
     window_side,
 )
+from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
 from kornia_tidy.render.stray_light import share_in_frame
 

@@ -1,16 +1,21 @@
 """From a defocus map and a PSF bank to the irradiance on the sensor.
 
-An image in linear light, its defocus and a PSF bank come in; the blurred image goes out. Read ``compositing.py`` first:
-gather, scatter and occlusion; how each is computed stands in ``backends/``.
+An image in linear light, its defocus and a PSF bank come in; the irradiance on the sensor goes out. Read
+``compositing.py`` first (gather, scatter, occlusion), then ``scene.py`` (what a backend is given) and ``dispatch.py``
+(which backend is taken).
 """
 
 from kornia_tidy.render.compositing import gather, occlusion, render, scatter
+from kornia_tidy.render.dispatch import explain
 from kornia_tidy.render.layers import assign_layers, layer_weights
+from kornia_tidy.render.scene import layered_scene
 
 __all__ = [
     "assign_layers",
+    "explain",
     "gather",
     "layer_weights",
+    "layered_scene",
     "occlusion",
     "render",
     "scatter",

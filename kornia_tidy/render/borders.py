@@ -1,4 +1,4 @@
-"""Convolution with a PSF: what lies beyond the image's border, and products of spectra.
+"""Borders of the image, and convolution with a PSF by products of spectra.
 
 An image plane is padded by the PSF's radius on each side, multiplied with the PSF's spectrum, and the part that no
 wrap-around has touched is cut out. Borders: ``reflect`` (``...c b | a b c...``, OpenCV's reflect101), ``replicate``

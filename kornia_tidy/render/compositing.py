@@ -1,4 +1,4 @@
-"""Compositing: the image of a scene whose pixels lie in different defocus layers, one PSF a layer.
+"""Compositing of a scene with many defocus layers, each with its PSF.
 
 Each function makes a layered scene of its arguments (:mod:`kornia_tidy.render.scene`) and hands it to a backend
 (:mod:`kornia_tidy.render.dispatch`). All backends give the same image. Light is linear throughout.
@@ -9,14 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.dispatch import METHODS, render_scene
 from kornia_tidy.render.render_ops import render_layers
-from kornia_tidy.render.scene import check_scene, layered_scene
-from kornia_tidy.runtime.tracing import is_transformed
 
 
 class Bank(Protocol):
@@ -62,7 +58,7 @@ def render(
         correlate: flip the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
         method: the backend. ``"auto"`` takes the cheapest that supports the scene, see
             :func:`kornia_tidy.render.dispatch.explain`; ``"direct"``, ``"tiled"`` and ``"dense"`` ask for one.
-            ``torch.func`` and forward-mode derivatives are for dense alone; ``torch.compile`` is for all.
+            ``torch.compile``, ``torch.func`` and forward-mode derivatives are for dense alone.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or
@@ -84,18 +80,9 @@ def render(
         torch.Size([4, 3, 28, 44])
     """
     check_choice("compositing", compositing, COMPOSITING)
-    return _composite(
-        image,
-        defocus,
-        bank.defocus,
-        bank.psfs,
-        bank.veil,
-        compositing=compositing,
-        layers=layers,
-        border=border,
-        correlate=correlate,
-        method=method,
-    )
+    options = {"compositing": compositing, "layers": layers, "border": border}
+    scene = image, defocus, bank.defocus, bank.psfs, bank.veil
+    return render_layers(*scene, correlate=correlate, method=method, **options)
 
 
 def gather(
@@ -143,8 +130,8 @@ def gather(
         >>> (coded[0, 0, 2] * 100).round().int().tolist()
         [0, 0, 25, 75, 0]
     """
-    options = {"layers": layers, "border": border, "correlate": correlate, "method": method}
-    return _composite(image, defocus, nodes, psfs, veil, compositing="gather", **options)
+    options = {"compositing": "gather", "layers": layers, "border": border}
+    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 def scatter(
@@ -183,8 +170,8 @@ def scatter(
 
     Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
     """
-    options = {"layers": layers, "border": border, "correlate": correlate, "method": method}
-    return _composite(image, defocus, nodes, psfs, veil, compositing="scatter", **options)
+    options = {"compositing": "scatter", "layers": layers, "border": border}
+    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 def occlusion(
@@ -240,28 +227,8 @@ def occlusion(
         >>> (coded[0, 0, 0] * 100).round().int().tolist()
         [0, 33, 67, 100]
     """
-    options = {"layers": layers, "border": border, "correlate": correlate, "method": method}
-    return _composite(image, defocus, nodes, psfs, veil, compositing="occlusion", **options)
+    options = {"compositing": "occlusion", "layers": layers, "border": border}
+    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": scatter, "occlusion": occlusion}
-
-
-def _composite(
-    image: Tensor,
-    defocus: Tensor,
-    nodes: Tensor,
-    psfs: Tensor,
-    stray_light: Tensor | None,
-    *,
-    method: str,
-    **options: str,
-) -> Tensor:
-    """Render in float32 or better, whatever autocast says, and return the image's type."""
-    if is_transformed():
-        with torch.autocast(image.device.type, enabled=False):
-            scene = layered_scene(image, defocus, nodes, psfs, stray_light, **options)
-            return render_scene(scene, method).to(image.dtype)
-    check_choice("method", method, METHODS)
-    check_scene(image, defocus, nodes, psfs, stray_light, options["border"])
-    return render_layers(image, defocus, nodes, psfs, stray_light, method=method, **options)

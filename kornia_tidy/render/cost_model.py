@@ -153,7 +153,7 @@ def count_tiles(labels: Labels, layers: int, window: int, *, gathers: bool = Tru
     directly = gathers and can_go_directly(labels, torch.float32)
     strips = count_pairs(labels, torch.float32) if directly else None
     terms = 1 if labels.layer_weight is None else 2
-    return Tiles(grid.size, grid.blocks, pairs, present, labels.layer_index.numel(), terms, strips)
+    return Tiles(grid.size, len(here), pairs, present, labels.layer_index.numel(), terms, strips)
 
 
 def rendering_seconds(tiles: Tiles, channels: int, fidelity: Fidelity) -> float:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,50 +13,50 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.render.backend import Backend, GradientPairs
-from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients, memory_objection
+from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
-from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.layers import SAMPLE
+from kornia_tidy.render.scene import LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
 
 BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
 METHODS = ("auto", *BACKENDS)
+LARGEST_PLANE = 32 << 20  # bytes of all channels of an image, up to which "auto" may take dense
+REMEMBERED = 256  # choices, each of some 500 bytes and a grid
+
+_choices: dict[tuple[Hashable, ...], tuple[Backend, dict[Any, Any]]] = {}
 
 
-def render_scene(scene: LayeredScene, method: str = "auto") -> Tensor:
-    """Render a layered scene by the cheapest backend, or by one that is named.
+def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
+    """Render a layered scene by the cheapest backend, or by one that is named or given.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``.
+        method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``, or a backend.
 
     Returns:
-        (B, C, h, w) light in the scene's dtype.
+        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
+        with respect to image, layer weight, PSFs and stray light. The backend makes them; those that are differentiated
+        in turn are made by the dense one.
 
     Raises:
         ValueError: if the method is not known, or does not support the scene.
     """
-    return render_with(choose(scene, method), scene)
-
-
-def render_with(backend: Backend, scene: LayeredScene) -> Tensor:
-    """Render a layered scene by a backend, with its stray light.
-
-    The result has gradients with respect to image, layer weight, PSFs and stray light. The backend makes them, for
-    gradients that are differentiated in turn the dense one.
-    """
+    backend = choose(scene, method) if isinstance(method, str) else method
     if is_transformed():
         return render_unrecorded(backend, scene)
     return _Rendered.apply(backend, scene, scene.image, scene.layer_weight, scene.psfs, scene.stray_light)
 
 
 def render_unrecorded(backend: Backend, scene: LayeredScene) -> Tensor:
-    """Return what :func:`render_with` returns, with those gradients only that torch makes of the backend's operations."""
-    coded = backend.render(scene)
-    if scene.stray_light is None or scene.compositing == "occlusion":
-        return coded
-    return coded + stray_light_of(scene)
+    """Render a layered scene without the gradients that backends make."""
+    with torch.autocast(scene.image.device.type, enabled=False):
+        coded = backend.render(scene)
+        if scene.stray_light is not None and scene.compositing != "occlusion":
+            coded = coded + stray_light_of(scene)
+    return coded.to(scene.dtype)
 
 
 @torch.enable_grad()
@@ -96,11 +98,12 @@ class _Rendered(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), wanted = grad_outputs, ctx.needs_input_grad[2:]
+        (gradient,), wanted, given = grad_outputs, ctx.needs_input_grad[2:], ctx.scene
 
-        def scene_of(*tensors: Tensor | None) -> LayeredScene:
+        def scene_of(*tensors: Any) -> LayeredScene:
             image, weight, psfs, stray_light = tensors
-            return replace(ctx.scene, image=image, layer_weight=weight, psfs=psfs, stray_light=stray_light, found={})
+            rest = given.border, given.compositing, given.dtype
+            return scene_of_layers(image, given.layer_index, weight, psfs, stray_light, *rest)
 
         if torch.is_grad_enabled():  # it is differentiated in turn
 
@@ -108,20 +111,24 @@ class _Rendered(torch.autograd.Function):
                 return render_unrecorded(BACKENDS["dense"], scene_of(*tensors))
 
             return None, None, *differentiable_gradients(render, ctx.saved_tensors, gradient, wanted)
-        own = [
-            None if x is None else x.detach().requires_grad_(want)
-            for x, want in zip(ctx.saved_tensors, wanted, strict=True)
-        ]
+        own = leaves_of(ctx.saved_tensors, wanted)
         leaves = [x for x in own if x is not None and x.requires_grad]
-        found = iter(chain_gradients(scene_gradients(ctx.backend, scene_of(*own), gradient), leaves))
+        with torch.enable_grad():
+            found = iter(chain_gradients(scene_gradients(ctx.backend, scene_of(*own), gradient), leaves))
         return None, None, *(next(found) if x is not None and x.requires_grad else None for x in own)
+
+
+def leaves_of(tensors: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
+    """Return tensors in which gradients end, that require them where they are wanted."""
+    return [None if x is None else x.detach().requires_grad_(want) for x, want in zip(tensors, wanted, strict=True)]
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """Return the backend that :func:`render_scene` takes.
 
     Of those that support the scene it is the one with the least estimated time. Dense rendering is taken only while
-    its memory stays small, or if nothing else supports the scene.
+    its memory stays small, or if nothing else supports the scene. The choice for a sample of layers is remembered: it
+    takes as long as to render a small image.
 
     Args:
         scene: to be rendered.
@@ -136,6 +143,11 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return BACKENDS[method]
+    key = _fingerprint(scene)
+    if key in _choices and refusal(_choices[key][0], scene) is None:
+        best, grids = _choices[key]
+        scene.grids.update(grids)
+        return best
     able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
     if len(able) > 1 and memory_objection(scene) is not None:
         able.remove(BACKENDS["dense"])
@@ -143,7 +155,29 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     for backend in able if len(able) > 1 else ():
         if backend.least_seconds(scene) < least and (seconds := backend.seconds(scene)) < least:
             best, least = backend, seconds
+    if key is not None:
+        if len(_choices) >= REMEMBERED:
+            _choices.clear()
+        _choices[key] = best, dict(scene.grids)
     return best
+
+
+def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
+    """Return what a choice depends on, with a digest of the sample of layers that costs are estimated from.
+
+    None on an accelerator, which one would have to wait for, and where torch transforms the renderer.
+    """
+    labels = scene.labels
+    if labels.layer_index.device.type != "cpu" or is_transformed():
+        return None
+    digest = hashlib.blake2b(digest_size=16)
+    for layer in labels.every(SAMPLE).terms():
+        digest.update(layer.contiguous().numpy())
+    # With occlusion the values of PSFs matter too.
+    refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
+    objected, threads, shape = memory_objection(scene), torch.get_num_threads(), labels.layer_index.shape
+    shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
+    return scene.compositing, *shapes, refused, objected, threads, digest.digest()
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:
@@ -151,6 +185,16 @@ def refusal(backend: Backend, scene: LayeredScene) -> str | None:
     if backend.name != "dense" and is_transformed():
         return "torch.func and forward-mode derivatives need plain operations of torch"
     return backend.refusal(scene)
+
+
+def memory_objection(scene: LayeredScene) -> str | None:
+    """Return why the memory of dense rendering is too large for a scene, or None if it is small."""
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
+        return "for gradients it keeps a spectrum for each layer"
+    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
+    plane = scene.image.numel() * itemsize
+    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
 
 
 @dataclass(frozen=True)
@@ -170,16 +214,15 @@ class Explanation:
     objections: dict[str, str]
 
     def __str__(self) -> str:
-        words = {
-            name: f"about {1e3 * self.seconds[name]:.3g} ms" for name in sorted(self.seconds, key=self.seconds.get)
-        }
+        by_time = sorted(self.seconds.items(), key=lambda item: item[1])
+        words = {name: f"about {1e3 * seconds:.3g} ms" for name, seconds in by_time}
         for name, why in self.objections.items():
             words[name] = f"{words[name]}, but {why}" if name in words else why
         return "\n".join([f"{self.scene}: {self.backend}", *(f"  {name}: {why}" for name, why in words.items())])
 
 
 def explain(scene: LayeredScene) -> Explanation:
-    """Return which backend ``method="auto"`` takes for a scene, what each would cost and why others are not taken.
+    """Return the choice of ``method="auto"`` for a scene, with the estimated times and the objections to the others.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
@@ -192,10 +235,10 @@ def explain(scene: LayeredScene) -> Explanation:
         >>> sorted(explanation.seconds), explanation.objections
         (['dense', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
     """
-    (height, width), (batch, channels) = scene.output_size, scene.image.shape[:2]
+    (height, width), (batch, channels), side = scene.output_size, scene.image.shape[:2], scene.psfs.shape[-1]
     words = (
         f"{scene.compositing} of {batch} x {channels} channels of {height}x{width} px, {scene.sampled_layers} of "
-        f"{len(scene.psfs)} layers, PSFs of {scene.psf_size}x{scene.psf_size} px, {torch.get_num_threads()} threads"
+        f"{len(scene.psfs)} layers, PSFs of {side}x{side} px, {torch.get_num_threads()} threads"
     )
     objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
     seconds = {name: backend.seconds(scene) for name, backend in BACKENDS.items() if name not in objections}

@@ -13,9 +13,16 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
-from kornia_tidy.render.dispatch import chain_gradients, choose, render_unrecorded, scene_gradients
-from kornia_tidy.render.scene import LayeredScene, layered_scene
-from kornia_tidy.runtime.tracing import recording_in_operator
+from kornia_tidy.render.dispatch import (
+    chain_gradients,
+    choose,
+    leaves_of,
+    render_scene,
+    render_unrecorded,
+    scene_gradients,
+)
+from kornia_tidy.render.scene import LayeredScene, check_scene, layered_scene
+from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
@@ -60,8 +67,14 @@ def render_layers(
         to all tensors, which can be differentiated in turn.
 
     Raises:
-        ValueError: as :func:`kornia_tidy.render.dispatch.choose`; shapes are to be checked before.
+        TypeError: if a tensor is not floating point.
+        ValueError: if shapes do not fit, or as :func:`kornia_tidy.render.dispatch.choose`.
     """
+    if is_transformed():
+        options = {"compositing": compositing, "layers": layers, "border": border}
+        scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
+        return render_scene(scene, method)
+    check_scene(image, defocus, nodes, psfs, stray_light, border)
     return torch.ops.kornia_tidy.render_layers(
         image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method
     )
@@ -71,7 +84,7 @@ def _render(*arguments: Any) -> Tensor:
     image, method = arguments[0], arguments[-1]
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
         scene = _scene(*arguments[:-1])
-        return render_unrecorded(choose(scene, method), scene).to(image.dtype).contiguous()
+        return render_unrecorded(choose(scene, method), scene).contiguous()
 
 
 def _render_fake(*arguments: Any) -> Tensor:
@@ -86,9 +99,8 @@ def _scene(*arguments: Any) -> LayeredScene:
 
 
 def _gradients(*arguments: Any) -> list[Tensor]:
-    *arguments, method, gradient, wanted = arguments
-    tensors, options = arguments[:_TENSORS], arguments[_TENSORS:]
-    own = [None if x is None else x.detach().requires_grad_(want) for x, want in zip(tensors, wanted, strict=True)]
+    tensors, options, (method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:-3], arguments[-3:]
+    own = leaves_of(tensors, wanted)
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
         scene = _scene(*own, *options)

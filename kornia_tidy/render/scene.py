@@ -1,4 +1,4 @@
-"""The layered scene: what the renderer is given, checked once and with the layers of every pixel found once."""
+"""The layered scene: the renderer's input, checked, with every pixel assigned to its layers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
 
 @dataclass(frozen=True)
 class LayeredScene:
-    """An image whose pixels lie in defocus layers, and the PSF of each layer. See :func:`layered_scene`.
+    """An image, the defocus layers of its pixels, and the PSF of each layer. See :func:`layered_scene`.
+
+    Backends sort pixels by their layers: gather those of the output (B or 1, h, w), scatter and occlusion those of
+    :attr:`plane`. What lies beyond a border of zeros has no weight there, and takes the layers of the nearest pixels.
 
     Args:
         image: (B, C, H, W) linear light in float32 or float64.
@@ -25,7 +28,11 @@ class LayeredScene:
         stray_light: (D, C) fraction of a point's light that is spread evenly, or None for none.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        found: what was found out about the scene, by its name, so that it is found once.
+        dtype: of the rendered image.
+        sorted_layers: layer index and layer weight of the pixels that are sorted, and
+        labels: the same for each image of the batch, without gradients.
+        found: planes that were made of the scene, by their names, so that they are made once.
+        grids: the best tiles of each kind for the scene, as far as they were looked for.
     """
 
     image: Tensor
@@ -35,63 +42,30 @@ class LayeredScene:
     stray_light: Tensor | None
     border: str
     compositing: str
-    found: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
-
-    @property
-    def psf_size(self) -> int:
-        """Side P of the PSFs in pixels."""
-        return self.psfs.shape[-1]
+    dtype: torch.dtype
+    sorted_layers: tuple[Tensor, Tensor | None]
+    labels: Labels
+    found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    grids: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
         """Height and width of the rendered image."""
-        lost = self.psf_size - 1 if self.border == "valid" else 0
+        lost = self.psfs.shape[-1] - 1 if self.border == "valid" else 0
         return self.image.shape[-2] - lost, self.image.shape[-1] - lost
-
-    # What follows is made when it is first asked for. functools.cached_property has a lock, which torch.compile refuses.
 
     @property
     def plane(self) -> Tensor:
-        """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels."""
+        """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels. Made on first use."""
         if "plane" not in self.found:
-            self.found["plane"] = pad_border(self.image, self.psf_size // 2, self.border)
+            self.found["plane"] = pad_border(self.image, self.psfs.shape[-1] // 2, self.border)
         return self.found["plane"]
 
     @property
-    def sorted_layers(self) -> tuple[Tensor, Tensor | None]:
-        """Layer index and layer weight of the pixels that backends sort, (B or 1, h', w').
-
-        Gather sorts the pixels of the output, scatter and occlusion those of :attr:`plane`. What lies beyond a border
-        of zeros has no weight there, and takes the layers of the nearest pixels.
-        """
-        if "sorted_layers" not in self.found:
-            self.found["sorted_layers"] = self._sort_layers()
-        return self.found["sorted_layers"]
-
-    def _sort_layers(self) -> tuple[Tensor, Tensor | None]:
-        index, weight, radius = self.layer_index, self.layer_weight, self.psf_size // 2
-        if self.compositing != "gather":
-            sides = "replicate" if self.border == "zero" else self.border
-            index = pad_border(index.to(self.image.dtype), radius, sides).long()  # padding is for real numbers
-            weight = None if weight is None else pad_border(weight, radius, sides)
-        elif self.border == "valid" and radius > 0:
-            index = index[..., radius:-radius, radius:-radius]
-            weight = None if weight is None else weight[..., radius:-radius, radius:-radius]
-        return index[:, 0], None if weight is None else weight[:, 0]
-
-    @property
     def batch_weight(self) -> Tensor | None:
-        """Layer weight of :attr:`sorted_layers` for each image of the batch, (B, h', w')."""
+        """Layer weight of :attr:`sorted_layers` for each image of the batch, with gradients."""
         weight = self.sorted_layers[1]
         return None if weight is None else weight.expand(len(self.image), -1, -1)
-
-    @property
-    def labels(self) -> Labels:
-        """:attr:`sorted_layers` for each image of the batch, (B, h', w')."""
-        if "labels" not in self.found:
-            index = self.sorted_layers[0].expand(len(self.image), -1, -1)
-            self.found["labels"] = Labels.of(index, self.batch_weight)
-        return self.found["labels"]
 
     @property
     def sampled_layers(self) -> int:
@@ -144,7 +118,7 @@ def layered_scene(
     check_scene(image, defocus, nodes, psfs, stray_light, border)
     dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
     index, weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
-    return LayeredScene(
+    return scene_of_layers(
         image.to(dtype),
         index,
         weight.to(dtype) if layers == "linear" else None,
@@ -152,6 +126,46 @@ def layered_scene(
         None if stray_light is None else stray_light.to(dtype),
         border,
         compositing,
+        image.dtype,
+    )
+
+
+def scene_of_layers(
+    image: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    psfs: Tensor,
+    stray_light: Tensor | None,
+    border: str,
+    compositing: str,
+    dtype: torch.dtype,
+) -> LayeredScene:
+    """Return a scene whose layers are known. Nothing is checked.
+
+    Args:
+        image: this and the other arguments are those of :class:`LayeredScene`.
+        layer_index: of each pixel.
+        layer_weight: of the next layer, or None.
+        psfs: of the layers.
+        stray_light: of the layers, or None.
+        border: what lies beyond the image.
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
+        dtype: of the rendered image.
+    """
+    index, weight, radius, batch = layer_index, layer_weight, psfs.shape[-1] // 2, len(image)
+    if compositing != "gather":
+        sides = "replicate" if border == "zero" else border
+        index = pad_border(index.to(image.dtype), radius, sides).long()  # padding is for real numbers
+        weight = None if weight is None else pad_border(weight, radius, sides)
+    elif border == "valid" and radius > 0:
+        index = index[..., radius:-radius, radius:-radius]
+        weight = None if weight is None else weight[..., radius:-radius, radius:-radius]
+    index, weight = index[:, 0], None if weight is None else weight[:, 0]
+    with_gradient = weight is not None and weight.requires_grad and torch.is_grad_enabled()
+    of_batch = None if weight is None else weight.detach().expand(batch, -1, -1)
+    labels = Labels(index.expand(batch, -1, -1), of_batch, with_gradient)
+    return LayeredScene(
+        image, layer_index, layer_weight, psfs, stray_light, border, compositing, dtype, (index, weight), labels
     )
 
 

@@ -67,7 +67,7 @@ def _pixels_around(side: int, radius: Tensor) -> Tensor:
 
 
 def spread_evenly(light: Tensor, psf_size: int, border: str) -> Tensor:
-    """Return what each pixel gets of light that has strayed: its mean, or with the border ``"zero"`` what stays of it.
+    """Return the stray light on each pixel: the mean of light that has strayed, for a zero border the part that stays.
 
     Args:
         light: (..., H, W) light that leaves the PSFs' window, at the pixels that it comes from.
@@ -94,14 +94,14 @@ def stray_light_of(scene: LayeredScene) -> Tensor:
     assert scene.stray_light is not None
     if scene.compositing == "scatter":
         strayed = blend_of_layers(scene.stray_light, scene.layer_index, scene.layer_weight) * scene.image
-        return spread_evenly(strayed, scene.psf_size, scene.border)
+        return spread_evenly(strayed, scene.psfs.shape[-1], scene.border)
     index, weight = scene.sorted_layers
     taken = blend_of_layers(scene.stray_light, index[:, None], None if weight is None else weight[:, None])
-    return taken * spread_evenly(scene.image, scene.psf_size, scene.border)
+    return taken * spread_evenly(scene.image, scene.psfs.shape[-1], scene.border)
 
 
 def normalised_share(stray_light: Tensor, psfs: Tensor, shape: Sequence[int], border: str) -> Tensor:
-    r"""Return how much of the light that a pixel is seen to have is stray, where PSFs are normalised to what they see.
+    r"""Return the fraction of stray light in a pixel, where PSFs are normalised by the weight that they cover.
 
     .. math:: v' = \frac{v \, \overline{w}}{\overline{h * 1} + v \, \overline{w}}
 
@@ -137,5 +137,7 @@ def share_in_frame(psfs: Tensor, shape: Sequence[int]) -> Tensor:
         tensor(0.1111)
     """
     offset = torch.arange(psfs.shape[-1], dtype=psfs.dtype, device=psfs.device) - psfs.shape[-1] // 2
-    down, across = ((1 - offset.abs() / side).clamp(min=0) for side in shape)  # pixels whose neighbour there is inside
+    down, across = (
+        (1 - offset.abs() / side).clamp(min=0) for side in shape
+    )  # fraction of pixels with a neighbour inside
     return (psfs * (down[:, None] * across)).sum((-2, -1))

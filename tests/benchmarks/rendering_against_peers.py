@@ -13,7 +13,6 @@ import json
 import statistics
 import time
 from collections.abc import Callable
-from unittest.mock import patch
 
 import cv2
 import kornia
@@ -23,8 +22,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from kornia_tidy.render.backends import tiled as tiling
-from kornia_tidy.render.backends import tiled_occlusion as occlusion_tiling
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.compositing import render
 from tests.base import DATA
@@ -100,8 +97,7 @@ def tiled(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
 
 def by_transforms(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
     """Ours as it is without a C compiler."""
-    with patch.object(tiling, "goes_directly", lambda *_: False):
-        return tiled(image, psi, bank)
+    return render(image, psi, bank, layers="nearest", method="tiled")
 
 
 def dense(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
@@ -114,8 +110,7 @@ def tiled_occlusion(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
 
 def occlusion_by_transforms(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
     """Ours as it is without a C compiler."""
-    with patch.object(occlusion_tiling, "goes_directly", lambda *_: False):
-        return tiled_occlusion(image, psi, bank)
+    return render(image, psi, bank, "occlusion", layers="nearest", method="tiled")
 
 
 def ikoma_stack(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
@@ -165,7 +160,7 @@ def test_tiled_render(benchmark, compositing, layers, count, size, scene):
 
 @pytest.mark.parametrize("scene", ["small", "aloe"])
 @pytest.mark.parametrize("compositing", ["gather", "scatter"])
-@pytest.mark.parametrize("method", ["tiled", "dense"])
+@pytest.mark.parametrize("method", ["auto", "dense"])
 def test_training_batch_forward_and_backward_to_the_psfs(benchmark, compositing, method, scene):
     """8 crops of 278 x 278, as the paper's patches; of the small scene two of 60 x 60."""
     image, psi = load_scene(scene)

@@ -18,8 +18,9 @@ from torch.nn.functional import conv2d, one_hot
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW
-from kornia_tidy.render.backends.dense_occlusion import occlude_dense
+from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
+from kornia_tidy.render.scene import scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies import round_off, written_out
 from tests.rounding import gamma
@@ -148,7 +149,8 @@ def occlude(draw: random.Random) -> Call:
 
     def truth() -> tuple[Tensor, float]:
         shared = None if fraction is None else fraction[:, None]
-        expected = occlude_dense(image, lower[:, None], shared, psfs, veil=veil, border=border)
+        scene = scene_of_layers(image, lower[:, None], shared, psfs, veil, border, "occlusion", dtype)
+        expected = DenseBackend().render(scene)
         apart = 1 if dtype == torch.float32 else 1 + 3 * side**2
         return expected, 6 * layers * (layers + 1) * apart * gamma(side**2 + 16, dtype)
 

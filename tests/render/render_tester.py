@@ -11,7 +11,7 @@ from kornia_tidy.render.backend import Backend
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.compositing import render
-from kornia_tidy.render.dispatch import render_with
+from kornia_tidy.render.dispatch import render_scene
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import Bank
@@ -32,7 +32,7 @@ def render_by(
     if isinstance(method, str):
         return render(image, defocus, bank, compositing, method=method, **options)
     scene = layered_scene(image, defocus, bank.defocus, bank.psfs, bank.veil, compositing=compositing, **options)
-    return render_with(method, scene).to(image.dtype)
+    return render_scene(scene, method)
 
 
 class RenderTester(BaseTester):

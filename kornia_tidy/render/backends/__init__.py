@@ -1,4 +1,4 @@
-"""Ways to compute one rendering: dense (the definition), tiled by transforms, and direct convolution in C.
+"""Backends of the renderer: dense (the definition), tiled by transforms, and direct convolution in C.
 
-Light, layers and PSFs come in, light goes out, the same to rounding whichever way is taken. Read ``tiled.py`` first.
+A layered scene comes in, light goes out, the same to rounding whichever backend renders it. Read ``dense.py`` first.
 """

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -36,51 +35,28 @@ class Chunk:
         batch: images.
         rows: rows of blocks.
         columns: columns of blocks.
-        y: rows of pixels.
-        x: columns of pixels.
+        extent: images, rows and columns of blocks.
+        pixels: images, rows and columns of pixels, an index into (B, H, W).
         block: (N,) block of each pair, counted from the chunk's first.
         layer: (N,) layer of each pair, as an index into :attr:`BlockPlan.present`.
         counts: pairs of each block.
+        runs: its pairs, in as few runs as they make.
     """
 
     batch: slice
     rows: slice
     columns: slice
-    y: slice
-    x: slice
+    extent: tuple[int, int, int]
+    pixels: tuple[slice, slice, slice]
     block: Tensor
     layer: Tensor
     counts: list[int]
-
-    @property
-    def extent(self) -> tuple[int, int, int]:
-        """Images, rows and columns of blocks."""
-        images, rows, columns = (part.stop - part.start for part in (self.batch, self.rows, self.columns))
-        return images, rows, columns
-
-    @cached_property
-    def runs(self) -> list[Run]:
-        """Its pairs, in as few runs as they make."""
-        block, layer = self.block.tolist(), self.layer.tolist()
-        starts = [
-            pair
-            for pair in range(len(block))
-            if pair == 0 or block[pair] != block[pair - 1] or layer[pair] != layer[pair - 1] + 1
-        ]
-        return [
-            Run(block[start], slice(start, stop), slice(layer[start], layer[stop - 1] + 1))
-            for start, stop in pairwise([*starts, len(block)])
-        ]
-
-    @property
-    def pixels(self) -> tuple[slice, slice, slice]:
-        """Index of its pixels in (B, H, W)."""
-        return self.batch, self.y, self.x
+    runs: list[Run]
 
 
 @dataclass(frozen=True)
 class BlockPlan:
-    """What is computed for one scene.
+    """The pairs of blocks and layers of one scene, in chunks.
 
     Args:
         grid: the blocks.
@@ -106,14 +82,14 @@ def plan_blocks(labels: Labels, layers: int, grid: Grid, kind: TileKind) -> Bloc
     device = labels.layer_index.device
     stride = 2 * grid.size**2
     itemsize = 4 if labels.layer_weight is None else labels.layer_weight.element_size()
-    limit = kind.bytes_on(device) // (stride * itemsize)
+    limit = (kind.chunk_bytes if device.type == "cpu" else kind.accelerator_bytes) // (stride * itemsize)
 
     here = grid.present(labels, layers)
     used = here.any(0)
     block, layer = here.nonzero().unbind(1)
     number = (used.cumsum(0) - 1)[layer]
     ends = [0, *here.sum(1).cumsum(0).tolist()]
-    start = torch.zeros(grid.blocks, layers, dtype=torch.int64, device=device)
+    start = torch.zeros(len(here), layers, dtype=torch.int64, device=device)
     chunks = []
     for extent, first, last in _split(grid, ends, limit):
         own = slice(ends[first], ends[last])
@@ -147,14 +123,28 @@ def _split(grid: Grid, ends: list[int], limit: int) -> Iterator[tuple[Extent, in
 
 
 def _chunk(grid: Grid, extent: Extent, block: Tensor, layer: Tensor, counts: list[int]) -> Chunk:
-    images, rows, columns = extent
+    (image, last_image), (row, last_row), (column, last_column) = extent
+    down, across = grid.tile, grid.across * grid.tile
+    y = slice(row * down, min(last_row * down, grid.height))
+    x = slice(column * across, min(last_column * across, grid.width))
+    numbers, layers = block.tolist(), layer.tolist()
+    starts = [
+        pair
+        for pair in range(len(numbers))
+        if pair == 0 or numbers[pair] != numbers[pair - 1] or layers[pair] != layers[pair - 1] + 1
+    ]
+    runs = [
+        Run(numbers[start], slice(start, stop), slice(layers[start], layers[stop - 1] + 1))
+        for start, stop in pairwise([*starts, len(numbers)])
+    ]
     return Chunk(
-        batch=slice(*images),
-        rows=slice(*rows),
-        columns=slice(*columns),
-        y=slice(rows[0] * grid.tile, min(rows[1] * grid.tile, grid.height)),
-        x=slice(columns[0] * 2 * grid.tile, min(columns[1] * 2 * grid.tile, grid.width)),
+        batch=slice(image, last_image),
+        rows=slice(row, last_row),
+        columns=slice(column, last_column),
+        extent=(last_image - image, last_row - row, last_column - column),
+        pixels=(slice(image, last_image), y, x),
         block=block,
         layer=layer,
         counts=counts,
+        runs=runs,
     )

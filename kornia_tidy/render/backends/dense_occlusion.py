@@ -1,4 +1,4 @@
-r"""Occlusion in plain operations of torch: near layers hide far ones, each normalised by what its PSF sees.
+r"""Occlusion in plain operations of torch: blurred, normalised layers are composited from near to far.
 
 A plain sum over layers is wrong at the outline of a near object: gather does not let its blur reach over what lies
 behind, scatter darkens or brightens the seam. Here layers of blurred opacity are laid over one another.
@@ -68,7 +68,7 @@ def cumulative_weight(layer_index: Tensor, layer_weight: Tensor | None, layer: i
 
 
 class OcclusionPlanes(NamedTuple):
-    """The planes of a scene with occlusion, with what lies beyond the border.
+    """The planes of a scene with occlusion, its border included.
 
     Args:
         light: (B, C, H + P - 1, W + P - 1).
@@ -93,7 +93,7 @@ def occlusion_planes(scene: LayeredScene) -> OcclusionPlanes:
     """Return the planes that a scene with occlusion is rendered from."""
     image, stray_light, inside = scene.image, scene.stray_light, None
     if scene.border == "zero":
-        inside = pad_border(torch.ones_like(image[:1, 0]), scene.psf_size // 2, "zero")
+        inside = pad_border(torch.ones_like(image[:1, 0]), scene.psfs.shape[-1] // 2, "zero")
     mean = None if stray_light is None else image.mean((-2, -1))
     if stray_light is not None:
         stray_light = normalised_share(stray_light, scene.psfs, image.shape[-2:], scene.border)
@@ -113,7 +113,13 @@ def occlude_dense(
     """Render with occlusion by transforms of the whole plane for every layer, see :func:`lay_over`.
 
     Args:
-        light: as the other arguments in :class:`OcclusionPlanes`.
+        light: image with its border, see :class:`OcclusionPlanes` for all arguments.
+        psfs: of the layers.
+        layer_weight: weight of the next layer, or None.
+        mean: mean light of each image, or None.
+        stray_light: fraction of the mean that each layer takes on, or None.
+        layer_index: of each pixel.
+        inside: 1 on the image and 0 in the dark beyond it, or None.
 
     Returns:
         (B, C, H, W) float64.

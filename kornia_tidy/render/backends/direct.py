@@ -41,14 +41,14 @@ class DirectBackend:
             return "direct convolution gathers light and does not scatter it"
         if scene.compositing == "occlusion":
             return direct_occlusion.refusal(scene.output_size, scene.psfs)
-        return refusal(scene.output_size, scene.image)
+        return refusal(scene.labels, scene.image.dtype)
 
     def seconds(self, scene: LayeredScene) -> float:
         """Return the estimated time, from the pairs of strips and layers; all of it is shared by threads."""
         if scene.compositing == "occlusion":
             cost = direct_occlusion.scene_cost(scene)
         else:
-            cost = direct_cost(count_pairs(scene.labels, scene.image.dtype), scene.psf_size)
+            cost = direct_cost(count_pairs(scene.labels, scene.image.dtype), scene.psfs.shape[-1])
         return cost * scene.image.shape[1] / torch.get_num_threads() * 1e-9
 
     def least_seconds(self, scene: LayeredScene) -> float:
@@ -67,15 +67,15 @@ class DirectBackend:
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of PSFs and layer weight directly, those of the image and of occlusion by tiles."""
         keep_memory()
-        labels, layers = scene.labels, len(scene.psfs)
+        labels, layers, side = scene.labels, len(scene.psfs), scene.psfs.shape[-1]
         if scene.compositing == "occlusion":
-            grid = choose_grid(labels, layers, scene.psf_size, WINDOWS)
+            grid = choose_grid(labels, layers, side, WINDOWS)
             return occlusion_gradients(occlusion_planes(scene), labels, grid, WINDOWS, gradient)
         tensors = scene.plane, scene.psfs, scene.batch_weight
         plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
         if wants_gradient(tensors[0]):
-            plan = plan_blocks(labels, layers, choose_grid(labels, layers, scene.psf_size), BLOCKS)
+            plan = plan_blocks(labels, layers, choose_grid(labels, layers, side), BLOCKS)
             of_plane, _, _ = gather_gradients(plane, psfs, gradient, plan, (True, False, False))
         if wants_gradient(tensors[1]):
             of_psfs = gather_direct_psf_gradient(plane, gradient, index, weight, layers)
@@ -84,31 +84,30 @@ class DirectBackend:
         return gradient_pairs(tensors, (of_plane, of_psfs, of_weight))
 
 
-def refusal(output_size: tuple[int, int], image: Tensor) -> str | None:
-    """Return why an output of a size cannot be gathered directly, or None if it can.
+def refusal(labels: Labels, dtype: torch.dtype) -> str | None:
+    """Return why light cannot be gathered directly, or None if it can.
 
     Args:
-        output_size: height and width.
-        image: light, of which device and type count.
+        labels: the layers of the output's pixels.
+        dtype: of the light.
     """
-    device, dtype = image.device.type, image.dtype
-    if device != "cpu":
-        return f"direct convolution runs on processors, and the image is on {device!r}"
+    index = labels.layer_index
+    if index.device.type != "cpu":
+        return f"direct convolution runs on processors, and the image is on {index.device.type!r}"
     if dtype not in REALS:
         return f"direct convolution is in float32 or float64, and the image in {dtype}"
-    smallest = gather_ops.smallest_output(dtype)
-    if output_size[0] < smallest[0] or output_size[1] < smallest[1]:
-        size = "x".join(map(str, output_size))
-        return f"direct convolution needs an output of at least {smallest[0]}x{smallest[1]} pixels, got {size}"
+    (height, width), smallest = index.shape[-2:], gather_ops.smallest_output(dtype)
+    if height < smallest[0] or width < smallest[1]:
+        least = "x".join(map(str, smallest))
+        return f"direct convolution needs an output of at least {least} pixels, got {height}x{width}"
     if compiled(SOURCE, dtype) is None:
         return "direct convolution needs a C compiler (see `kornia-tidy info`)"
     return None
 
 
 def can_go_directly(labels: Labels, dtype: torch.dtype) -> bool:
-    """Return whether labels of the output's pixels can be gathered directly, see :func:`refusal`."""
-    height, width = labels.layer_index.shape[-2:]
-    return refusal((height, width), torch.empty((), dtype=dtype, device=labels.layer_index.device)) is None
+    """Return whether light can be gathered directly, see :func:`refusal`."""
+    return refusal(labels, dtype) is None
 
 
 def is_direct_faster(direct: float, transforms: float) -> bool:

@@ -16,7 +16,7 @@ from kornia_tidy.kernels.occlusion_ops import SMALLEST_SIDE, SOURCE, count_work,
 from kornia_tidy.render.scene import LayeredScene
 
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
-COUNTED = 12  # bands of blocks, of which costs are known
+COUNTED = 12  # bands of blocks in the sample that costs are estimated from
 
 
 def refusal(output_size: tuple[int, ...], psfs: Tensor) -> str | None:
@@ -54,7 +54,7 @@ def scene_cost(scene: LayeredScene) -> float:
     """Return the time that a scene takes in nanoseconds a channel, see :func:`direct_cost`."""
     index, weight = scene.sorted_layers
     counts = count_work(scene.plane, scene.psfs, index, weight, COUNTED)
-    return direct_cost(*counts, max(scene.psf_size, SMALLEST_SIDE))
+    return direct_cost(*counts, max(scene.psfs.shape[-1], SMALLEST_SIDE))
 
 
 def direct_cost(alone: int, pairs: int, columns: int, edges: int, side: int) -> float:

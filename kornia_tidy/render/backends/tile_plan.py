@@ -18,14 +18,14 @@ from torch import Tensor
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.layers import SAMPLE, Labels
 
-TILE_FACTOR = 1.1  # of what windows take over the cost by which they are chosen
+TILE_FACTOR = 1.1  # time of all windows over their cost in the choice of a grid
 PIXEL_NANOSECONDS = 8.5  # of a pixel and each layer that it takes light from
 SHARED = 0.5  # of the work by transforms that threads share
 
 
 @dataclass(frozen=True)
 class TileKind:
-    """What all tiles of one kind have in common.
+    """Sizes and limits of the tiles of gather and scatter, or of occlusion.
 
     Args:
         sizes: sides of windows to choose from, in samples.
@@ -43,13 +43,9 @@ class TileKind:
     chunk_bytes: int
     accelerator_bytes: int = 256 << 20
 
-    def bytes_on(self, device: torch.device) -> int:
-        """Return the bytes that the planes of a chunk may take on a device."""
-        return self.chunk_bytes if device.type == "cpu" else self.accelerator_bytes
 
-
-# Sides of transforms whose samples take the least time. A block is two tiles: the left window is the real and the right
-# one the imaginary part of a complex plane, so that one transform serves both. Bytes are those of one channel.
+# A block is two tiles: the left window is the real and the right one the imaginary part of a complex plane, so that one
+# transform serves both. The sizes are those with the fastest transforms. Bytes are those of one channel.
 BLOCKS = TileKind(
     sizes=(
         *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
@@ -60,7 +56,7 @@ BLOCKS = TileKind(
     windowed=False,
     chunk_bytes=5 << 20,
 )
-# With occlusion, light may be hidden by, or come from, what lies beside a tile. Bytes are those of all channels.
+# With occlusion the neighbours of a tile emit and hide light in it. Bytes are those of all channels.
 WINDOWS = TileKind(
     sizes=(16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024),
     candidates=17,
@@ -82,6 +78,8 @@ class Grid:
         tile: side of a tile in pixels.
         across: tiles that stand side by side in a block.
         reach: pixels beyond its lower and right end in which a layer counts as a block's own.
+        rows: blocks from top to bottom; the last ones may reach beyond the plane.
+        columns: blocks from left to right.
     """
 
     batch: int
@@ -89,28 +87,10 @@ class Grid:
     width: int
     size: int
     tile: int
-    across: int = 2
-    reach: int = 0
-
-    @property
-    def rows(self) -> int:
-        """Blocks from top to bottom."""
-        return math.ceil(self.height / self.tile)
-
-    @property
-    def columns(self) -> int:
-        """Blocks from left to right."""
-        return math.ceil(self.width / (self.across * self.tile))
-
-    @property
-    def covered_height(self) -> int:
-        """Height of all blocks: the last ones may reach beyond the plane."""
-        return self.rows * self.tile
-
-    @property
-    def covered_width(self) -> int:
-        """Width of all blocks."""
-        return self.columns * self.across * self.tile
+    across: int
+    reach: int
+    rows: int
+    columns: int
 
     @property
     def blocks(self) -> int:
@@ -131,23 +111,23 @@ class Grid:
 
     def present(self, labels: Labels, layers: int, step: int = 1) -> Tensor:
         """Return (blocks, layers) bool: which of the layers a block contains. Labels are of every ``step``-th pixel."""
-        device = labels.layer_index.device
+        device, blocks = labels.layer_index.device, self.batch * self.rows * self.columns
         images = torch.arange(self.batch, device=device)
-        y, x = (torch.arange(0, side + self.reach, step, device=device) for side in (self.height, self.width))
+        y = torch.arange(0, self.height + self.reach, step, device=device)
+        x = torch.arange(0, self.width + self.reach, step, device=device)
         row, column = self.number(images, y, x[:1]) * layers, self.number(images[:1], y[:1], x) * layers
-        reached_y = self._reached(y, self.tile, self.rows)
-        reached_x = self._reached(x, self.across * self.tile, self.columns)
-        present = torch.zeros(self.blocks * layers, dtype=torch.bool, device=device)
+        present = torch.zeros(blocks * layers, dtype=torch.bool, device=device)
         for first in range(0, len(y), 64):  # in a processor's cache
             part = slice(first, first + 64)
             for layer in labels.terms(slice(None), part):
                 keys = (layer + column).add_(row[:, part])
                 present.index_fill_(0, keys.reshape(-1), True)
                 if self.reach:
-                    left, above = keys[..., reached_x] - layers, reached_y[part]
-                    present.index_fill_(0, left.reshape(-1), True)
-                    for reaching in (keys, left):  # the blocks above
-                        present.index_fill_(0, reaching[:, above].sub_(self.columns * layers).reshape(-1), True)
+                    above = keys[:, self._reached(y[part], self.tile, self.rows)] - self.columns * layers
+                    present.index_fill_(0, above.reshape(-1), True)
+                    before = self._reached(x, self.across * self.tile, self.columns)
+                    for own in (keys, above):
+                        present.index_fill_(0, own[..., before].sub_(layers).reshape(-1), True)
         return present.view(-1, layers)
 
     def _reached(self, pixels: Tensor, block: int, blocks: int) -> Tensor:
@@ -183,7 +163,8 @@ def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) ->
 def least_cost(shape: tuple[int, ...], psf_size: int, kind: TileKind) -> float:
     """Return the cost of labels of a shape with one layer in each block, in nanoseconds a channel."""
     grids = candidates(shape, psf_size, kind)
-    return min(_costs(grids, [torch.ones(grid.blocks, dtype=torch.int64) for grid in grids], kind))
+    held = [torch.ones(grid.blocks, dtype=torch.int64) for grid in grids]
+    return min(_costs(grids, held, kind))
 
 
 def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -> list[Grid]:
@@ -199,12 +180,12 @@ def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -
 
 def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: TileKind) -> Grid:
     """Return the grid of the fewest blocks; where overlap is free, in tiles no larger than needed."""
-    tile = size - psf_size + 1
-    if kind.windowed:
-        return Grid(batch, height, width, size, tile, kind.across, psf_size - 1)
+    tile, reach = size - psf_size + 1, psf_size - 1 if kind.windowed else 0
     rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
-    needed = max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2)
-    return Grid(batch, height, width, size, min(tile, needed), kind.across)
+    if not kind.windowed:
+        tile = min(tile, max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2))
+        rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
+    return Grid(batch, height, width, size, tile, kind.across, reach, rows, columns)
 
 
 def _costs(grids: list[Grid], held: list[Tensor], kind: TileKind) -> list[float]:
@@ -212,7 +193,7 @@ def _costs(grids: list[Grid], held: list[Tensor], kind: TileKind) -> list[float]
     if kind.windowed:
         return torch.stack([windows_cost(own, grid.size) for grid, own in zip(grids, held, strict=True)]).tolist()
     pairs = torch.stack([own.sum() for own in held]).tolist()
-    return [tile_cost(grid.size, grid.blocks, count) for grid, count in zip(grids, pairs, strict=True)]
+    return [tile_cost(grid.size, len(own), count) for grid, own, count in zip(grids, held, pairs, strict=True)]
 
 
 def transforms_seconds(nanoseconds: float) -> float:

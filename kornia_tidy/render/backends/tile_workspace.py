@@ -8,7 +8,7 @@ planes of their layers. The planes of one chunk of tiles exist at a time, in one
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -39,10 +39,11 @@ class TileWorkspace:
     def __init__(self, plan: BlockPlan, psfs: Tensor, offset: int) -> None:
         self.plan, self._psfs = plan, psfs
         self._memory: dict[tuple[str, torch.dtype], Tensor] = {}
-        self._dtype, self._device = psfs.dtype, psfs.device
+        self._dtype, self._complex, self._device = psfs.dtype, psfs.dtype.to_complex(), psfs.device
         size, tile = plan.grid.size, plan.grid.tile
-        images = torch.arange(max(chunk.batch.stop - chunk.batch.start for chunk in plan.chunks), device=psfs.device)
-        y = torch.arange(max(chunk.y.stop - chunk.y.start for chunk in plan.chunks), device=psfs.device)
+        largest = max(chunk.extent[0] for chunk in plan.chunks), max(chunk.extent[1] for chunk in plan.chunks)
+        images = torch.arange(largest[0], device=psfs.device)
+        y = torch.arange(largest[1] * tile, device=psfs.device)
         x = torch.arange(plan.grid.width, device=psfs.device)
         # A pixel's block times the number of layers, and where it stands in its window, counted in floats: alike for
         # all rows of blocks.
@@ -63,14 +64,7 @@ class TileWorkspace:
     def no_spectra(self) -> Tensor:
         """Return zeros of the shape of :attr:`spectra`."""
         shape = (self._psfs.shape[1], len(self.plan.present), self.plan.grid.size, self.plan.grid.size)
-        return self._psfs.new_zeros(shape, dtype=self._dtype.to_complex())
-
-    def steps(self) -> Iterator[tuple[Chunk, Offsets, int]]:
-        """Yield each channel of each chunk, and the offsets of the chunk's pixels, which all channels share."""
-        for chunk in self.plan.chunks:
-            offsets = self.offsets(chunk)
-            for channel in range(self._psfs.shape[1]):
-                yield chunk, offsets, channel
+        return self._psfs.new_zeros(shape, dtype=self._complex)
 
     def _buffer(self, name: str, shape: Sequence[int], dtype: torch.dtype | None = None) -> Tensor:
         """Return memory by name, with whatever was left in it."""
@@ -79,24 +73,21 @@ class TileWorkspace:
             self._memory[key] = torch.empty(count, dtype=key[1], device=self._device)
         return self._memory[key][:count].view(*shape)
 
-    def _planes(self, name: str, *count: int) -> Tensor:
-        """Return complex planes by name, (*count, size, size), with whatever was left in them."""
-        size = self.plan.grid.size
-        return self._buffer(name, (*count, size, size), self._dtype.to_complex())
-
     def windows(self, plane: Tensor, chunk: Chunk) -> Tensor:
         """Cut a chunk's windows out of a (B, H', W') plane, black beyond its ends: (blocks, size, size) complex."""
         size, tile = self.plan.grid.size, self.plan.grid.tile
         images, rows, columns = chunk.extent
         height, width = (rows - 1) * tile + size, (2 * columns - 1) * tile + size
-        part = plane[chunk.batch, chunk.y.start : chunk.y.start + height, chunk.x.start : chunk.x.start + width]
+        _, y, x = chunk.pixels
+        part = plane[chunk.batch, y.start : y.start + height, x.start : x.start + width]
         if part.shape[1:] != (height, width):
             whole = self._buffer("part", (images, height, width))
             whole[:, part.shape[1] :] = 0
             whole[:, : part.shape[1], part.shape[2] :] = 0
             whole[:, : part.shape[1], : part.shape[2]] = part
             part = whole
-        tiles, cut = part.unfold(1, size, tile).unfold(2, size, tile), self._planes("windows", *chunk.extent)
+        tiles = part.unfold(1, size, tile).unfold(2, size, tile)
+        cut = self._buffer("windows", (*chunk.extent, size, size), self._complex)
         return torch.complex(tiles[:, :, 0::2], tiles[:, :, 1::2], out=cut).flatten(0, 2)
 
     def add_windows(self, plane: Tensor, windows: Tensor, chunk: Chunk) -> None:
@@ -105,13 +96,13 @@ class TileWorkspace:
         rows, columns = chunk.extent[1:]
         halves = torch.view_as_real(windows).unflatten(0, chunk.extent).movedim(-1, 0)
         for half, light in enumerate(halves):
-            left = chunk.x.start + half * tile
+            left = chunk.pixels[2].start + half * tile
             across = plane[chunk.batch, :, left : left + (columns - 1) * 2 * tile + size]
             # Of every second tile, windows overlap with the row above and below only, by less than a tile: first the
-            # tiles, then what hangs over, so that no pixel is met twice in one addition.
+            # tiles, then the overhang, so that no pixel is met twice in one addition.
             for start, stop in ((0, tile), (tile, size)):
                 if start < stop:
-                    top = chunk.y.start + start
+                    top = chunk.pixels[1].start + start
                     down = across[:, top : top + (rows - 1) * tile + stop - start]
                     down.unfold(1, stop - start, tile).unfold(2, size, 2 * tile).add_(light[..., start:stop, :])
 
@@ -119,11 +110,13 @@ class TileWorkspace:
         """Return a black plane that holds the windows of all blocks."""
         grid = self.plan.grid
         overlap = grid.size - grid.tile
-        return plane.new_zeros(*plane.shape[:2], grid.covered_height + overlap, grid.covered_width + overlap)
+        return plane.new_zeros(
+            *plane.shape[:2], grid.rows * grid.tile + overlap, grid.columns * grid.across * grid.tile + overlap
+        )
 
     def blur(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Return each pair's light times the spectrum of its layer, (pairs, size, size)."""
-        pairs = self._planes("pairs", len(chunk.layer))
+        pairs = self._buffer("pairs", (len(chunk.layer), *light.shape[1:]), self._complex)
         if not self.plan.by_slices:
             return torch.index_select(spectra, 0, chunk.layer, out=pairs).mul_(light.index_select(0, chunk.block))
         for run in chunk.runs:
@@ -132,9 +125,9 @@ class TileWorkspace:
 
     def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Return each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
-        total = self._planes("windows", len(chunk.counts))
+        total = self._buffer("windows", (len(chunk.counts), *own.shape[1:]), self._complex)
         if not self.plan.by_slices:
-            own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._planes("pairs", len(own))))
+            own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._buffer("pairs", own.shape, self._complex)))
             return total.zero_().index_add_(0, chunk.block, own)
         for run in chunk.runs:
             own[run.pairs].mul_(spectra[run.layers])
@@ -168,7 +161,8 @@ class TileWorkspace:
 
     def scatter_to_planes(self, light: Tensor, offsets: Offsets, chunk: Chunk) -> Tensor:
         """Split each pixel over the planes of its layers, the transpose of gathering: (pairs, size, size) complex."""
-        planes = self._planes("pairs", len(chunk.layer)).zero_()
+        size = self.plan.grid.size
+        planes = self._buffer("pairs", (len(chunk.layer), size, size), self._complex).zero_()
         floats = torch.view_as_real(planes).view(-1)
         if offsets.above is not None:
             above, weight = offsets.above

@@ -1,7 +1,6 @@
 """The tiled backend: each tile is convolved by transforms with the PSFs of the layers it contains and with no other.
 
-For the backward pass only the inputs are kept; spectra are computed again. Gradients that are differentiated in turn
-are made by the functions of :mod:`kornia_tidy.render.backends.dense`.
+For the backward pass nothing is kept; spectra are computed again.
 """
 
 from __future__ import annotations
@@ -53,23 +52,24 @@ class TiledBackend:
 
     def seconds(self, scene: LayeredScene) -> float:
         """Return the estimated time with the best tiles for the scene."""
-        kind = self._kind(scene)
-        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psf_size, kind)
-        scene.found[kind] = grid
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        cost, grid = cheapest_grid(scene.labels, len(scene.psfs), scene.psfs.shape[-1], kind)
+        scene.grids[kind] = grid
         if scene.compositing != "occlusion":
             cost += tile_cost(grid.size, 0, scene.sampled_layers)  # the spectra of the PSFs
         return _seconds(scene, cost)
 
     def least_seconds(self, scene: LayeredScene) -> float:
         """Return the time of a scene with one layer in each tile."""
-        shape = tuple(scene.labels.layer_index.shape)
-        return _seconds(scene, least_cost(shape, scene.psf_size, self._kind(scene)))
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        return _seconds(scene, least_cost(tuple(scene.labels.layer_index.shape), scene.psfs.shape[-1], kind))
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
         keep_memory()
-        labels, layers, kind = scene.labels, len(scene.psfs), self._kind(scene)
-        grid = scene.found.get(kind) or choose_grid(labels, layers, scene.psf_size, kind)
+        labels, layers = scene.labels, len(scene.psfs)
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
         plan = plan_blocks(labels, layers, grid, kind)
@@ -80,23 +80,22 @@ class TiledBackend:
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the padded planes and of the PSFs."""
         keep_memory()
-        labels, layers, kind = scene.labels, len(scene.psfs), self._kind(scene)
-        grid = scene.found.get(self.name) or choose_grid(labels, layers, scene.psf_size, kind)
+        labels, layers = scene.labels, len(scene.psfs)
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
         if scene.compositing == "occlusion":
             return occlusion_gradients(occlusion_planes(scene), labels, grid, kind, gradient)
-        plan = plan_blocks(labels, layers, grid, kind)
-        scatters = scene.compositing == "scatter"
-        plane = scene.plane if scatters else _plane_with_spare(scene, grid)
-        tensors = plane, scene.psfs, scene.batch_weight
-        return gradient_pairs(
-            tensors,
-            (_scatter_gradients if scatters else gather_gradients)(
-                plane.detach(), scene.psfs.detach(), gradient, plan, [wants_gradient(x) for x in tensors]
-            ),
-        )
+        plan, scatters = plan_blocks(labels, layers, grid, kind), scene.compositing == "scatter"
+        tensors = scene.plane if scatters else _plane_with_spare(scene, grid), scene.psfs, scene.batch_weight
+        wanted = [wants_gradient(x) for x in tensors]
+        gradients = _scatter_gradients if scatters else gather_gradients
+        return gradient_pairs(tensors, gradients(tensors[0].detach(), scene.psfs.detach(), gradient, plan, wanted))
 
-    def _kind(self, scene: LayeredScene) -> TileKind:
-        return self.windows if scene.compositing == "occlusion" else self.blocks
+
+def _plane_with_spare(scene: LayeredScene, grid: Grid) -> Tensor:
+    """Return the plane with room below and on the right for tiles that hang over, where the border can fill it."""
+    spare = (grid.rows * grid.tile - grid.height, grid.columns * grid.across * grid.tile - grid.width)
+    return pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, spare)
 
 
 def _seconds(scene: LayeredScene, cost: float) -> float:
@@ -107,19 +106,15 @@ def _seconds(scene: LayeredScene, cost: float) -> float:
     return transforms_seconds(cost) * scene.image.shape[1]
 
 
-def _plane_with_spare(scene: LayeredScene, grid: Grid) -> Tensor:
-    """Return the plane with room below and on the right for tiles that hang over, where its border can fill it."""
-    spare = (grid.covered_height - grid.height, grid.covered_width - grid.width)
-    return pad_border(scene.image, scene.psf_size // 2, scene.border, spare)
-
-
 def _gather(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
     work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
     blended = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
-    for chunk, offsets, c in work.steps():
-        light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-        blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-        work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+            blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
+            work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
     return blended
 
 
@@ -139,18 +134,20 @@ def gather_gradients(
     work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
     gradients = TileGradients(wanted, plane, work)
     full = work.tiled_plane(plane) if gradients.plane else None
-    for chunk, offsets, c in work.steps():
-        if gradients.plane or gradients.psfs is not None:
-            own = torch.fft.fft2(work.scatter_to_planes(grad[:, c][chunk.pixels], offsets, chunk))
-        if gradients.layer_weight is not None or gradients.psfs is not None:
-            light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-        if gradients.layer_weight is not None:
-            blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-            gradients.add_layer_weight(blurred, grad[:, c][chunk.pixels], offsets, chunk)
-        if gradients.psfs is not None:
-            gradients.add_psfs(light, own, chunk, c)
-        if full is not None:
-            work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.conjugate[c], chunk)), chunk)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            if gradients.plane or gradients.psfs is not None:
+                own = torch.fft.fft2(work.scatter_to_planes(grad[:, c][chunk.pixels], offsets, chunk))
+            if gradients.layer_weight is not None or gradients.psfs is not None:
+                light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+            if gradients.layer_weight is not None:
+                blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
+                gradients.add_layer_weight(blurred, grad[:, c][chunk.pixels], offsets, chunk)
+            if gradients.psfs is not None:
+                gradients.add_psfs(light, own, chunk, c)
+            if full is not None:
+                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.conjugate[c], chunk)), chunk)
     if full is not None:
         full = full[..., : plane.shape[-2], : plane.shape[-1]]
     return full, gradients.of_psfs(psfs, conjugate=False), gradients.layer_weight
@@ -159,9 +156,11 @@ def gather_gradients(
 def _scatter(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
     work = TileWorkspace(plan, psfs, 0)
     full = work.tiled_plane(plane)
-    for chunk, offsets, c in work.steps():
-        own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
-        work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
+            work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
     return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
 
 
@@ -173,16 +172,18 @@ def _scatter_gradients(
     gradients = TileGradients(wanted, plane, work)
     gathered = torch.empty_like(plane) if gradients.plane else None
     full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
-    for chunk, offsets, c in work.steps():
-        light = torch.fft.fft2(work.windows(full[:, c], chunk))
-        pixels = plane[:, c][chunk.pixels]
-        if gradients.psfs is not None:
-            own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
-            gradients.add_psfs(light, own, chunk, c)
-        if gathered is not None or gradients.layer_weight is not None:
-            blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
-            if gradients.layer_weight is not None:
-                gradients.add_layer_weight(blurred, pixels, offsets, chunk)
-            if gathered is not None:
-                work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            light = torch.fft.fft2(work.windows(full[:, c], chunk))
+            pixels = plane[:, c][chunk.pixels]
+            if gradients.psfs is not None:
+                own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
+                gradients.add_psfs(light, own, chunk, c)
+            if gathered is not None or gradients.layer_weight is not None:
+                blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
+                if gradients.layer_weight is not None:
+                    gradients.add_layer_weight(blurred, pixels, offsets, chunk)
+                if gathered is not None:
+                    work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
     return gathered, gradients.of_psfs(psfs, conjugate=True), gradients.layer_weight

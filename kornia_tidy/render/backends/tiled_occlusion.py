@@ -35,7 +35,7 @@ from kornia_tidy.render.layers import Labels, weight_of_layer
 
 
 class Planes(NamedTuple):
-    """Planes that windows are cut from, and what their layers are blurred by.
+    """The planes that windows are cut from, and the spectra of the PSFs.
 
     Args:
         light: (B, C, H', W') image, with all that lies beyond its border and below and right of its tiles.
@@ -57,7 +57,7 @@ class Planes(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a chunk's tiles are a differentiable function of: windows of the planes, and spectra of their layers."""
+    """The differentiable inputs of a chunk's tiles: windows of the planes, and spectra of their layers."""
 
     light: Tensor  # (N, C, size, size)
     spectra: Tensor  # (N, n, C, size, size), or (N / 2, C, size, size) for pairs of one layer
@@ -115,7 +115,7 @@ def _gradients(
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients with respect to light, PSFs, layer weight, mean and stray light, where they are wanted."""
     padded, grid = _padded(planes, plan), plan.grid
-    grad = pad(grad, (0, grid.covered_width - grid.width, 0, grid.covered_height - grid.height))
+    grad = pad(grad, (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height))
     gradients = {
         name: torch.zeros_like(source, memory_format=torch.contiguous_format)
         for name, source, want in zip(Inputs._fields, padded[:5], wanted, strict=True)
@@ -140,7 +140,7 @@ def _gradients(
 
 
 def _of_planes(gradients: dict[str, Tensor], planes: OcclusionPlanes, present: Tensor) -> tuple[Tensor | None, ...]:
-    """Return the gradients of the scene's planes from those of the padded ones: what hangs over is seen by no pixel."""
+    """Return the gradients of the scene's planes from those of the padded ones, cropped."""
     light, psfs, weight, _, stray_light, _, _ = planes
     of_psfs = of_stray_light = None
     if "spectra" in gradients:  # correlation is the transpose of convolution
@@ -162,7 +162,7 @@ def _padded(planes: OcclusionPlanes, plan: WindowPlan) -> Planes:
     """Return planes as large as all tiles: where the last ones hang over there is nothing new to be computed."""
     light, psfs, weight, mean, stray_light, index, inside = planes
     grid, batch = plan.grid, len(light)
-    rest = (0, grid.covered_width - grid.width, 0, grid.covered_height - grid.height)
+    rest = (0, grid.columns * grid.tile - grid.width, 0, grid.rows * grid.tile - grid.height)
     spectra = torch.fft.fft2(psfs.index_select(0, plan.present).double(), s=(grid.size, grid.size))
     return Planes(
         pad(light, rest, mode="replicate"),
@@ -202,7 +202,7 @@ def _inputs(planes: Planes, chunk: WindowChunk, grid: Grid) -> Inputs:
 
 
 def _add(name: str, gradient: Tensor, part: Tensor, chunk: WindowChunk, grid: Grid) -> None:
-    """Add the gradient of one of a chunk's inputs to that of what it was taken from."""
+    """Add the gradient of a chunk's input to the gradient of its source."""
     if name in ("light", "layer_weight"):
         for own, (image, y, x) in zip(part, chunk.corners, strict=True):
             gradient[image, ..., y : y + grid.size, x : x + grid.size] += own

@@ -35,7 +35,7 @@ class WindowChunk(NamedTuple):
 
 
 class WindowPlan(NamedTuple):
-    """What is computed for one scene: tiles in chunks, and the (D',) layers that are present at all."""
+    """The tiles of one scene in chunks, and the (D',) layers that are present in it."""
 
     grid: Grid
     present: Tensor
@@ -60,7 +60,8 @@ def plan_windows(labels: Labels, layers: int, channels: int, grid: Grid, kind: T
     corners = [grid.corner(number) for number in range(len(here))]
     bounded = torch.tensor([not dark or _within(corner, grid) for corner in corners])
     numbers = here.sum(1)
-    limit = kind.bytes_on(device) // (16 * channels * grid.size**2)
+    limit = kind.chunk_bytes if device.type == "cpu" else kind.accelerator_bytes
+    limit //= 16 * channels * grid.size**2
     chunks = []
     for own_bound in (True, False):
         for number in range(1, int(numbers.max()) + 1):

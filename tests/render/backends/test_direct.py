@@ -14,16 +14,12 @@ from hypothesis import strategies as st
 
 from kornia_tidy.kernels import gather_ops
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends.direct import (
-    SOURCE,
-    count_pairs,
-    direct_cost,
-)
+from kornia_tidy.render.backends.direct import SOURCE, count_pairs, direct_cost
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
 from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.scene import LayeredScene, layered_scene
+from kornia_tidy.render.scene import layered_scene, scene_of_layers
 from tests.base import BaseTester
 from tests.render.backends.test_tiled import ATOL, KINDS, depth_map
 from tests.render.render_tester import RenderTester
@@ -185,10 +181,8 @@ class TestChoice(BaseTester):
     def test_feature_small_psfs_go_directly_and_large_ones_by_transforms(self):
         psi = torch.arange(8.0)[torch.arange(400) // 50][:, None].expand(1, 1, 400, 600)
         image, sides = torch.rand(1, 1, 400, 600), range(1, 131, 6)
-        psfs = {side: torch.rand(8, 1, side, side) for side in sides}
-        direct = [
-            side for side in sides if choose(layered_scene(image, psi, torch.arange(8.0), psfs[side])).name == "direct"
-        ]
+        scenes = {side: layered_scene(image, psi, torch.arange(8.0), torch.rand(8, 1, side, side)) for side in sides}
+        direct = [side for side in sides if choose(scenes[side]).name == "direct"]
         assert direct[0] == 1
         assert 13 < direct[-1] < 100
         assert direct == list(range(1, direct[-1] + 1, 6))
@@ -203,7 +197,7 @@ class TestChoice(BaseTester):
         ],
     )
     def test_exception_names_why_a_scene_is_refused(self, size, where, compositing, message):
-        scene = LayeredScene(
+        scene = scene_of_layers(
             torch.zeros(1, 1, *size, device=where),
             torch.zeros(1, 1, *size, device=where, dtype=torch.int64),
             None,
@@ -211,6 +205,7 @@ class TestChoice(BaseTester):
             None,
             "reflect",
             compositing,
+            torch.float32,
         )
         assert message in (refusal(BACKENDS["direct"], scene) or "")
         with pytest.raises(ValueError, match=f"method 'direct' does not support this scene: .*{message}"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -12,10 +13,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
+from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
-from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
 from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
@@ -173,7 +174,7 @@ class TestTiledRender(RenderTester):
         for by_slices in (True, False):
             work = TileWorkspace(replace(plan, by_slices=by_slices), bank.psfs, 4)
             gradients, found = TileGradients((False, True, False), plane, work), []
-            for chunk, _, c in work.steps():
+            for chunk, c in product(plan.chunks, range(2)):
                 light = torch.fft.fft2(work.windows(plane[:, c], chunk))
                 pairs = work.blur(light, work.spectra[c], chunk)
                 gradients.add_psfs(light, pairs, chunk, c)
