@@ -162,7 +162,7 @@ def _blocks(plain: Tensor, left: Tensor) -> Iterator[slice]:
 # A compiler sees them as one node each: which of the ways is taken, and block by block, is decided when they run.
 
 
-def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:  # noqa: ARG001
+def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
     return weights.new_empty(kernels.shape[0], kernels.shape[1], kernels.shape[1])
 
 
@@ -186,13 +186,13 @@ def _new_gradients(
     weights: Tensor,
     kernels: Tensor,
     gradient: Tensor,
-    wanted: Sequence[bool],  # noqa: ARG001
+    wanted: Sequence[bool],
 ) -> list[Tensor]:
     inputs = zip((field, weights, kernels), wanted, strict=True)
     return [x.new_empty(x.shape) for x, want in inputs if want]
 
 
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:3])
 
 

@@ -1,4 +1,4 @@
-"""The renderer as one operator of torch, so that compiled and exported graphs render by the same backends as eager code.
+"""The renderer as one operator of torch: compiled and exported graphs render by the same backends as eager code.
 
 The operator assigns the layers, chooses the backend and renders when it runs: which layers a tile holds depends on
 values, which a compiler does not know. Its gradient is a second operator, which makes the scene again: only the
@@ -116,13 +116,13 @@ def _gradients_fake(*arguments: Any) -> list[Tensor]:
     return [x.new_empty(x.shape) for x, want in pairs if want and x is not None]
 
 
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:_TENSORS])
     ctx.options = inputs[_TENSORS:]
 
 
 def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    tensors, (*options, method) = ctx.saved_tensors, ctx.options
+    tensors, options = ctx.saved_tensors, ctx.options[:-1]
     layered = options[1] == "linear" and len(tensors[2]) > 1  # otherwise nothing depends smoothly on defocus
     wanted = [
         bool(want and x is not None and (layered or n not in (1, 2)))

@@ -6,7 +6,7 @@ plain operations of torch, from start to end.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import NoReturn
 
@@ -64,7 +64,7 @@ def is_value_unknown() -> bool:
 
 
 @contextmanager
-def recording_in_operator() -> Iterator[None]:
+def recording_in_operator() -> Generator[None]:
     """Let autograd record inside the implementation of an operator.
 
     Where a dispatch mode is active, such as a counter of operations, torch calls implementations with autograd and lazy

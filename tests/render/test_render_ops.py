@@ -50,7 +50,7 @@ class TestRenderLayers(BaseTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("compositing", COMPOSITING)
     def test_dynamo_a_graph_renders_as_eager_code_does(self, compositing, layers, method, dtype):
-        """To the last bit, gradients too: the same code runs. Other layers than those it was traced with are rendered."""
+        """To the last bit, gradients too, and for other layers than those that it was traced with."""
         bank = make_bank(6, 2, 5, dtype=dtype, light=0.8, veil=True)
         psfs, veil = bank.psfs.requires_grad_(), bank.veil.detach().requires_grad_()
         renderer = Renderer(Bank(psfs, bank.defocus, veil), compositing, method, layers=layers)

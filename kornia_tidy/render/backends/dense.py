@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
+from kornia_tidy.render.backend import GradientPairs, gradient_pairs
 from kornia_tidy.render.backends.dense_occlusion import occlude_dense, occlusion_planes
 from kornia_tidy.render.backends.tile_plan import transforms_seconds
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, padded_size, to_spectrum
@@ -47,7 +47,8 @@ class DenseBackend:
     @torch.enable_grad()
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the scene's own tensors: the light is rendered again."""
-        tensors = [x for x in (scene.image, scene.layer_weight, scene.psfs, scene.stray_light) if wants_gradient(x)]
+        given = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+        tensors = [x for x in given if x is not None and x.requires_grad]
         coded = self.render(scene)
         found = torch.autograd.grad(coded, tensors, gradient.to(coded), retain_graph=True, allow_unused=True)
         return gradient_pairs(tensors, found)

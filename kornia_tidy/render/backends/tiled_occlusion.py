@@ -104,9 +104,8 @@ def occlusion_gradients(
     """
     channels = planes.light.shape[1]
     plan = plan_windows(labels, len(planes.psfs), channels, grid, kind, dark=planes.inside is not None)
-    detached = OcclusionPlanes(*(None if x is None else x.detach() for x in planes))
     with torch.no_grad():
-        found = _gradients(detached, plan, gradient, [wants_gradient(x) for x in planes[:5]])
+        found = _gradients(planes, plan, gradient, [wants_gradient(x) for x in planes[:5]])
     return gradient_pairs(planes[:5], found)
 
 
