@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import PixelwiseMask
-from kornia_tidy.mask_design.non_convexity import autocorrelation_witness, extreme_points
+from kornia_tidy.mask_design.non_convexity import autocorrelation_bound, extreme_points
 from kornia_tidy.optics.aperture import circular_aperture
 
 
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[int, Tensor]:
 
 def witness(count: int, aperture: Tensor, noise: torch.Generator) -> Tensor:
     """Return the witness of one set of random masks."""
-    return autocorrelation_witness(PixelwiseMask(count, generator=noise).phase.detach(), aperture)
+    return autocorrelation_bound(PixelwiseMask(count, generator=noise).phase.detach(), aperture)
 
 
 def draw(path: Path, aperture: Tensor, witnesses: dict[int, Tensor]) -> None:

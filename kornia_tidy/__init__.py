@@ -1,4 +1,4 @@
-"""kornia_tidy: a programmable camera, with masks that change during the exposure, in front of any PyTorch pipeline."""
+"""kornia_tidy: a differentiable camera with programmable phase masks that change during the exposure."""
 
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moving_capture

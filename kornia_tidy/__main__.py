@@ -1,4 +1,4 @@
-"""`python -m kornia_tidy` is the command `kornia-tidy`."""
+"""Entry point of `python -m kornia_tidy`, which runs the command `kornia-tidy`."""
 
 import sys
 

@@ -1,7 +1,7 @@
-"""Checks of what users pass in: each raises one sentence that names the value and what is allowed.
+"""Argument checks: each raises an error of one sentence that names the value and the allowed ones.
 
-They are plain raises, so ``python -O`` keeps them. Checks that look at values (and so wait for the device)
-are separate from those that look at shapes and types.
+They raise explicitly, so that ``python -O`` keeps them. Checks of tensor values, which wait for the device, are
+separate from checks of shapes and types.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from torch import Tensor
 def check_choice(name: str, value: Any, allowed: Collection[Any]) -> None:
     """Raise ``ValueError`` unless ``value`` is one of ``allowed``."""
     if value not in allowed:
-        text = repr(value)  # which a damaged file can make as long as it likes
+        text = repr(value)  # a damaged file can make it arbitrarily long
         got = text if len(text) <= 80 else f"{text[:76]} ..."
         raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {got}")
 
 
 def check_positive(name: str, value: float, unit: str = "") -> None:
-    """Raise ``ValueError`` unless ``value`` is a finite number above zero, ``TypeError`` if it is no number."""
+    """Raise ``ValueError`` unless ``value`` is positive and finite, ``TypeError`` if it is not a number."""
     check_number(name, value, unit)
     if not 0 < value < float("inf"):
         raise ValueError(f"{name} must be positive and finite{' ' + unit if unit else ''}, got {value}")
@@ -35,14 +35,14 @@ def check_number(name: str, value: Any, unit: str = "") -> None:
 
 
 def check_metres(name: str, value: float, shortest: float, longest: float, example: str) -> None:
-    """Raise ``ValueError`` unless a length lies where such lengths do; ``example`` says how one is written."""
+    """Raise ``ValueError`` unless a length in metres lies within plausible limits; ``example`` is a valid value."""
     check_positive(name, value, "metres")
     if not shortest <= value <= longest:
         raise ValueError(f"{name} must be metres between {shortest:g} and {longest:g} ({example}), got {value}")
 
 
 def check_part(name: str, value: Any, kind: type | tuple[type, ...], example: str, needs: str = "") -> None:
-    """Raise ``TypeError`` unless ``value`` is of a kind, and has an attribute where one is needed.
+    """Raise ``TypeError`` unless ``value`` has a type and, if given, an attribute.
 
     Example:
         >>> check_part("masks", 5, torch.nn.Module, "phase masks such as PixelwiseMask(5)")
@@ -64,7 +64,7 @@ def check_generator(generator: Any) -> None:
 
 
 def described(value: Any) -> str:
-    """Return a value in words short enough for a message."""
+    """Return a short description of a value for a message."""
     if isinstance(value, bool) or value is None:
         return repr(value)
     if isinstance(value, (int, float)):
@@ -87,7 +87,7 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
 
 
 def _as_float(name: str, value: Tensor) -> str:
-    """How to turn whole numbers into what is meant."""
+    """Return the hint for converting an integer tensor to floating point."""
     if name.startswith("depth"):
         return f": convert it with {name}.float() * 0.001 if it is in millimetres"
     if name.startswith("image") and value.dtype not in (torch.bool, torch.complex64, torch.complex128):
@@ -99,7 +99,7 @@ def check_finite(name: str, value: Tensor) -> None:
     """Raise ``ValueError`` if a value is NaN or infinite. Waits for the device."""
     if not value.numel():
         return
-    lowest, highest = torch.aminmax(value.detach())  # NaN if any value is: one pass, and no map of truths
+    lowest, highest = torch.aminmax(value.detach())  # NaN if any value is: one pass without a boolean tensor
     if not bool(lowest.isfinite() & highest.isfinite()):
         bad = value[~torch.isfinite(value)][0].item()
         raise ValueError(f"{name} must be finite, got {bad}")

@@ -1,4 +1,4 @@
-"""The `kornia-tidy` command: the library from a shell, one sentence for every mistake."""
+"""The `kornia-tidy` command with its subcommands, exit statuses and error messages of one sentence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kornia_tidy.commands import demo, evaluate, info, masks, psf, raw, render, 
 COMMANDS = (simulate, demo, systems, psf, masks, raw, train, evaluate, render, trade, info)
 
 DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS = 0, 2, 70, 130, 141  # exit statuses; 70 is EX_SOFTWARE of sysexits.h
-DEBUG = "KORNIA_TIDY_DEBUG"  # in the environment, set to anything: tracebacks too
+DEBUG = "KORNIA_TIDY_DEBUG"  # environment variable; if set, tracebacks are printed
 
 DESCRIPTION = """\
 A programmable camera: a phase mask in its lens changes while the shutter is open, so that each depth of the scene
@@ -35,8 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments. Default: those of the process.
 
     Returns:
-        Exit status: 0 if all went well, 2 if what was asked for cannot be done, 70 if the library is at fault, 130 if
-        interrupted, 141 if nobody reads any more what it prints.
+        Exit status: 0 after success, 2 for a mistake of the user or of a file, 70 for a fault of the library, 130 if
+        interrupted, 141 if the reader of the output has closed its pipe.
 
     Raises:
         SystemExit: from argparse, after ``--help`` (0) or arguments that it cannot read (2).
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _print_warning  # ty: ignore[invalid-assignment]
         try:
             args.run(args)
-            sys.stdout.flush()  # here, where a full disk or a closed pipe can be told of
+            sys.stdout.flush()  # raises here if the disk is full or the pipe is closed
         except KeyboardInterrupt:
             print("kornia-tidy: interrupted", file=sys.stderr)
             return INTERRUPTED
@@ -59,25 +59,25 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _told(error: Exception) -> int:
-    """Say in one sentence what went wrong; return the exit status."""
+    """Print an error as one sentence, and return the exit status."""
     if os.environ.get(DEBUG):
         traceback.print_exception(error)
     if _is_out_of_memory(error):
-        print(f"kornia-tidy: error: the memory that this needs is not there: {_sentence(error)}", file=sys.stderr)
+        print(f"kornia-tidy: error: out of memory: {_sentence(error)}", file=sys.stderr)
         return CANNOT
     if isinstance(error, (ImportError, KeyError, OSError, TypeError, ValueError)):
         print(f"kornia-tidy: error: {_sentence(error)}", file=sys.stderr)
         return CANNOT
     print(
         f"kornia-tidy: error: this is a fault of kornia-tidy, not yours ({type(error).__name__}: {_sentence(error)}); "
-        f"please report it with what {DEBUG}=1 in the environment prints",
+        f"please report it with the output of the same command with {DEBUG}=1 in the environment",
         file=sys.stderr,
     )
     return BUG
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """PyTorch's and OpenCV's allocators raise errors of no kind of their own on the CPU."""
+    """Return whether an error means exhausted memory, also for generic errors of PyTorch and OpenCV on the CPU."""
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         return True
     text = str(error)
@@ -85,7 +85,7 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 
 def _forget_stdout() -> None:
-    """Let the interpreter end without trying once more to print what nobody reads."""
+    """Redirect standard output to the null device, so that the interpreter's final flush does not fail again."""
     with suppress(OSError, ValueError):
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())
@@ -103,7 +103,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _sentence(error: BaseException) -> str:
-    """Return an error's message in one line; str(KeyError) would put it in quotes."""
+    """Return an error's message in one line, without the quotes of ``str(KeyError)``."""
     text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     return " ".join(text.split()) or type(error).__name__
 

@@ -1,4 +1,4 @@
-"""How exactly to compute: every knob that trades speed for accuracy, and named sets of them."""
+"""Fidelity: the settings of the speed-accuracy trade-off, and presets of them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ LAYERS = ("nearest", "linear", "cubic", "bandlimited")
 
 @dataclass(frozen=True)
 class Fidelity:
-    """The knobs of the speed/accuracy trade. Presets: ``paper``, ``draft``, ``balanced``, ``reference``.
+    """Settings of the speed-accuracy trade-off. Presets: ``paper``, ``draft``, ``balanced``, ``reference``.
 
-    What ``reference`` leaves out, as the root mean square error of a capture, full scale 1:
+    Errors of the preset ``reference``, as the root mean square error of a capture, full scale 1:
 
     - light beyond its window, which is the smallest that holds 97 % but at most 257 px; the rest is spread evenly over
       the image. Against windows of 513 and 641 px, on dead leaves: 9e-4 for five random masks (95 % held) and a flat
@@ -23,11 +23,11 @@ class Fidelity:
     - depths between its layers: 1.5e-6 for random masks, against linear layers 1/64 rad apart (linear layers 1 rad
       apart: 4e-5); up to 1e-4 for a flat mask in focus on black and white shapes.
     - integration over sensor pixels: 5e-12, and rounding.
-    - wavelengths that the camera's spectrum does not have: the reference is at all those that it has, be they three or
-      sixty. How far they are from the spectrum they were sampled from is for who samples it.
+    - sampling of the spectrum: the reference uses all wavelengths of the camera's spectrum. The error from sampling a
+      continuous spectrum at these wavelengths is not included.
 
-    So an error against it is one against the truth down to some 2e-3. Below, it tells how well layers, points and
-    precision are kept for the light within that window.
+    Errors against the reference are therefore true errors down to some 2e-3. Smaller ones compare layers, quadrature
+    points and precision for the light within the window.
 
     The borders, against PSFs of 801 px and the border's continuation of the image (160 x 200 px, one depth, psi = 0,
     530 nm), for white, one half black and the other white, and dead leaves:
@@ -55,7 +55,7 @@ class Fidelity:
     0.5 rad or ``"cubic"`` 1 rad apart for 1e-5, and ``"bandlimited"`` for 1e-6.
 
     Args:
-        name: how the setting calls itself.
+        name: name of the fidelity, for messages.
         propagation: ``"exact"`` integrates every pixel of the mask and of the sensor; ``"paper"`` is the published
             discretisation (one FFT on the 23x23 pupil, point samples), which wraps light around beyond psi = 14.7.
         pixel_tolerance: error allowed to the integral over a sensor pixel of the finest pattern the pupil can make
@@ -63,23 +63,23 @@ class Fidelity:
             more, which every published system has, a sixth with two and 0.3 of it with one. ``"balanced"`` stays
             below 0.1 %, ``"draft"`` below 3 % and ``"reference"`` below 1e-6, for masks of every family and 400 to
             700 nm (``tests/psf/test_exact.py``). Only for exact propagation.
-        layers: how a pixel takes its PSF from those computed: ``"nearest"``, ``"linear"``, ``"cubic"``, or
-            ``"bandlimited"``, which is nearly exact while they lie closer than 2.8 rad (for 470 nm).
+        layers: interpolation of PSFs over defocus: ``"nearest"``, ``"linear"``, ``"cubic"``, or ``"bandlimited"``,
+            which is nearly exact for a spacing below 2.8 rad (at 470 nm).
         layer_spacing: distance between the computed PSFs in radians of defocus.
         wavelengths: at most so many, where the camera's spectrum has more: neighbours then stand together for one, see
             :func:`kornia_tidy.psf.spectral_binning.fewer_wavelengths`. Default: all that the spectrum has.
         window: side of the PSFs in pixels, odd. Default: measured, by the next two.
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
         max_window: largest side of the PSF window in pixels.
-        stray_light: what becomes of the light outside the window: ``"renormalize"`` gives it back to the window,
-            ``"veil"`` spreads it over the image, or what stays of it where the border is ``"zero"``, and ``"discard"``
-            loses it.
+        stray_light: treatment of the light outside the window. ``"renormalize"`` scales the window to sum one,
+            ``"veil"`` spreads the light evenly over the image (with the border ``"zero"`` only the part that stays
+            inside it), and ``"discard"`` drops it.
         double: compute in float64 whatever the type of the image.
         correlate: rotate PSFs by 180 degrees, as the PhaseCam3D family does.
-        occlusion_states: what occlusion-aware compositing looks through, where averaging PSFs is not exact: ``"each"``
-            renders every state of the exposure and averages the images, ``"mean"`` renders once through the average
-            PSFs, in a fifth of the time for five masks. For these, random, the Aloe scene and ``balanced``, the mean is
-            off by 1.6e-5 RMS of full scale, 5e-4 at most.
+        occlusion_states: time average for occlusion-aware compositing, for which averaging PSFs is not exact.
+            ``"each"`` renders every state of the exposure and averages the images. ``"mean"`` renders once with the
+            average PSFs, in a fifth of the time for five masks. With five random masks, the Aloe scene and
+            ``balanced``, its error is 1.6e-5 RMS of full scale, 5e-4 at most.
 
     Raises:
         ValueError: if a value is not allowed.
@@ -124,8 +124,8 @@ class Fidelity:
     def preset(cls, name: str) -> Fidelity:
         """Return a preset by name.
 
-        ``draft`` is for looking, ``balanced`` (the default) for training, ``reference`` for judging the others, and
-        ``paper`` for repeating published numbers. Their measured price stands in the README.
+        ``draft`` is for previews, ``balanced`` (the default) for training, ``reference`` for measuring the errors of
+        the others, and ``paper`` for reproducing published numbers.
 
         Raises:
             ValueError: if there is no such preset.
@@ -135,7 +135,7 @@ class Fidelity:
 
     @classmethod
     def of(cls, value: str | Fidelity) -> Fidelity:
-        """Return a preset by its name, or the settings themselves.
+        """Return a fidelity unchanged, or the preset of a name.
 
         Raises:
             ValueError: if there is no such preset.
@@ -147,7 +147,7 @@ class Fidelity:
         return value
 
     def replace(self, **changes: object) -> Fidelity:
-        """Return a copy with some knobs changed, named as such."""
+        """Return a copy with some settings changed, and a name that says so."""
         return replace(self, **{"name": f"{self.name.removesuffix(', changed')}, changed", **changes})
 
 

@@ -1,4 +1,4 @@
-"""Whole files in and out: one sentence when reading fails, and writes that are never left half done."""
+"""File input and output: errors of one sentence, atomic writes, and locks of folders."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from uuid import uuid4
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where nothing is locked
+except ImportError:  # missing on Windows, where nothing is locked
     fcntl = None
 
-_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # what the writers below call files and folders until they are whole
+_LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of files and folders until they are complete
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -69,7 +69,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what JSON says.
+    """Parse a text of JSON.
 
     Raises:
         ValueError: if it is not JSON, or is nested too deep.
@@ -87,7 +87,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file so that nobody ever sees half of it: under another name in the same folder, then renamed.
+    """Write a file atomically: under a temporary name in the same folder, then renamed.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -99,11 +99,11 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
-    """Give another name in the same folder to write to; what is written there takes the file's place, if all went well.
+    """Yield a temporary path in the same folder; after success the file written there replaces ``path``.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        OSError: if it cannot be written, the disk being full for one; the path is named.
+        OSError: if it cannot be written, for example on a full disk; the message names ``path``.
         ValueError: if the path is a folder.
     """
     path = Path(path)
@@ -121,16 +121,16 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
 
 
 def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], replace: bool = False) -> None:
-    """Write a folder of files so that nobody ever sees a part of it: under another name beside it, then renamed.
+    """Write a folder of files atomically: under a temporary name beside it, then renamed.
 
     Args:
-        path: where to; with ``replace`` a folder of this name is replaced as a whole.
+        path: the folder.
         files: contents by name.
-        replace: whether there may be one.
+        replace: whether an existing folder is replaced as a whole.
 
     Raises:
-        FileExistsError: if there is something of this name that is not to be replaced.
-        FileNotFoundError: if the folder it is to lie in does not exist.
+        FileExistsError: if the path exists and is not to be replaced.
+        FileNotFoundError: if the parent folder does not exist.
     """
     path = Path(path).absolute()
     if not path.parent.is_dir():
@@ -159,17 +159,17 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
 
 @contextmanager
 def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
-    """Hold a folder in a block, so that no other process or thread that asks for it does the same in it.
+    """Lock an existing folder within a block against other processes and threads that lock it.
 
-    The system gives it back when the process ends, however it ends; nothing is left in the folder. Where the file
-    system knows no locks, nothing is held.
+    The system releases the lock when the process ends for whatever reason, and no file is left in the folder. On file
+    systems without locks nothing is locked.
 
     Args:
-        folder: that is there.
-        what: is done in it, in words, for the message.
+        folder: an existing folder.
+        what: the work done in it, in words, for the message.
 
     Raises:
-        ValueError: if another holds it.
+        ValueError: if the folder is locked already.
     """
     if fcntl is None:
         yield
@@ -185,7 +185,7 @@ def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
         try:
             yield
         finally:
-            # Forks, such as workers that outlive the block, hold the same lock: closing would leave it with them.
+            # Forked processes that outlive the block share the lock, and closing the file would leave it with them.
             with suppress(OSError):
                 fcntl.flock(place, fcntl.LOCK_UN)
     finally:
@@ -194,17 +194,17 @@ def only_here(folder: str | os.PathLike[str], what: str) -> Generator[None]:
 
 @contextmanager
 def _named(path: Path) -> Generator[None]:
-    """Name the file in what the system says of its own temporary one, or of none: no space left on device."""
+    """Put the path of the final file into errors about the temporary file, such as "no space left on device"."""
     try:
         yield
-    except (FileExistsError, FileNotFoundError):  # told from others by those who write into one folder together
+    except (FileExistsError, FileNotFoundError):  # distinguishes processes that write into one folder
         raise
     except OSError as error:
         raise OSError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:
-    """Remove from a folder what writers left that were killed at work. Nobody may be writing into it."""
+    """Remove the temporary files of killed processes from a folder into which no process is writing."""
     for path in Path(folder).iterdir():
         if _LEFTOVER.fullmatch(path.name):
             if path.is_dir():

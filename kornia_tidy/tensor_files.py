@@ -1,4 +1,4 @@
-"""Safetensors files: tensors by name, and words beside them, read without trust in either."""
+"""Reader of safetensors files, with checks against damaged and malicious content."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ def read_tensors(
 
     Args:
         path: the file.
-        what: it should be, in words, for the message.
+        what: description of the expected file, for the message.
         device: of the tensors.
 
     Returns:
-        Tensors by name, in memory of their own and not the file's; and the words of its header, by name.
+        Tensors by name, copied from the file, and the metadata of its header by name.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no regular file, damaged, or of another kind.
+        ValueError: if it is not a regular file, damaged, or of another format.
 
     Example:
         >>> import tempfile
@@ -43,5 +43,5 @@ def read_tensors(
         with safe_open(path, framework="pt", device=str(device)) as file:
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (no mapping)
             return tensors, dict(file.metadata() or {})
-    except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # the latter of types PyTorch does not know
+    except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # KeyError: a data type that PyTorch lacks
         raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error!s:.300}") from None

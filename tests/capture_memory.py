@@ -1,4 +1,4 @@
-"""What a capture takes of memory beside what is predicted, in a process of its own."""
+"""Measured and predicted peak memory of a capture, in a separate process."""
 
 from __future__ import annotations
 

@@ -40,4 +40,4 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def _seed(request: pytest.FixtureRequest) -> None:
     torch.manual_seed(0)
     if "dynamo" in request.node.name:
-        torch.compiler.reset()  # what other tests had it compile would make it guess what varies
+        torch.compiler.reset()  # compilations of other tests would affect its guesses of dynamic shapes

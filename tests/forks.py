@@ -1,4 +1,4 @@
-"""Forks of a test's own process, for those who are to be killed: they need no imports of their own."""
+"""Forks of the test process for tests that kill a process; a fork needs no new imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests as other machines would run them: one factor at a time, then a table of what was run and what was not.
+"""Portability tests: the test suite under the conditions of other machines, one factor at a time, with a table.
 
 ``python -m tests.portable`` takes up to 20 minutes on two cores; ``--quick`` takes a share of it, ``--only aten`` the
 factors whose names begin so, and ``--list`` shows them all.
@@ -23,6 +23,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 KERNELS = (
+    "tests/kernels/test_gather_ops.py",
+    "tests/kernels/test_mutual_intensity_ops.py",
+    "tests/kernels/test_occlusion_ops.py",
     "tests/render/backends/test_direct.py",
     "tests/render/backends/test_direct_occlusion.py",
     "tests/psf/test_mutual_intensity.py",
@@ -65,7 +68,7 @@ AVX2 = frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"})
 AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512dq", "avx512vl"}
 V2 = frozenset({"sse4_2", "ssse3", "popcnt", "cx16"})
 
-# Printed by an interpreter in a factor's environment: what is in use there.
+# Prints, in the environment of a factor, the vector width, compiler and threads in use.
 PROBE = """
 import hashlib, json, warnings
 import torch
@@ -86,7 +89,7 @@ print(json.dumps({
 
 @dataclass(frozen=True)
 class Machine:
-    """What this machine is, and what is in use on it if nobody says otherwise."""
+    """Processor of this machine, with the vector width, compiler and threads used by default."""
 
     processor: str
     can: frozenset[str]
@@ -207,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def this_machine() -> Machine:
-    """Look at the processor, and at what is in use without any factor."""
+    """Detect the processor and the defaults without any factor."""
     about: dict[str, str] = {}
     if (path := Path("/proc/cpuinfo")).is_file():
         lines = path.read_text().split("\n\n")[0].splitlines()
@@ -217,14 +220,14 @@ def this_machine() -> Machine:
 
 
 def environment(factor: dict[str, str]) -> dict[str, str]:
-    """Return a factor's environment: only what it names differs from what `make test` has."""
+    """Return the environment of `make test` with the variables of a factor."""
     names = {name for each in FACTORS for name in each.environment}
     plain = {key: value for key, value in os.environ.items() if key not in names}
     return {**plain, "OMP_NUM_THREADS": "1", **factor}
 
 
 def probe(factor: dict[str, str]) -> dict[str, object]:
-    """Return what is in use in an environment; empty if not even that can be found out."""
+    """Return the vector width, compiler and threads in use in an environment; empty if the probe fails."""
     command = [sys.executable, "-c", PROBE]
     told = subprocess.run(
         command, env=environment(factor), cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
@@ -257,7 +260,7 @@ def run(factor: Factor, machine: Machine, tests: tuple[str, ...]) -> Outcome:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", f"--junitxml={report}", "-p"]
         command += ["no:cacheprovider", f"--numprocesses={min(8, processes)}", "--dist=loadfile"]
-        # What is meant here is no warning: code that is not compiled, or without threads.
+        # Missing compiled code or threads are intended here and no warning.
         command += ["-W", "ignore:compiled code", *drop_nested(tests)]
         status = subprocess.run(command, env=environment(factor.environment), cwd=ROOT, check=False).returncode
         if report.is_file():
@@ -284,7 +287,7 @@ def count(outcome: Outcome, report: ET.Element) -> None:
 
 
 def table(outcomes: Sequence[Outcome], machine: Machine) -> str:
-    """Return what was run as a table of Markdown."""
+    """Return the outcomes as a table in Markdown."""
     rows = [
         f"\n{machine.processor}, {os.cpu_count()} cores; PyTorch's own choice is {machine.usual.get('aten')}\n",
         "| factor | tests | passed | failed | skipped | s | |",

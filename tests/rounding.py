@@ -1,4 +1,4 @@
-"""Bounds of round-off that follow from what is computed, for any order of summation and with or without fused products.
+"""Round-off bounds by error analysis, for any order of summation and with or without fused multiply-add.
 
 Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd edition, 3.1 and 3.5 (complex arithmetic: 3.6).
 """

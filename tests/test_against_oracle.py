@@ -43,7 +43,7 @@ WAVELENGTHS = (470e-9, 540e-9, 620e-9)
 
 
 def heights(masks: PhaseMasks, index: float = 1.5) -> np.ndarray:
-    """Metres of an element whose index at 530 nm is given, in float64 (the library's own are float32)."""
+    """Heights in metres for a refractive index at 530 nm, in float64 (those of the library are float32)."""
     return masks.phase.detach().double().numpy() * 530e-9 / (2 * math.pi * (index - 1))
 
 
@@ -64,7 +64,7 @@ def capture_of(optics: TiDyOptics, image: np.ndarray, depth: np.ndarray) -> np.n
 
 
 class TestOracle(BaseTester):
-    """What the model itself is judged by: closed forms, and another model where there is one."""
+    """The oracle itself against closed forms and, if there is one, another model."""
 
     def test_feature_it_imports_numpy_and_nothing_of_ours(self):
         allowed = {"__future__", "collections.abc", "functools", "math", "numpy"}
@@ -269,7 +269,7 @@ class TestCaptures(BaseTester):
 
     @pytest.mark.parametrize("kind", ["flat", "noise"])
     def test_feature_reference_captures_depths_between_its_layers(self, kind):
-        r"""Three depths that are no layers; what lies between layers is off by what bounds the bend of a PSF.
+        r"""Three depths between layers; the interpolation error is bounded by the second derivative of a PSF.
 
         Between layers h apart a straight line is off by h^2 / 8 times the second derivative, and layers are moved by
         half of that to meet it. But for a constant phase the field in the pupil has the derivative i (rho^2 - 1/2) over
@@ -330,7 +330,7 @@ class TestNoise(BaseTester):
         assert abs(float((drawn - mean).square().mean()) - variance) < 5 * spread
 
     def test_feature_a_camera_puts_its_noise_into_linear_light(self):
-        """A grey wall in focus: the mean of what is decoded again is its light, the spread that of the sensor."""
+        """A grey wall in focus: the decoded capture has the mean of its light and the deviation of the sensor noise."""
         optics = TiDyOptics(PixelwiseMask(1), ThinLensCamera(), None, SensorNoise(0.01), Fidelity(window=7))
         grey = torch.full((1, 3, 200, 200), 0.6, dtype=torch.float64)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The benchmarks are left out of the tests: here every one of them runs once, and what they write is checked."""
+"""Smoke tests of the benchmarks, which the test suite does not time: each runs once, and its output is checked."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class TestMain(BaseTester):
     def test_exception_no_memory_is_one_sentence_and_status_2(self, action, command_that, capsys):
         assert cli.main(command_that(action)) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("kornia-tidy: error: the memory that this needs is not there")
+        assert line.startswith("kornia-tidy: error: out of memory")
 
     def test_feature_a_reader_that_leaves_is_no_error(self, tmp_path, capfd):
         """As `kornia-tidy ... | head` does: nothing is said, and the status is that of SIGPIPE."""

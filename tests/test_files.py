@@ -1,4 +1,4 @@
-"""Reading and writing whole files: what is no file, what does not fit, what is locked."""
+"""Reading and atomic writing of files: missing files, full disks and locked folders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.forks import fork, wait
 
 @pytest.fixture
 def small_disk():
-    """A limit on the size of files stands for the disk: writing fails half-way, as on a full one."""
+    """Simulate a full disk by a limit on the size of files, so that writing fails half-way."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 12, limits[1]))

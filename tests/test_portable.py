@@ -17,7 +17,7 @@ USED = {"aten": "DEFAULT", "mkl": "1", "compiled": True, "threads": 1}
 
 @pytest.fixture
 def probed(monkeypatch):
-    """What is in use, whatever is asked for; and no processes."""
+    """Replace the probe by a fixed answer, so that no process is started."""
     used = dict(USED)
     monkeypatch.setattr(portable, "probe", lambda environment: used)
     monkeypatch.setattr(portable, "this_machine", lambda: PLAIN)

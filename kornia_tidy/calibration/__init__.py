@@ -1,4 +1,5 @@
-"""Measuring a real camera: its noise from flat fields (``noise/``), its PSFs from captures of points (``psf/``).
+"""Calibration of a real camera: its noise from flat fields (``noise/``), its PSFs from captures of points (``psf/``).
 
-Captures come in; a sensor's parameters, a PSF bank, or the mask that makes such PSFs go out.
+Raw captures come in. Sensor parameters, a measured PSF bank, or the mask that explains the measured PSFs go out. Read
+``noise/photon_transfer.py`` or ``psf/measured_psfs.py`` first.
 """

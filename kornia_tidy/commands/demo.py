@@ -1,4 +1,4 @@
-"""`kornia-tidy demo`: from a scene to a coded capture and back, as two pictures."""
+"""`kornia-tidy demo`: demonstration of capture and reconstruction, as two figures."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 DESCRIPTION = """\
-Photograph a scene with a camera whose five phase masks were learnt together with a network, and let the network
-reconstruct from that one capture an image in focus everywhere and the depth of every pixel; beside it the same with one
-mask and with a plain lens, and what five masks give that were learnt for the image alone (EDoF). Without IMAGE and
-DEPTH the scene is made by the library. The depths of IMAGE are stretched, in dioptres, over the range for which the
-masks were learnt.
+Photograph a scene with a camera with five phase masks, and reconstruct an all-in-focus image and the depth of every
+pixel from this one capture with the network that was trained together with the masks. For comparison the same is done
+with one mask, with a plain lens, and with five masks learnt for the image alone (EDoF). Without IMAGE and DEPTH the
+scene is generated. The depths of IMAGE are stretched, in dioptres, over the range for which the masks were learnt.
 """
 
 SYSTEMS = {"plain": "joint-0", "K = 1": "joint-1", "K = 5": "joint-5", "K=5 EDoF": "edof-5"}
@@ -64,7 +63,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Simulate the captures, reconstruct, draw the pictures and write all."""
+    """Simulate captures, reconstruct images and depth, and write the two figures."""
     if (args.image is None) != (args.depth is None):
         raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
     require_matplotlib()
@@ -91,7 +90,7 @@ def run(args: argparse.Namespace) -> None:
             systems = {name: load_pretrained(which) for name, which in SYSTEMS.items()}
             optics = systems["K = 5"].optics
             camera = optics.camera
-            assert isinstance(camera, ThinLensCamera)  # which the systems were trained with
+            assert isinstance(camera, ThinLensCamera)  # as in the training of the systems
             scene = _scene(args, camera)
             near = nearness(camera, scene.depth)
         estimates = {}
@@ -167,7 +166,7 @@ def _estimate(name: str, system: TrainedSystem, scene: Scene, noise: int) -> Est
 
 
 def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:
-    """Return a scene in colour whose depths fill the camera's range."""
+    """Return a colour scene with depths stretched over the camera's range."""
     if args.image is None:
         return DeadLeaves(1, args.size, args.size, depth_range=camera.depth_range, seed=args.seed).read(0)
     image, depth, valid = read_scene(args)
@@ -181,7 +180,7 @@ def _scene(args: argparse.Namespace, camera: ThinLensCamera) -> Scene:
 
 
 def stretched(depth: Tensor, valid: Tensor, camera: ThinLensCamera) -> Tensor:
-    """Move the depths of a scene so that they fill a camera's range, evenly in dioptres.
+    """Stretch the depths of a scene, linearly in dioptres, over a camera's range.
 
     Example:
         >>> depth = torch.tensor([[[2.0, 3.0, 6.0]]])

@@ -1,4 +1,4 @@
-"""`kornia-tidy evaluate`: how well a trained system does, scene by scene."""
+"""`kornia-tidy evaluate`: error measures of a trained system on test scenes."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, metric_range, table, write_table
 
 DESCRIPTION = """\
-Let a trained camera and network see scenes they were not trained on. FOLDER gets
-results.csv (a line a scene), summary.json (means and settings), and of the first scenes
-the capture, the estimates, the truths and the errors times 3, as pictures.
+Evaluate a trained camera and network on scenes that were not used for training. FOLDER
+gets results.csv (one line per scene), summary.json (means and settings), and pictures of
+the first scenes: capture, estimates, ground truth, and errors times 3.
 
-image_rmse, image_psnr (dB), image_ssim: of the image in [0, 1], not clipped to it.
-depth_rmse: of depth as it is learnt, 0 at the far and 1 at the near end of the camera's
-  range, linear in inverse depth; depth_rmse_radians: of the defocus behind it.
+image_rmse, image_psnr (dB), image_ssim: of the image in [0, 1], without clipping.
+depth_rmse: of normalised inverse depth, 0 at the far and 1 at the near end of the
+  camera's range; depth_rmse_radians: of the corresponding defocus.
 depth_rmse_metres, depth_abs_rel, depth_log10, depth_delta1 to 3 (within 1.25, 1.25^2 and
-  1.25^3): of depth in metres, where it is known and within the camera's range, and at
-  most 32 times as far as its near end if it reaches to infinity. Estimates are clamped
-  to this range. depth_counted: the share of pixels that count.
+  1.25^3): of depth in metres, over pixels of known depth within the camera's range. A
+  range that reaches to infinity ends at 32 times its near end. Estimates are clamped to
+  the range. depth_counted: share of the pixels evaluated.
 """
 
 
@@ -37,7 +37,7 @@ def add_parser(subparsers: Any) -> None:
     """Describe the command to argparse."""
     parser = subparsers.add_parser(
         "evaluate",
-        help="how well a trained system does",
+        help="error measures of a trained system",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -45,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help="best.safetensors or last.safetensors of a run")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="made if missing (default: evaluation, beside it)")
     parser.add_argument(
-        "--scenes", type=int, metavar="N", help="number (default: all that are for testing; 32 of scenes made here)"
+        "--scenes", type=int, metavar="N", help="number (default: the whole test split; 32 of generated scenes)"
     )
     parser.add_argument("--pictures", type=int, default=8, metavar="N", help="scenes drawn (default: 8)")
     parser.add_argument("--noise-seed", type=seed, default=0, metavar="N", help="of the sensor (default: 0)")
@@ -59,7 +59,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Evaluate, write and tell."""
+    """Evaluate the system, write results and pictures, and print a summary."""
     folder = Path(args.output) if args.output else Path(args.checkpoint).parent / "evaluation"
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> None:
     trained = system.settings
     settings = trained.replace(**{name: value for name, value in given_settings(args).items() if name != "scenes"})
     if settings.data != trained.data and "root" not in args:
-        settings = settings.replace(root=None)  # the folder was that of the other data
+        settings = settings.replace(root=None)  # the stored folder belongs to the other data set
     seen = (settings.data, _place(settings.root)) == (trained.data, _place(trained.root))
     split = "test" if seen or settings.data != "rgbd-folder" else "all"
     scenes = make_scenes(settings, split, args.scenes)

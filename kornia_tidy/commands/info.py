@@ -16,21 +16,20 @@ import torch
 
 import kornia_tidy
 from kornia_tidy.commands.report import tell
+from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops
 from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
-from kornia_tidy.psf import mutual_intensity
-from kornia_tidy.render.backends import direct, direct_occlusion
 
 DESCRIPTION = """\
-Tell what kornia_tidy runs on: versions of the packages it uses, processor and threads,
-the C compiler, and the compiled code with the folder that it is kept in. What is not
-compiled yet is compiled, which takes some seconds. Please put this into bug reports.
+Print the environment of kornia_tidy: versions of packages, processor and threads, the C
+compiler, and the compiled kernels with their cache folder. Kernels that are not compiled
+yet are compiled, which takes some seconds. Please include this in bug reports.
 """
 
 PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
     *("lightning", "matplotlib", "h5py"),
 )
-SOURCES = (direct.SOURCE, direct_occlusion.SOURCE, mutual_intensity.SOURCE)
+SOURCES = (gather_ops.SOURCE, occlusion_ops.SOURCE, mutual_intensity_ops.SOURCE)
 
 
 def add_parser(subparsers: Any) -> None:
@@ -45,13 +44,13 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(_: argparse.Namespace) -> None:
-    """Tell all of it."""
+    """Print the report line by line."""
     for topic, text in lines():
         tell(topic, _without_home(text))
 
 
 def lines() -> Iterator[tuple[str, str]]:
-    """Yield topics and what there is to say of them."""
+    """Yield the lines of the report as topics and texts."""
     yield "package", f"kornia_tidy {kornia_tidy.__version__}, Python {platform.python_version()}"
     yield "uses", ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
     yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}"
@@ -112,6 +111,6 @@ def _cache() -> str:
 
 
 def _without_home(text: str) -> str:
-    """Leave the user's name out of what may be shown to everybody."""
+    """Replace the home folder in a path by ``~``, to keep the user's name out of public reports."""
     home = os.path.expanduser("~")
     return text.replace(home, "~") if len(home) > 1 else text

@@ -1,4 +1,4 @@
-"""`kornia-tidy masks`: masks to the panel of a modulator or to a printer, and back."""
+"""`kornia-tidy masks`: export of masks to SLM frames, heights or STL, and import of frames."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ MATERIALS = {
 }
 
 DESCRIPTION = """\
-Phase masks, out of the library and back. MASKS is a file of heights in metres
-(.npy, K x rows x columns) or a camera's state_dict (.safetensors, masks.phase
-in radians at 530 nm). A state does not tell a constraint: masks with one, and
-families without a phase, are exported from Python (kornia_tidy.mask_export).
+Export and import phase masks. MASKS is a file of heights in metres (.npy, K x rows x
+columns) or a camera's state_dict (.safetensors, masks.phase in radians at 530 nm). A
+state_dict does not contain the constraint of masks: export masks with a constraint, and
+families without the parameter phase, from Python (kornia_tidy.mask_export).
 """
 
 EXPORT = """\
-Write masks for the laboratory, by the name of OUT:
-  a folder  one frame a mask for the panel of a phase modulator (PNG or TIFF),
-            timing.csv, and frames.json with all that is needed to read them
+Export masks in the format given by the name of OUT:
+  a folder  one frame per mask for the panel of a phase modulator (PNG or TIFF),
+            timing.csv, and frames.json with the settings needed to read them
             back; up to 8 bits in 8-bit files, 9 and 10 in the least
             significant bits of 16-bit files
   x.npy     heights in metres
   x.stl     one mask on a plate, in millimetres
-All of it is written or nothing, and frames are read back and compared.
+Files are written atomically, and frames are read back and compared.
 """
 
 EXPORT_EXAMPLES = """\
@@ -73,7 +73,7 @@ def add_parser(subparsers: Any) -> None:
     )
     actions = masks.add_subparsers(required=True, metavar="ACTION", title="actions")
 
-    show = actions.add_parser("show", help="say what masks a file holds", description="Say what masks a file holds.")
+    show = actions.add_parser("show", help="list the masks of a file", description="List the masks of a file.")
     _add_masks(show)
     show.set_defaults(run=show_masks)
 
@@ -91,8 +91,8 @@ def add_parser(subparsers: Any) -> None:
         "--pupil-radius",
         type=float,
         metavar="M",
-        help="of the pupil, on the panel or the plate, metres; 2.3 of it span the mask (default on a panel: the "
-        "largest that fits with whole panel pixels a mask pixel)",
+        help="of the pupil on the panel or the plate, metres; the mask is 2.3 radii wide (default on a panel: the "
+        "largest with a whole number of panel pixels per mask pixel)",
     )
     _add_panel(export)
     _add_timing(export)
@@ -111,7 +111,7 @@ def add_parser(subparsers: Any) -> None:
     back.add_argument(
         "--shown",
         action="store_true",
-        help="heights as the panel shows them, without the whole waves that it cannot (default: with them)",
+        help="heights as shown by the panel, wrapped to one wave (default: with the whole waves restored)",
     )
     _add_material(back)
     back.add_argument("--force", action="store_true", help="replace OUT")
@@ -119,7 +119,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show_masks(args: argparse.Namespace) -> None:
-    """Say what masks a file holds."""
+    """Print the masks of a file with their size and heights."""
     heights = read_heights(args.masks, MATERIALS[args.material])
     tell("masks", _in_words(heights))
     for k, one in enumerate(heights):
@@ -133,7 +133,7 @@ def show_masks(args: argparse.Namespace) -> None:
 
 
 def export_masks(args: argparse.Namespace) -> None:
-    """Write SLM frames, heights or STL."""
+    """Export masks as SLM frames, heights or STL, by the name of the output."""
     kind = Path(args.output).suffix.lower()
     check_choice("the suffix of what to write", kind, ("", ".npy", ".stl"))
     _check_absent(args.output, args.force, args.masks, folder=not kind)
@@ -150,7 +150,7 @@ def export_masks(args: argparse.Namespace) -> None:
 
 
 def import_masks(args: argparse.Namespace) -> None:
-    """Read SLM frames back."""
+    """Import SLM frames, check them, and write their heights."""
     if args.output is not None:
         check_choice("the suffix of what to write", Path(args.output).suffix.lower(), (".npy", ".safetensors"))
         _check_absent(args.output, args.force)
@@ -271,7 +271,7 @@ def _panel_size(text: str) -> tuple[int, int]:
 
 
 def _numbers(path: str) -> list[float]:
-    """Return the numbers of a text file, whatever separates them."""
+    """Return the numbers of a text file, separated by white space, commas or semicolons."""
     try:
         return [float(word) for word in re.split(r"[\s,;]+", read_bytes(path).decode()) if word]
     except ValueError as error:
@@ -279,11 +279,11 @@ def _numbers(path: str) -> list[float]:
 
 
 def _check_absent(path: str, force: bool, source: str | None = None, folder: bool = False) -> None:
-    """Refuse what may not be replaced, before any work.
+    """Check before any work that the output may be written.
 
     Raises:
-        FileExistsError: if it is there and not to be replaced.
-        FileNotFoundError: if the folder it is to lie in does not exist.
+        FileExistsError: if it exists and is not to be replaced.
+        FileNotFoundError: if its parent folder does not exist.
     """
     target = Path(path)
     if not target.absolute().parent.is_dir():

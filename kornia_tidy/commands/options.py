@@ -1,4 +1,4 @@
-"""Options that subcommands share: which scene, which camera, and how they become the library's objects."""
+"""Shared options of subcommands for scenes and cameras, and their conversion to objects of the library."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from kornia_tidy.data.image_files import SUFFIXES
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
-MOST_PROCESSES = 1024  # more would only bring a machine down
-MOST_MASKS = 1024  # PSFs of more take days
+MOST_PROCESSES = 1024  # more would exhaust a machine
+MOST_MASKS = 1024  # PSFs of more masks take days
 
 
 def add_depth_options(parser: argparse.ArgumentParser) -> None:
-    """Add what a depth file needs to become metres."""
+    """Add the options that convert a depth file to metres."""
     group = parser.add_argument_group(
         "depth file",
         "Metres are stored value * scale or, for the disparity of a stereo pair,\n"
@@ -78,7 +78,7 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_lens_options(group: argparse._ArgumentGroup) -> None:
-    """Add a lens and the pixels behind it, in SI units; what has no default here has that of the camera."""
+    """Add options for lens and pixel pitch in SI units; missing defaults are those of the camera."""
     group.add_argument(
         "--focal-length", type=float, default=50e-3, metavar="M", help="longer enlarges the PSF (default: 0.05)"
     )
@@ -107,14 +107,14 @@ def seed(text: str) -> int:
 
 
 def processes(text: str) -> int:
-    """Return a number of processes that a machine may start, 0 included."""
+    """Parse a number of processes, from 0 to a safe maximum."""
     if not (text.isascii() and text.isdigit() and int(text[:9]) <= MOST_PROCESSES):
         raise argparse.ArgumentTypeError(f"must be a whole number from 0 to {MOST_PROCESSES}, got {text!r:.40}")
     return int(text)
 
 
 def mask_count(text: str) -> int:
-    """Return a number of masks of one exposure, if that many can be thought of."""
+    """Parse the number of masks of one exposure, up to a safe maximum."""
     value = int(text)
     if value > MOST_MASKS:
         raise argparse.ArgumentTypeError(f"must be {MOST_MASKS} masks or fewer, got {text:.40}")
@@ -139,7 +139,7 @@ def make_camera(args: argparse.Namespace, scene: Scene) -> ThinLensCamera:
     """Return the camera named by the arguments, or the one that fits the scene.
 
     Raises:
-        ValueError: if ``--fit-depth`` comes with what it is to choose, or no lens can do what is asked.
+        ValueError: if ``--fit-depth`` comes with an option that it chooses, or no lens fits.
     """
     if not args.fit_depth:
         return make_lens(args, None if args.depth_range is None else tuple(args.depth_range))
@@ -163,12 +163,12 @@ def make_lens(args: argparse.Namespace, depth_range: tuple[float, float] | None)
 
 
 def middle_depths(depth: Tensor, valid: Tensor) -> tuple[float, float]:
-    """Return the nearest and farthest depth in metres, less half a percent of the known pixels at either end.
+    """Return the nearest and farthest depth in metres without half a percent of the known pixels at either end.
 
-    Counted in dioptres, so that a sky at infinity is part of the scene.
+    Percentiles are taken in dioptres, so that infinite depths are included.
 
     Raises:
-        ValueError: if all of the scene lies at one depth, which no choice of aperture can spread over defocus.
+        ValueError: if the whole scene lies at one depth.
 
     Example:
         >>> import torch
@@ -183,7 +183,7 @@ def middle_depths(depth: Tensor, valid: Tensor) -> tuple[float, float]:
 
 
 def check_output(path: str, *inputs: str | None, bits: int = 8) -> None:
-    """Refuse a picture's path that could not be written, or that would replace an input, before any work.
+    """Check before any work that a picture can be written to a path and does not replace an input.
 
     Raises:
         FileNotFoundError: if the folder does not exist.

@@ -1,4 +1,4 @@
-"""`kornia-tidy psf`: what a camera makes of a point at each depth and in each colour, drawn and in numbers."""
+"""`kornia-tidy psf`: figure and numbers of a camera's PSFs over depth and colour."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kornia_tidy.fidelity import PRESETS, Fidelity
 from kornia_tidy.figures.depth import depth_at
 from kornia_tidy.figures.psf import PSFSheet, draw_psfs, ring_centres
 from kornia_tidy.figures.style import require_matplotlib
-from kornia_tidy.figures.system_survey import contrast_transfer
+from kornia_tidy.figures.system_statistics import contrast_transfer
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.mask_export.mask_files import SUFFIXES, read_heights
@@ -28,16 +28,16 @@ from kornia_tidy.systems.presets import SYSTEMS
 
 DESCRIPTION = """\
 Draw the point spread functions (PSFs) of a camera: a montage over depth and colour,
-a slice through focus, and the contrast that is left of fine detail (MTF). CAMERA is
+a slice through focus, and the modulation transfer function (MTF). CAMERA is
 the name of a published system, a checkpoint of a training (best.safetensors), or a
 file of masks: heights in metres (.npy) or a camera's state_dict (.safetensors).
 
-Told for each depth and colour:
-  held    share of a point's light that falls into the window (ensquared energy)
-  peak    share that falls into the brightest pixel
-  Strehl  the peak over that of the same lens in focus without a mask
-  MTF50   spatial frequency at which contrast has fallen to a half, in cycles a
-          pixel; 0.5 is the finest that the pixels can show
+Printed for each depth and colour:
+  held    share of a point's light inside the window (ensquared energy)
+  peak    share of the light in the brightest pixel
+  Strehl  the peak relative to that of the same lens in focus without a mask
+  MTF50   spatial frequency at which contrast falls to one half, in cycles per
+          pixel; 0.5 is the Nyquist limit
 """
 
 EPILOG = f"""\
@@ -87,7 +87,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Compute the PSFs, tell their numbers and draw them."""
+    """Compute the PSFs, print their numbers and draw them."""
     check_output(args.output, args.camera)
     require_matplotlib()
     stages = Stages()
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _optics(args: argparse.Namespace) -> TiDyOptics:
-    """The camera that is asked for, which loses the light outside its PSFs' window: only so can that be told."""
+    """Return the camera of the arguments, with stray light discarded so that the ensquared energy can be measured."""
     name, fidelity, lens = args.camera, args.fidelity or "balanced", make_lens(args, None)
     if name in SYSTEMS:
         generator = torch.Generator().manual_seed(args.mask_seed)
@@ -162,7 +162,7 @@ def _optics(args: argparse.Namespace) -> TiDyOptics:
 
 
 def _trained(path: str) -> TiDyOptics | None:
-    """The camera of a checkpoint; None for a file of masks."""
+    """Return the camera of a checkpoint; None for a file of masks."""
     if Path(path).suffix.lower() != ".safetensors":
         return None
     try:
@@ -183,7 +183,7 @@ def _refuse_lens(name: str, lens: ThinLensCamera) -> None:
 
 
 def _defocus(text: str | None, optics: TiDyOptics) -> Tensor:
-    """(D,) radians, ascending, of the depths asked for."""
+    """Return the defocus of the requested depths in radians, ascending, (D,)."""
     lo, hi = optics.camera.defocus_range
     if text is None:
         return torch.linspace(lo, hi, COLUMNS, dtype=torch.float64)
@@ -197,7 +197,7 @@ def _defocus(text: str | None, optics: TiDyOptics) -> Tensor:
 
 
 def _without_mask(optics: TiDyOptics) -> Tensor:
-    """(1, C, P, P) PSFs of the same lens in focus behind a flat mask."""
+    """Return the in-focus PSFs of the same lens with a flat mask, (1, C, P, P)."""
     rows, columns = optics.masks.phase.shape[-2:]
     masks = PixelwiseMask(1, (rows, columns), initial="flat")
     plain = TiDyOptics(
@@ -214,7 +214,7 @@ def _in_metres(psi: float, optics: TiDyOptics) -> str:
 
 
 def _channels(optics: TiDyOptics) -> list[str]:
-    """What the channels are called: by their wavelength, or by their colour where they see several."""
+    """Return the names of the channels: a wavelength, or a colour if a channel has several."""
     seen = [
         [wavelength for wavelength, weight in zip(optics.spectrum.wavelengths, weights, strict=True) if weight]
         for weights in optics.spectrum.weights
@@ -224,7 +224,7 @@ def _channels(optics: TiDyOptics) -> list[str]:
 
 
 def _half_contrast(contrast: Tensor) -> str:
-    """Where contrast first falls to a half, in cycles a pixel, or that it does not.
+    """Return the frequency at which contrast first falls to one half, in cycles per pixel, in words.
 
     Example:
         >>> _half_contrast(torch.tensor([0.9, 0.6, 0.4, 0.1]))

@@ -1,4 +1,4 @@
-"""`kornia-tidy raw`: camera raw files, each thing that can be done with them in a file of its own."""
+"""`kornia-tidy raw`: the group of commands for camera raw files."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from kornia_tidy.commands import (
 SUBCOMMANDS = (raw_info, raw_develop, raw_reconstruct, raw_calibrate_noise, raw_calibrate_psf, raw_simulate)
 
 DESCRIPTION = """\
-Camera raw files: the counts of a sensor, before any camera has made a picture of
-them. FILES are what cameras write (DNG, CR2, CR3, NEF, ARW, RAF, ORF, RW2, ...) or
-bare dumps of counts, whose size and levels you then give. Each file is decoded in
-a process of its own with limits of time and memory, so that a damaged one costs
-one sentence and never hides the others.
+Work with camera raw files, which hold the digital counts of a sensor. FILES are raw
+files of cameras (DNG, CR2, CR3, NEF, ARW, RAF, ORF, RW2, ...) or headerless dumps of
+counts, with size and levels given as options. Each file is decoded in a separate
+process with limits of time and memory. A damaged file gives an error message, and
+the other files are still processed.
 """
 
 

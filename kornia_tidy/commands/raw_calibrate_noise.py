@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
 
 DESCRIPTION = """\
-Measure a camera's noise at one ISO setting, by photon transfer: how the variance of
-its counts grows with their level gives the electrons that make a count (gain) and
-the noise without light (read noise). FILES are
-  flats     two or more of each exposure, in any order, of something that holds
-            still: best an evenly lit sheet out of focus, from dark to nearly
-            saturated. Differences are measured, so that scene and fixed pattern
+Measure a camera's noise at one ISO setting by photon transfer: a fit of the variance
+of the counts over their level gives the electrons per count (gain) and the noise
+without light (read noise). FILES are
+  flats     two or more captures of each exposure, in any order, of a static scene:
+            best an evenly lit sheet out of focus, from dark to nearly saturated.
+            Differences of captures are measured, so that scene and fixed pattern
             cancel
-  one file  any scene with smooth areas of different brightness. Texture is told
-            from noise block by block; the error says how well that went
+  one file  any scene with smooth areas of different brightness. Noise is separated
+            from texture block by block; the printed error shows how reliably
 Pictures that do not allow a calibration are refused with the reason.
 """
 
@@ -31,7 +31,7 @@ examples:
   Pairs of flats at ISO 800, with two captures under the lens cap:
     kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json --plot
 
-  What a single picture says:
+  From a single picture:
     kornia-tidy raw calibrate-noise street.cr2 -o noise.json
 
 In Python:
@@ -39,7 +39,7 @@ In Python:
   sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
 """
 
-STRAIGHT = 0.99  # R² from which on a curve is called a straight line
+STRAIGHT = 0.99  # R² above which the curve is reported as a straight line
 DOTS_PER_INCH = 150
 
 
@@ -69,7 +69,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, write and tell."""
+    """Calibrate, write the results, and print a summary."""
     output = Path(args.output)
     plot = None if args.plot is None else Path(args.plot or output.with_suffix(".png"))
     _check_outputs(output, plot, [*args.files, *args.dark])
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def in_words(result: PhotonTransfer) -> list[tuple[str, str]]:
-    """Return what was measured, as topics and texts."""
+    """Return the results of a calibration as topics and texts."""
     line = result.line
     iso = "" if result.iso is None else f", ISO {result.iso:g}"
     single = result.method == "single"
@@ -125,7 +125,7 @@ def _draw(result: PhotonTransfer, path: Path) -> None:
 
 
 def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:
-    """Refuse before any work what could not be written, or would replace a capture."""
+    """Check before any work that outputs can be written and do not replace captures."""
     if plot is not None:
         from kornia_tidy.checks import check_choice  # noqa: PLC0415
         from kornia_tidy.figures.style import require_matplotlib  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""`kornia-tidy raw calibrate-psf`: pictures of a point of light at known distances -> the camera's PSFs."""
+"""`kornia-tidy raw calibrate-psf`: measurement of PSFs from pictures of a point of light at known distances."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Measure the PSFs of a camera from pictures of a point of light at known distances.
-At each distance the point is moved by parts of a pixel between the pictures: a
-sensor that samples too coarsely sees a PSF only in several pictures together. 16
-places are good, 24 behind a filter array; they need not be known. Several exposures
-at each place, the longer ones saturated, show the faint parts of a PSF as well.
-FILES are raw files or 16-bit images of linear light, black level taken off; sorted
-by distance, then by place of the point, then by exposure. Of a filter array's
-planes those of one colour make one PSF, on the pixels of the sensor: the bank is
-one of red, green and blue.
+At each distance the point is moved by fractions of a pixel between the pictures, as
+an undersampled PSF can only be reconstructed from several of them. 16 positions are
+good, 24 behind a filter array; they need not be known. Several exposures at each
+position, the longer ones saturated, measure the faint parts of a PSF as well. FILES
+are raw files or 16-bit images of linear light without black level, sorted by
+distance, then by position of the point, then by exposure. The planes of one colour of
+a filter array give one PSF on the pixel grid of the sensor, so that the bank has red,
+green and blue.
 """
 
 EXAMPLES = """\
@@ -40,19 +40,18 @@ examples:
     kornia-tidy raw calibrate-psf d1_*.dng d2_*.dng d3_*.dng \\
         --distances 0.35 0.6 1.5 --full-well 10500 --read-noise 2.4 -o bank.safetensors
 
-  Two exposures at each place; the same places with the modulator flat, so that it is
-  known where the chief ray falls; and the mask that makes these PSFs:
+  Two exposures at each position; the same positions with a flat modulator, which give
+  the position of the chief ray; and retrieval of the mask behind these PSFs:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
         --reference flat*.tif -o bank.safetensors --picture bank.png --fit-mask mask.npy
 
-What is printed tells how far to trust the bank: "noise" is the error to be expected,
-the sum of its moduli over the PSF's light; "residuals" of about 1 say that the
-pictures of one distance fit each other, far larger ones that something moved or
+The printed numbers show the accuracy of the bank. "noise" is the expected error, as the
+sum of its moduli relative to the PSF's light. "residuals" of about 1 mean that the
+pictures of one distance are consistent. Far larger ones mean that something moved or
 that --full-well, --read-noise or the black level are wrong. Most of the error of a
-sharp PSF is noise in the dark about it: one more exposure, four times as long, so that
-the background is nearly saturated, lowers it as much as twice the places do. Without
---reference the PSF's centre of light is its centre, and what masks do to move it is not
-seen.
+sharp PSF is noise in its dark surroundings: one more exposure, four times as long,
+lowers it as much as twice the number of positions. Without --reference each PSF is
+centred at its centroid, and shifts by the masks are not measured.
 
 In Python:
   bank = PSFBank.load("bank.safetensors")
@@ -97,7 +96,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure the PSFs and write them."""
+    """Measure the PSFs and write the bank."""
     from kornia_tidy.calibration.psf.measured_psfs import measure_psfs  # noqa: PLC0415 (only who measures waits for it)
 
     places = _check_arguments(args)
@@ -147,7 +146,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _check_arguments(args: argparse.Namespace) -> int:
-    """Refuse what cannot be, before any work; return how many places of the point there are at each distance."""
+    """Check the arguments before any work; return the number of point positions at each distance."""
     for path, suffix in ((args.output, ".safetensors"), (args.picture, ".png"), (args.fit_mask, ".npy")):
         if path is not None:
             check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
@@ -176,7 +175,7 @@ def _check_arguments(args: argparse.Namespace) -> int:
 
 
 def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
-    """Read one place after the other, of which only the light about the points is kept."""
+    """Read the pictures of one position after another, and keep only crops around the points."""
     from kornia_tidy.calibration.psf.point_images import point_images  # noqa: PLC0415
 
     sensor = SensorNoise.physical(args.full_well, args.read_noise)
@@ -198,7 +197,7 @@ def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
 
 
 def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tile | None]:
-    """Return linear light (C, H, W), of a mosaic its planes with the channels that its tile sees."""
+    """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
     if Path(path).suffix.lower() in SUFFIXES:
         return read_image(path), None
     raw = open_raw(path, args)
@@ -212,7 +211,7 @@ def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tile | None]:
 
 
 def _cutoff(camera: ThinLensCamera, channels: int) -> list[float]:
-    """Return the highest frequency that the lens passes, at the shortest wavelength a channel may see."""
+    """Return the cutoff frequency of the lens at the shortest wavelength of the channels."""
     from kornia_tidy.calibration.psf.measured_psfs import diffraction_cutoff  # noqa: PLC0415
 
     shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)

@@ -27,10 +27,10 @@ from kornia_tidy.raw.develop import (
 )
 
 DESCRIPTION = """\
-Make a picture of each raw file: black and white levels, white balance,
-demosaicing, the camera's colours to sRGB, upright, with square pixels. No
-brightening, sharpening or denoising. Each FILE becomes FOLDER/FILE.png, 16 bits,
-and FOLDER/FILE.jpg to look at; each is written whole or not at all.
+Develop raw files into pictures: black and white levels, white balance, demosaicing,
+colour conversion to sRGB, upright orientation and square pixels. Nothing is
+brightened, sharpened or denoised. Each FILE becomes FOLDER/FILE.png, 16 bits, and a
+preview FOLDER/FILE.jpg. Files are written atomically.
 """
 
 EXAMPLES = """\
@@ -38,13 +38,13 @@ examples:
   All files of a folder; if interrupted, go on with --resume:
     kornia-tidy raw develop shots/*.dng -o pictures
 
-  For measuring: linear light on the sensor's own grid, nothing interpolated:
+  For measurements: linear light on the pixel grid of the sensor, without interpolation:
     kornia-tidy raw develop shots/*.dng -o planes --demosaic half --linear --sensor-grid
 
-  Files that do not say in which light they were taken, and look green or orange:
+  Files without a white balance, which look green or orange:
     kornia-tidy raw develop quicktake/*.qtk -o pictures --white-balance auto
 
-  A bare dump of counts, with factors for red, green and blue:
+  A headerless dump of counts, with factors for red, green and blue:
     kornia-tidy raw develop dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520 \\
         --white-balance 1.9 1 1.5 -o pictures
 
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> None:
             clipped = clipped_in_words(image)
             encoded = encode(image.clamp_(0, 1))
         with stages("write"):
-            for output in reversed(paths):  # the preview first: where there is a picture, all is there
+            for output in reversed(paths):  # the preview is written first, so that a picture means that both exist
                 if output.suffix == ".jpg":
                     write_image(output, encoded)
                 else:
@@ -152,7 +152,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) -> dict[str, list[Path]]:
-    """Return what each file becomes.
+    """Return the output paths of each file.
 
     Raises:
         ValueError: if two files would become the same picture, or a picture would replace one of the files.
@@ -173,7 +173,7 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
 
 
 def add_white_balance_option(group: Any) -> None:
-    """Add what :func:`parse_white_balance` reads."""
+    """Add the option read by :func:`parse_white_balance`."""
     group.add_argument(
         "--white-balance",
         nargs="+",
@@ -184,7 +184,7 @@ def add_white_balance_option(group: Any) -> None:
 
 
 def parse_white_balance(words: Sequence[str] | None) -> str | Tensor | None:
-    """Return the white balance that was asked for: a name, factors, or None.
+    """Return the white balance of the arguments: a name, factors, or None for the default.
 
     Example:
         >>> parse_white_balance(["as-shot"]), parse_white_balance(["2", "1", "1.5"])
@@ -202,7 +202,7 @@ def parse_white_balance(words: Sequence[str] | None) -> str | Tensor | None:
 
 
 def colors_in_words(raw: RawCapture, args: argparse.Namespace, white_balance: str | Tensor | None) -> str:
-    """Return how a picture got its colours."""
+    """Describe the colour matrix and the white balance of a picture."""
     if not raw.colors:
         return "monochrome"
     factors = balance_factors(raw, white_balance)
@@ -217,7 +217,7 @@ def colors_in_words(raw: RawCapture, args: argparse.Namespace, white_balance: st
 
 
 def clipped_in_words(image: Tensor) -> str:
-    """Return what a file of [0, 1] cannot hold of a linear picture.
+    """Describe the share of a linear picture that a file of [0, 1] clips.
 
     Example:
         >>> clipped_in_words(torch.tensor([[[-0.1, 0.5, 1.0, 1.2]]]))

@@ -1,4 +1,4 @@
-"""`kornia-tidy raw info`: what a camera raw file holds."""
+"""`kornia-tidy raw info`: properties of camera raw files."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from kornia_tidy.commands.report import tell
 from kornia_tidy.raw.capture import RawCapture, RawInfo
 
 DESCRIPTION = """\
-Say what raw files hold: camera, lens and exposure; size and filter array of the
-visible area; black and white levels beside the counts that are really there;
-white balance as shot, colour matrices and orientation. Every file is decoded
-whole, so a file that is told of here can be developed.
+Print the properties of raw files: camera, lens and exposure; size and filter array of
+the visible area; black and white levels and the range of the counts; white balance as
+shot, colour matrices and orientation. Every file is decoded completely, so a file that
+is listed can be developed.
 """
 
 EXAMPLES = """\
@@ -49,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
     """Describe the subcommand to argparse."""
     parser = subparsers.add_parser(
         "info",
-        help="say what raw files hold",
+        help="properties of raw files",
         description=DESCRIPTION,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -61,7 +61,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Say what raw files hold."""
+    """Print the properties of raw files."""
     objects: list[dict[str, Any]] = []
 
     def look(path: str) -> None:
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def in_words(raw: RawCapture) -> list[tuple[str, str]]:
-    """Return what a capture holds, as topics and texts.
+    """Return the properties of a capture as topics and texts.
 
     Example:
         >>> import torch
@@ -119,7 +119,7 @@ def in_words(raw: RawCapture) -> list[tuple[str, str]]:
 
 
 def as_json(raw: RawCapture) -> dict[str, Any]:
-    """Return what a capture holds, for a program to read: SI units, None where the file says nothing."""
+    """Return the properties of a capture for JSON, in SI units, with None for missing values."""
 
     def plain(tensor: Tensor | None) -> list[Any] | None:
         return None if tensor is None else tensor.tolist()
@@ -171,7 +171,7 @@ def _exposure(info: RawInfo) -> str:
 
 
 def _levels(black: Tensor) -> str:
-    """Return black levels: one if all are the same, else by places."""
+    """Format black levels: one number if all are equal, else one for each place of the tile."""
     levels = black.flatten().tolist()
     return f"{levels[0]:g}" if len(set(levels)) == 1 else " ".join(f"{level:g}" for level in levels)
 

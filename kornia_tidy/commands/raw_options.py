@@ -1,4 +1,4 @@
-"""Options and habits that the raw subcommands share: opening a file or a bare dump, and going on after a bad one."""
+"""Shared options of the raw subcommands: headerless dumps, checks of outputs, and a loop over files."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ DUMP_OPTIONS = ("size", "pattern", "black", "white", "dtype", "byte_order")
 
 
 def add_dump_options(parser: argparse.ArgumentParser) -> None:
-    """Add what a bare dump of counts does not say of itself."""
+    """Add the options that describe a headerless dump of counts."""
     group = parser.add_argument_group(
         "bare dumps of counts",
-        "A file without a header says nothing of itself: give --size, --pattern, --black\n"
+        "A headerless file needs a description: give --size, --pattern, --black\n"
         "and --white, and all FILES are read as such dumps, row by row.",
     )
     group.add_argument("--size", type=_size, metavar="WxH", help="columns x rows, such as 768x512")
@@ -29,7 +29,7 @@ def add_dump_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--black", type=float, nargs="+", metavar="N", help="count without light, one or one a place")
     group.add_argument(
-        "--white", type=float, metavar="N", help="saturation count; also in place of what a raw file says of its own"
+        "--white", type=float, metavar="N", help="saturation count; for raw files, replaces that of the file"
     )
     group.add_argument("--dtype", choices=("uint8", "uint16"), help="of a count (default: uint16)")
     group.add_argument("--byte-order", choices=("little", "big"), help="of a count (default: little)")
@@ -62,7 +62,7 @@ def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
 
 
 def check_outputs(outputs: Sequence[str | Path | None], inputs: Sequence[str | Path | None]) -> None:
-    """Refuse before any work what could not be written, or would replace an input; None is no file.
+    """Check before any work that outputs can be written and do not replace inputs; None is skipped.
 
     Raises:
         FileNotFoundError: if a folder does not exist.
@@ -79,10 +79,11 @@ def check_outputs(outputs: Sequence[str | Path | None], inputs: Sequence[str | P
 
 
 def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
-    """Do something with every file, whatever becomes of the others.
+    """Apply an action to every file, and go on after errors.
 
     Raises:
-        OSError, ValueError: the mistake, if there is one file; else how many failed, each having been told by then.
+        OSError, ValueError: the error of a single file; for several files the number that failed, after their errors
+            have been printed.
     """
     failed = 0
     for path in paths:

@@ -1,4 +1,4 @@
-"""`kornia-tidy raw reconstruct`: all-in-focus pictures and depth from captures of any size."""
+"""`kornia-tidy raw reconstruct`: reconstruction of all-in-focus images and depth from captures of any size."""
 
 from __future__ import annotations
 
@@ -37,28 +37,27 @@ if TYPE_CHECKING:
     from kornia_tidy.inference.light_head import LightHead, Reconstruction
 
 DESCRIPTION = """\
-Let a trained network look at captures of any size, tile by tile within a memory
-budget; the tiles cannot be seen. FILES are camera raw files or pictures (PNG, TIFF,
-JPEG, NPY). Of each FILE, FOLDER gets
+Reconstruct captures of any size with a trained network, tile by tile within a memory
+budget and without visible seams. FILES are camera raw files or pictures (PNG, TIFF,
+JPEG, NPY). For each FILE, FOLDER gets
   FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
   FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
   FILE_depth.pfm, .npy    depth in metres, float32, infinity kept
   FILE_depth_colors.png   depth in colours, with a scale in metres
-as far as the network estimates them, and FILE.json, which says how they were made
-and is written last. Each is written whole or not at all.
+as far as the network estimates them, and FILE.json with the settings, which is written
+last. Files are written atomically.
 
-A network reads what one lens makes of a scene: HEAD is that which was trained with the
-masks of the camera. With the library come edof-5, edof-1 (five masks, one) and edof-0
-(a plain lens) for the picture, and joint-5, joint-1, joint-0 for picture and depth, all
-for a 50 mm f/17.6 lens focused at 0.6 m on pixels of 8 um.
+A network fits the camera that it was trained with, so HEAD must be trained with the
+masks and lens of the captures. The library includes edof-5, edof-1 (five masks, one
+mask) and edof-0 (a plain lens) for the picture, and joint-5, joint-1, joint-0 for
+picture and depth, all for a 50 mm f/17.6 lens focused at 0.6 m with pixels of 8 um.
 """
 
 EXAMPLES = """\
-How a raw file becomes what the network sees: black and white levels, white balance,
-demosaicing, the camera's colours to sRGB's, clipped to [0, 1], linear; on the grid of
-the sensor, as the lens's PSFs lie there, with square pixels. Then the encoding that
-the network was trained with (sRGB's unless --color-space was linear or paper). What
-comes out is turned upright.
+Processing of a raw file: black and white levels, white balance, demosaicing, conversion
+to linear sRGB clipped to [0, 1], on the pixel grid of the sensor with square pixels,
+since the PSFs are defined there. Then the encoding of the network's training is applied
+(sRGB unless --color-space was linear or paper). The results are turned upright.
 
 Memory: --memory for the tiles, about 40 bytes a pixel of each file at work, and 0.4 GiB
 for the program; in all 1.8 GiB for a file of 24 megapixels.
@@ -140,7 +139,7 @@ def run(args: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if args.resume:
         remove_leftovers(folder)
-    reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network once, for all jobs
+    reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
     tell("network", f"{args.head}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
 
     def work(path: str, progress: Callable[[int, int], None]) -> Row:
@@ -180,7 +179,7 @@ def head_file(head: str) -> Path:
 
 
 def result_suffixes(task: str, picture: str) -> list[str]:
-    """Return what is added to a file's name for each of its results; the last says that all are there.
+    """Return the suffixes of a file's results; the last result is written when all others exist.
 
     Example:
         >>> result_suffixes("edof", "tiff")
@@ -192,13 +191,13 @@ def result_suffixes(task: str, picture: str) -> list[str]:
 
 
 def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any]]:
-    """Return a capture as linear light, how to turn it upright, and what is known of camera and exposure."""
+    """Read a capture as linear light, with its upright orientation and its camera and exposure data."""
     if args.size is None and Path(path).suffix.lower() in PICTURES:
         picture = read_image(path)
         return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}
     raw: RawCapture = open_raw(path, args)
     light = develop(raw, white_balance=parse_white_balance(args.white_balance), encoded=False, upright=False)
-    bare = replace(raw, counts=torch.empty(0))  # which way it is turned, and not the counts
+    bare = replace(raw, counts=torch.empty(0))  # keeps the orientation without the counts
     return light, bare.upright, vars(raw.info)
 
 
@@ -210,7 +209,7 @@ def write_results(
     head: LightHead,
     depth_unit: float,
 ) -> tuple[int, int]:
-    """Write pictures and depth by the ends of their names. Return columns and rows."""
+    """Write pictures and depth with their suffixes; return columns and rows."""
     image = None if result.image is None else upright(result.image)
     depth = None if result.depth is None else upright(result.depth)
     for path in paths:
@@ -229,7 +228,7 @@ def write_results(
 
 
 def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
-    """Tell whether all results are there, made from the same file in the same way."""
+    """Return whether all results of a file exist, made with the same settings."""
     if not all(path.is_file() for path in paths):
         return False
     try:
@@ -240,9 +239,9 @@ def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
 
 
 def work_on_all(paths: list[str], work: Callable[[str, Callable[[int, int], None]], Row], jobs: int) -> list[Row]:
-    """Work on all files, some at a time, whatever becomes of the others. An interrupt ends all between two tiles.
+    """Process all files, several at a time, and go on after errors; an interrupt ends all between two tiles.
 
-    Threads: the network is in memory once, and what takes long leaves the interpreter free.
+    Threads share one copy of the network in memory, and long operations release the interpreter lock.
     """
     stop = threading.Event()
     lock = threading.Lock()
@@ -282,7 +281,7 @@ def work_on_all(paths: list[str], work: Callable[[str, Callable[[int, int], None
 
 
 def table(rows: list[Row]) -> list[str]:
-    """Return the summary: a line a file.
+    """Return the summary with one line per file.
 
     Example:
         >>> for line in table([Row("a.dng", "done", "60 x 40", 1.25), Row("bb.dng", "cannot read bb.dng: empty")]):
@@ -300,7 +299,7 @@ def table(rows: list[Row]) -> list[str]:
 
 
 def _row(path: str, future: Future[Row]) -> Row:
-    """What became of a file; a mistake in one is a line of the table."""
+    """Return the summary row of a processed file; an error is printed and becomes the text of the row."""
     try:
         return future.result()
     except Exception as error:
@@ -311,7 +310,7 @@ def _row(path: str, future: Future[Row]) -> Row:
 
 
 def _identity(path: str) -> dict[str, Any]:
-    """What tells that a file is the one that was reconstructed."""
+    """Return the identity of an input file, to recognise it on resuming."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"cannot read {path}: there is no such file")
     state = Path(path).stat()
@@ -319,7 +318,7 @@ def _identity(path: str) -> dict[str, Any]:
 
 
 def _in_words(head: LightHead, args: argparse.Namespace) -> dict[str, str]:
-    """What a person wants to know of the results."""
+    """Describe the results of a file for the summary."""
     unit, (near, far) = args.depth_unit, head.camera.depth_range
     words = {"head": args.head}
     if "image" in MAPS[head.task]:

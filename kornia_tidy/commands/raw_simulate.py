@@ -1,4 +1,4 @@
-"""`kornia-tidy raw simulate`: the raw file that a camera would write of a scene with depth."""
+"""`kornia-tidy raw simulate`: simulation of a camera's raw file of a scene with depth."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from kornia_tidy.sensor.noise import SensorNoise
 
 DESCRIPTION = """\
-Simulate the raw file that a camera behind coded optics would write: a scene, which is
-a picture and a depth map of the same size, is seen through the lens and its K phase
-masks, then through the filter array, with the camera's noise, black and white level.
-The result is an uncompressed DNG, which any raw software opens.
+Simulate the raw file of a camera with coded optics. The scene is a picture with a depth
+map of the same size. It is blurred by the lens with its K phase masks, sampled through
+the filter array, and recorded with the camera's noise, black and white level. The
+result is an uncompressed DNG, which any raw software opens.
 """
 
 EXAMPLES = """\
@@ -74,9 +74,7 @@ def add_parser(subparsers: Any) -> None:
         help=f"of the converter, whose white is 2^bits - 1 (default: {BITS})",
     )
     sensor.add_argument("--black", type=int, metavar="N", help="count without light (default: 2^bits / 16)")
-    sensor.add_argument(
-        "--white", type=float, metavar="N", help="saturation count, in place of what FILE says of its own"
-    )
+    sensor.add_argument("--white", type=float, metavar="N", help="saturation count, replaces that of FILE")
     sensor.add_argument(
         "--color",
         choices=("camera", "channels"),
@@ -149,7 +147,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _sensor(args: argparse.Namespace) -> RawCapture:
-    """The camera of a file, or one in words."""
+    """Return the sensor of a raw file or of the options."""
     import torch  # noqa: PLC0415
 
     from kornia_tidy.raw.capture import RawCapture  # noqa: PLC0415
@@ -167,7 +165,7 @@ def _sensor(args: argparse.Namespace) -> RawCapture:
     camera = RawCapture.from_counts(torch.zeros(1, 2, 2), args.pattern or PATTERN, black, 2**bits - 1)
     if set(camera.colors) != set("RGB"):
         return camera
-    # Its red, green and blue are those of the picture, so whoever develops the file shall see the picture's colours.
+    # The camera's colours are declared to be those of the picture, so that a raw developer reproduces them.
     return replace(camera, xyz_to_camera=srgb_from_xyz().float(), white_balance=torch.ones(len(camera.colors)))
 
 
@@ -187,7 +185,7 @@ def _noise(args: argparse.Namespace) -> SensorNoise:
 
 
 def _channels_for(camera: RawCapture, image: Any) -> Any:
-    """The picture with as many channels as the camera sees: a grey one has its grey in all."""
+    """Expand a grey picture to three channels for a colour camera."""
     if not camera.colors and image.shape[0] == 3:
         raise ValueError("a monochrome camera needs a grey picture: --image has colours")
     return image.expand(3, -1, -1) if camera.colors and image.shape[0] == 1 else image

@@ -1,4 +1,4 @@
-"""`kornia-tidy render`: a whole data set of scenes as coded captures on disk."""
+"""`kornia-tidy render`: coded captures of a whole data set, written to disk."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ OF_SCENES = ("data", "root", "size", "scenes", "validation_scenes", "depth_range
 OF_CAMERA = (
     "masks", "focal_length", "pixel_pitch", "depth_range", "sigma", "fidelity", "compositing", "border",
 )  # fmt: skip
-OF_PRESET = ("sigma", "fidelity", "compositing", "border")  # what may replace a part of a published system
+OF_PRESET = ("sigma", "fidelity", "compositing", "border")  # options that replace a part of a published system
 
 DESCRIPTION = """\
-Photograph every scene of a data set through a camera with phase masks, once and for all,
-and keep the captures to train on. The camera is made of the options below, or is a
-published one (--preset), or one that was trained (--checkpoint).
+Photograph every scene of a data set once through a camera with phase masks, and store
+the captures for training. The camera is given by the options below, a published system
+(--preset) or a trained one (--checkpoint).
 
-FOLDER gets render.json (everything that made the captures), the captures, and when all
-of them are there index.csv:
+FOLDER gets render.json (all settings), the captures, and index.csv once all captures
+are complete:
   000123/coded.png, image.png, depth.npy, mask.png, scene.json     a folder for each scene
   00004.tar with 000123.coded.png, 000123.depth.npy, ...           --shard-...: WebDataset
 Images are PNG of 16 bits, or with --float NPY (rows, columns, RGB) of float32; image is
@@ -47,11 +47,11 @@ where depth is known.
 """
 
 EPILOG = """\
-Killed or stopped, the same command goes on and ends with the same bytes: a capture or a
-shard appears under its name when it is whole. Captures follow from camera, scene, seed
-and number alone, whatever --jobs is and whichever process renders them (on processors of
-one kind). torchrun's processes, or any with RANK and WORLD_SIZE in their environment,
-share the work, on one machine or on several that see FOLDER.
+After an interruption the same command continues and gives the same bytes, since captures
+and shards are written atomically. A capture is determined by camera, scene, seed and
+number alone, for any --jobs and any process (on processors of one kind). Processes of
+torchrun, or others with RANK and WORLD_SIZE in their environment, share the work, on one
+machine or on several that share FOLDER.
 
 examples:
   Scenes made here, through five random masks, on all of 8 cores:
@@ -130,7 +130,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Render, and tell how it went."""
+    """Render the data set, and print a summary."""
     rank, world = (_environment(name, default) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
     optics, settings, camera_from = _camera(args)
     scenes = make_scenes(settings, args.split, args.scenes)
@@ -172,7 +172,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dict[str, Any]]:
-    """The camera, the settings that scenes are made by, and what the camera was made from."""
+    """Return the camera, the settings of its scenes, and the origin of the camera."""
     given = {name: value for name, value in given_settings(args).items() if name != "scenes"}
     if args.scenes is not None:
         given |= {"scenes": args.scenes, "validation_scenes": args.scenes}
@@ -184,7 +184,7 @@ def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dic
         system = load_trained(args.checkpoint)
         digest = hashlib.sha256(read_bytes(args.checkpoint)).hexdigest()
         if given.get("data", system.settings.data) != system.settings.data:
-            given = {"root": None, **given}  # the folder was that of the other data
+            given = {"root": None, **given}  # the stored folder belongs to the other data set
         return system.optics, system.settings.replace(**given), {"checkpoint": str(args.checkpoint), "sha256": digest}
     settings = TrainingSettings().replace(**given)
     if not args.preset:

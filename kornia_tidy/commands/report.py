@@ -1,4 +1,4 @@
-"""What a command tells: the scene, the camera and the light in words, and how long each stage took."""
+"""Report lines of commands: scene, PSFs and clamping in words, and the time of each stage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kornia_tidy.psf.psf_bank import PSFBank
 
 
 class Stages:
-    """Times the stages of a command.
+    """Stopwatch for the stages of a command.
 
     Example:
         >>> stages = Stages()
@@ -29,7 +29,7 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Generator[None]:
-        """Time a block; blocks of one name add up."""
+        """Time a block; blocks with the same name are summed."""
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
@@ -41,7 +41,7 @@ class Stages:
 
 
 def tell(topic: str, text: str) -> None:
-    """Print one line of a report, its topic in the margin."""
+    """Print one line of a report with its topic in the margin."""
     print(f"{topic:<9} {text}", flush=True)
 
 
@@ -56,7 +56,7 @@ def scene_in_words(scene: Scene) -> str:
 
 
 def light_in_words(bank: PSFBank, optics: TiDyOptics) -> str:
-    """Return the size of the PSF window and the share of the light that it holds, over all depths."""
+    """Describe the PSF window and its ensquared energy over all depths."""
     fate = {
         "renormalize": "the rest is given back to the window",
         "veil": "the rest is spread over the image",
@@ -74,7 +74,7 @@ def light_in_words(bank: PSFBank, optics: TiDyOptics) -> str:
 
 
 def clamped_in_words(optics: TiDyOptics, depth: Tensor) -> str:
-    """Return how many pixels of the last capture lay beyond the camera's range."""
+    """Describe how many pixels of the last capture lay beyond the camera's range."""
     count = optics.clamped_pixels
     if not count:
         return "no pixel lies beyond the camera's range"

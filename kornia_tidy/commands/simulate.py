@@ -1,4 +1,4 @@
-"""`kornia-tidy simulate`: the capture of one picture with depth."""
+"""`kornia-tidy simulate`: simulation of the coded capture of one picture with depth."""
 
 from __future__ import annotations
 

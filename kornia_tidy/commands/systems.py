@@ -18,7 +18,7 @@ from kornia_tidy.commands.options import add_depth_options, check_output, middle
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.figures.style import require_matplotlib
-from kornia_tidy.figures.system_survey import survey
+from kornia_tidy.figures.system_statistics import system_statistics
 from kornia_tidy.figures.systems import Portrait, draw_systems
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.tasks import metres
@@ -26,10 +26,9 @@ from kornia_tidy.systems.presets import SYSTEMS, published_system
 from kornia_tidy.systems.system import System
 
 DESCRIPTION = """\
-List nine published optical systems and draw them side by side into one picture:
-their masks, what a point of light becomes at each depth (PSF), how much contrast is
-left of fine detail (MTF), how well an image of a point tells its depth (Cramér-Rao
-bound), and what each captures of one scene.
+List nine published optical systems and draw them side by side in one picture: their
+masks, point spread functions (PSF) and contrast (MTF) over depth, the Cramér-Rao bound
+on the depth of a point, and the capture of one scene.
 """
 
 EPILOG = """\
@@ -84,7 +83,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """List the systems, look at each, and draw them."""
+    """List the systems, compute their statistics, and draw them."""
     systems = _chosen(args)
     check_output(args.output, args.image, args.depth)
     require_matplotlib()
@@ -99,8 +98,8 @@ def run(args: argparse.Namespace) -> None:
                 camera = system.camera()
                 masks = torch.Generator().manual_seed(args.seed)
                 optics = TiDyOptics.from_preset(system.name, generator=masks, camera=camera)
-            with stages("surveys"):
-                seen = survey(optics)
+            with stages("statistics"):
+                seen = system_statistics(optics)
             with stages("captures"):
                 generator = torch.Generator().manual_seed(args.seed)
                 capture = optics(image, metres(camera, nearness), generator=generator)
@@ -144,7 +143,7 @@ def table(systems: list[System]) -> list[str]:
 
 
 def _chosen(args: argparse.Namespace) -> list[System]:
-    """Refuse what cannot be done before any work."""
+    """Check the arguments before any work, and return the chosen systems."""
     if (args.image is None) != (args.depth is None):
         raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
     if args.size < 32:
@@ -154,7 +153,7 @@ def _chosen(args: argparse.Namespace) -> list[System]:
 
 
 def _scene(args: argparse.Namespace) -> tuple[Tensor, Tensor, str]:
-    """Return an image of three channels, how near its pixels are from 0 to 1, and its name."""
+    """Return an RGB image, its normalised inverse depth in [0, 1], and its name."""
     if args.image is None:
         height, width = round(args.size * 0.625), args.size
         image, depth = dead_leaves(height, width, depth_range=(0.5, 5.0), seed=args.seed)

@@ -1,4 +1,4 @@
-"""`kornia-tidy trade`: what each knob of the fidelity costs and is worth, on one's own scene and device."""
+"""`kornia-tidy trade`: measurement of the speed-accuracy trade-off on one's own scene and device."""
 
 from __future__ import annotations
 
@@ -34,41 +34,41 @@ from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.costs import DEVICES
 from kornia_tidy.tradeoff.figure import draw_trade
 from kornia_tidy.tradeoff.files import TradeRun, markdown, read_json, write_csv, write_json
-from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, Setting, ladder, planned
 from kornia_tidy.tradeoff.measure import TradeRow, linear_light, missing, sweep
+from kornia_tidy.tradeoff.sweep_settings import PLAN, SWEEP_VALUES, Setting, planned, sweep_settings
 
 DESCRIPTION = """\
-Measure the trade between speed and accuracy on one scene and this machine: each knob
-of the fidelity is turned alone, from a preset; the presets, and what is planned for
-this scene within errors of 1e-1 to 1e-6, are measured too. For each setting
+Measure the speed-accuracy trade-off on one scene and this machine. Each setting of the
+fidelity is varied alone from a preset. The presets, and the plans for this scene within
+errors of 1e-1 to 1e-6, are measured too. For each point the table has the
   error    of the noise-free capture in linear light, full scale 1, against the preset
            'reference', which is rendered once
-  time     of a capture after the masks have changed (PSFs and rendering), and with
-           PSFs that are there already; median and interquartile range
-  memory   that the tensors of a capture take at most
-Without --image and --depth the scene is made here (dead leaves).
+  time     of a capture after a change of the masks (PSFs and rendering), and with
+           cached PSFs; median and interquartile range
+  memory   peak of the tensors of a capture
+Without --image and --depth the scene is generated (dead leaves).
 """
 
 EPILOG = """\
-Results go to FOLDER/trade.json and trade.csv after every setting, a picture of them to
-trade.png and a table to the screen at the end. Interrupt with Ctrl-C and run the same
-again: it goes on where it was. Another scene, machine or version of the code starts anew.
+Results are written to FOLDER/trade.json and trade.csv after every point, and at the end a
+figure to trade.png and a table to the screen. After Ctrl-C the same command continues.
+Another scene, machine or version of the code starts anew.
 
-A knob cannot lower the error below what the others leave: a base that is exact but slow,
---base reference, shows what each of them does alone.
+No setting can lower the error below that of the other settings. With an exact but slow
+base, --base reference, the error of each setting alone is measured.
 
-Times tell most on a machine that does nothing else. PyTorch uses as many threads as the
+Times are reliable on an otherwise idle machine. PyTorch uses as many threads as the
 environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.
 
 examples:
-  kornia-tidy trade                                 all knobs, on a scene made here
+  kornia-tidy trade                                 all settings, on a generated scene
   kornia-tidy trade --knobs window layers --training
   kornia-tidy trade --image rgb.png --depth depth.png --depth-scale 0.001 --device cuda
 """
 
 NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
 DOTS_PER_INCH = 150
-KNOBS = (*LADDERS, PLAN)
+KNOBS = (*SWEEP_VALUES, PLAN)
 
 
 def add_parser(subparsers: Any) -> None:
@@ -100,13 +100,13 @@ def add_parser(subparsers: Any) -> None:
         help=f"some of {', '.join(KNOBS)} (default: all)",
     )
     measuring.add_argument(
-        "--base", choices=tuple(PRESETS), default="balanced", help="where the other knobs stay (default: balanced)"
+        "--base", choices=tuple(PRESETS), default="balanced", help="preset of the other settings (default: balanced)"
     )
     measuring.add_argument(
         "--reference",
         choices=tuple(PRESETS),
         default="reference",
-        help="what errors are measured against; 'balanced' spares the wait on a large scene (default: reference)",
+        help="preset to which errors refer; 'balanced' is faster on a large scene (default: reference)",
     )
     measuring.add_argument("--training", action="store_true", help="captures with gradients to the masks too")
     measuring.add_argument("--repeats", type=int, default=5, metavar="N", help="timed runs of each (default: 5)")
@@ -116,7 +116,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, write after every row, and tell."""
+    """Measure the sweep, write files after every row, and print the table."""
     device = _checked(args)
     folder = Path(args.output)
     scene = _scene(args)
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> None:
         PixelwiseMask(args.masks, generator=torch.Generator().manual_seed(args.seed)), make_camera(args, scene)
     ).to(device)
     image, depth = scene.image.to(device), scene.depth.to(device)
-    optics.check_scene(image, depth)  # once: captures that are measured keep quiet
+    optics.check_scene(image, depth)  # warns once: the measured captures do not warn
     name = f"dead leaves, seed {args.seed}" if args.image is None else Path(args.image).name
     conditions = Conditions.here_and_now(name, optics, image, depth, args.reference)
     settings = _settings(args, optics, image, depth)
@@ -176,7 +176,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _checked(args: argparse.Namespace) -> torch.device:
-    """Refuse what cannot be done before any work."""
+    """Check the arguments before any work, and return the device."""
     if (args.image is None) != (args.depth is None):
         raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
     if args.repeats < 1:
@@ -202,9 +202,9 @@ def _scene(args: argparse.Namespace) -> Scene:
 
 
 def _settings(args: argparse.Namespace, optics: TiDyOptics, image: Tensor, depth: Tensor) -> list[Setting]:
-    """Steps of the knobs and plans, without windows that are wider than the border allows."""
+    """Return the points of the sweep and the plans, without windows wider than the border allows."""
     widest = largest_window(optics.border, *image.shape[-2:])
-    steps = ladder(args.base, [knob for knob in args.knobs if knob != PLAN])
+    steps = sweep_settings(args.base, [knob for knob in args.knobs if knob != PLAN])
     settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
     if PLAN in args.knobs:
         settings += planned(optics, linear_light(optics, image)[None], depth[None])
@@ -212,7 +212,7 @@ def _settings(args: argparse.Namespace, optics: TiDyOptics, image: Tensor, depth
 
 
 def _known(path: Path, conditions: Conditions) -> tuple[tuple[TradeRow, ...], str]:
-    """Return the rows of an earlier run that still hold, and a word about them."""
+    """Return the valid rows of an earlier run, and a remark about them."""
     if not path.exists():
         return (), ""
     earlier = read_json(path)
@@ -222,7 +222,7 @@ def _known(path: Path, conditions: Conditions) -> tuple[tuple[TradeRow, ...], st
 
 
 def _others(known: tuple[TradeRow, ...], rows: list[TradeRow]) -> list[TradeRow]:
-    """Rows of earlier runs that these do not replace."""
+    """Return the rows of earlier runs that these do not replace."""
     done = {(row.knob, row.value, row.fidelity) for row in rows}
     return [row for row in known if (row.knob, row.value, row.fidelity) not in done]
 

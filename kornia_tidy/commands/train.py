@@ -1,4 +1,4 @@
-"""`kornia-tidy train`: learn masks and network together."""
+"""`kornia-tidy train`: joint training of phase masks and a reconstruction network."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ DESCRIPTION = """\
 Learn the phase masks of a camera together with the network that reads its captures:
 an all-in-focus image (edof), a depth map (depth), or both (joint).
 
-Scenes are painted here (dead-leaves) or files in --root: the frames of FlyingThings3D
+Scenes are generated (dead-leaves) or read from --root: the frames of FlyingThings3D
 (flying-things), the paper's patches of them (flying-things-patches), NYU Depth v2 (nyu),
-all as published, or a folder of one's own (rgbd-folder), in which rgbd.json tells which
-files are pairs and how depth is stored:
+all as published, or your own folder (rgbd-folder), in which rgbd.json gives the pairs of
+files and the unit of depth:
   {"image": "*.png", "depth": "*_depth.png", "scale": 0.001}
 Published splits are kept; of a folder a tenth is for validation and a tenth for testing.
-FlyingThings3D has no size: its nearest things are taken to be at the camera's near end.
+FlyingThings3D has no metric scale: its nearest points are put at the camera's near end.
 """
 
 EPILOG = """\
 FOLDER gets settings.json, last.safetensors (to go on from), best.safetensors (weights of
 the best epoch), training.csv, validation.csv, pictures of masks, PSFs and estimates in
-pictures/, and a log for `tensorboard --logdir FOLDER`. Stop with Ctrl-C, or lose power:
---resume goes on, with the stored settings, and ends with the same weights as a run that
-was never stopped (to the bit on one CPU process).
+pictures/, and a log for `tensorboard --logdir FOLDER`. After Ctrl-C or a power failure
+--resume continues with the stored settings, and ends with the same weights as an
+uninterrupted run (to the bit on one CPU process).
 
 examples:
   The paper's extended depth of field, on scenes made here:
@@ -133,14 +133,14 @@ def add_parser(subparsers: Any) -> None:
 
 
 def add_scene_options(group: Any) -> None:
-    """Add which scenes, to a command that takes its defaults from settings."""
+    """Add the options of scenes, with defaults from stored settings."""
     _setting(group, "data", choices=tuple(SCENES), help="where scenes come from")
     _setting(group, "root", metavar="FOLDER", help="folder of data that are files; default: data/NAME")
     _setting(group, "size", type=int, metavar="PX", help="side of the scenes; larger ones are cropped")
 
 
 def add_camera_settings(group: Any) -> None:
-    """Add which lens and sensor, to a command that takes its defaults from settings."""
+    """Add the options of lens and sensor, with defaults from stored settings."""
     _setting(
         group,
         "depth_range",
@@ -158,12 +158,12 @@ def add_camera_settings(group: Any) -> None:
 
 
 def given_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings that were given, and no defaults."""
+    """Return the settings given on the command line, without defaults."""
     return {field.name: getattr(args, field.name) for field in fields(TrainingSettings) if field.name in args}
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train."""
+    """Train or resume a run, and print its results."""
     require_lightning()
     from kornia_tidy.training.callbacks import BEST, LAST  # noqa: PLC0415 (lightning takes seconds)
     from kornia_tidy.training.run import SETTINGS, train  # noqa: PLC0415
@@ -179,7 +179,7 @@ def run(args: argparse.Namespace) -> None:
     stored = args.resume and (folder / SETTINGS).exists()
     settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()
     settings = settings.replace(**given_settings(args))
-    say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # one of the processes speaks for all
+    say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # only one process prints
     many = {"strategy": "ddp"} if args.devices > 1 else {}
     say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
     goes_on = args.resume and (folder / LAST).exists()
@@ -207,11 +207,11 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _nothing(*_: str) -> None:
-    """Say nothing."""
+    """Ignore a report line."""
 
 
 def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)
-    """Add an option for a setting. One that is not given does not appear, and leaves its place to stored settings."""
+    """Add an option for a setting without a default, so that stored settings remain unless it is given."""
     default = next(field.default for field in fields(TrainingSettings) if field.name == name)
     told = help if default is None else f"{help} (default: {default})"
     group.add_argument(f"--{name.replace('_', '-')}", dest=name, default=argparse.SUPPRESS, help=told, **options)

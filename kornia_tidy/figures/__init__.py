@@ -1,4 +1,4 @@
-"""Pictures for people, drawn with matplotlib: the library explained, depth maps, estimates, photon transfer."""
+"""Figures drawn with matplotlib: overview of the library, depth maps, PSFs, systems, estimates, photon transfer."""
 
 from kornia_tidy.figures.depth import depth_at, draw_depth
 from kornia_tidy.figures.explained import explain

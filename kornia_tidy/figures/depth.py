@@ -1,4 +1,4 @@
-"""Depth in pictures: maps in colours that are linear in inverse depth, the bar that names metres."""
+"""Depth maps in colours linear in inverse depth, with a colour bar in metres."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ TICK_DEPTHS = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 7, 10
 
 
 def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
-    """Draw a depth map in colours that are linear in inverse depth, with a bar that names the depths in metres.
+    """Draw a depth map in colours linear in inverse depth, with a colour bar in metres.
 
     Args:
         depth: (1, H, W) in metres, may be infinite; depths beyond the camera's range have the colours of its ends.
-        camera: its depth range is the bar's.
+        camera: its depth range is that of the colour bar.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes its longer side 1800 pixels, the bar not counted.
@@ -54,7 +54,7 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
 
 
 def depth_at(defocus: float, camera: ThinLensCamera) -> float:
-    """Return the depth in metres that has a defocus in radians; infinity for that of infinity and beyond.
+    """Return the depth in metres for a defocus in radians; infinite for the defocus of infinity and below.
 
     Example:
         >>> round(depth_at(0.0, ThinLensCamera()), 3)
@@ -65,7 +65,7 @@ def depth_at(defocus: float, camera: ThinLensCamera) -> float:
 
 
 def depth_bar(axes: Axes, camera: ThinLensCamera) -> None:
-    """Draw the colours of a camera's depth range, far to near, with some depths in metres below."""
+    """Draw the colour bar of a camera's depth range, far to near, with ticks in metres."""
     axes.imshow(np.linspace(0, 1, 256)[None], cmap=DEPTH_COLORS, aspect="auto", extent=(0, 1, 0, 1))
     ticks = depth_ticks(camera)
     axes.set_xticks([x for x, _ in ticks], [label for _, label in ticks])
@@ -73,7 +73,7 @@ def depth_bar(axes: Axes, camera: ThinLensCamera) -> None:
 
 
 def depth_ticks(camera: ThinLensCamera) -> list[tuple[float, str]]:
-    """Return places on the depth bar (0 far, 1 near) and their labels, far enough apart to be read."""
+    """Return tick positions on the depth bar (0 far, 1 near) with labels that do not overlap."""
     near, far = camera.depth_range
     span = 1 / near - 1 / far
     ticks: list[tuple[float, str]] = []
@@ -85,7 +85,7 @@ def depth_ticks(camera: ThinLensCamera) -> list[tuple[float, str]]:
 
 
 def metres(depth: float) -> str:
-    """Return a depth in two digits, without its unit.
+    """Format a depth with two significant digits, without its unit.
 
     Example:
         >>> metres(0.595), metres(math.inf)

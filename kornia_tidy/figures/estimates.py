@@ -1,4 +1,4 @@
-"""A picture of reconstructions: what cameras captured of a scene, what networks made of it, and where that errs."""
+"""Figure of reconstructions: captures of several cameras, the networks' images and depth maps, and error maps."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
+ERROR_SCALE = 3.0  # factor on error maps, so that small errors are visible
 COLUMN, MARGIN = 2.3, 0.3  # inches
 HEADINGS = ("the scene", "capture", "all-in-focus estimate", "its error, x3", "depth estimate", "its error, x3")
 
 
 class Estimate(NamedTuple):
-    """What one camera and its network made of a scene; maps are (C, H, W), depth as nearness in [0, 1] or unknown."""
+    """Capture of one camera with its network's estimates, (C, H, W); depth is normalised inverse depth or None."""
 
     name: str
     capture: Tensor
@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
     nearness: Tensor | None
 
     def scores(self, image: Tensor, nearness: Tensor, known: Tensor | None = None) -> dict[str, float]:
-        """Return PSNR (dB) of capture and image, SSIM of the image, and RMSE of the nearness where it is known."""
+        """Return PSNR (dB) of capture and image, SSIM of the image, and RMSE of the known normalised inverse depth."""
         truth = image[None]
         scores = {
             "capture_psnr": float(psnr(self.capture[None], truth)),
@@ -45,15 +45,15 @@ class Estimate(NamedTuple):
 def draw_estimates(
     image: Tensor, nearness: Tensor, estimates: Sequence[Estimate], known: Tensor | None = None
 ) -> Figure:
-    """Draw a row for each camera: the capture, image and depth that a network makes of it, and where they err.
+    """Draw one row for each camera: the capture, the estimated image and depth, and error maps.
 
-    A network that estimates no depth leaves its places empty.
+    The depth columns of a network without depth estimate stay empty.
 
     Args:
         image: the scene in focus, (3, H, W) in [0, 1].
-        nearness: its depth, (1, H, W), 0 at the far and 1 at the near end of the cameras' range.
-        estimates: of two cameras or more, from top to bottom; beside the first stands the scene, beside the second
-            its depth.
+        nearness: normalised inverse depth of the scene, (1, H, W), 0 at the far and 1 at the near end of the range.
+        estimates: of two cameras or more, from top to bottom. The scene is drawn beside the first row, its depth beside
+            the second.
         known: bool (1, H, W), True where the depth is known. None: everywhere.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The library explained at a glance, in one picture: a scene, masks, their PSFs over depth, coded captures."""
+"""Overview figure of the library: a scene, its depth, masks, their PSFs over depth, and coded captures."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ MOST_ROWS = 5  # masks drawn
 def explain(
     image: Tensor, depth: Tensor, optics: TiDyOptics, coded_first: Tensor, coded_all: Tensor, caption: str = ""
 ) -> Figure:
-    """Draw one picture that explains the library: scene, depth, masks, their PSFs over depth, coded captures.
+    """Draw the overview figure of the library: scene, depth, masks, their PSFs over depth, and coded captures.
 
     Args:
         image: (3, H, W) or (1, H, W) in [0, 1].
         depth: (1, H, W) in metres.
         optics: the camera with its K masks.
-        coded_first: its capture with the first mask shown all the time (K = 1), as ``image``.
-        coded_all: its capture with all masks, as ``image``.
-        caption: a line below, for what only the caller knows.
+        coded_first: capture with the first mask alone (K = 1), like ``image``.
+        coded_all: capture with all masks, like ``image``.
+        caption: a line of text below the figure.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes it 1800 pixels wide.
 
     Raises:
         ImportError: if matplotlib is missing.
-        TypeError: if the camera is not a :class:`~kornia_tidy.optics.thin_lens.ThinLensCamera`, which knows metres.
+        TypeError: if the camera is not a :class:`~kornia_tidy.optics.thin_lens.ThinLensCamera`, with depth in metres.
 
     Convention:
         - Each PSF is scaled to its own brightest value and drawn with the square root of its light.
@@ -77,7 +77,7 @@ def explain(
 
 
 def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
-    """Return the PSFs of each of the first few masks shown alone, in the window of their average.
+    """Return the PSF bank of each of the first masks shown alone, in the window of the time-averaged PSFs.
 
     Example:
         >>> from kornia_tidy import Fidelity, PixelwiseMask
@@ -106,7 +106,7 @@ def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
 
 # ---------------------------------------------------------------------- the four parts, from left to right
 
-# Places in inches from the lower left corner of the picture.
+# Positions in inches from the lower left corner of the figure.
 SCENE_X, PICTURE = 0.3, 2.3  # left edge, side of the box that holds a picture
 TABLE_X, CELL, STEP, GAP = 3.3, 0.56, 0.605, 0.55  # a row of the table is a mask and its PSFs
 CAPTURE_X = 9.4
@@ -249,7 +249,7 @@ def _psf(figure: Figure, x: float, y: float, psf: Tensor) -> None:
 def _picture(
     figure: Figure, corner: tuple[float, float], image: Tensor, title: str = "", side: float = PICTURE
 ) -> Axes:
-    """Draw a picture as large as fits into a square, under its title; the upper ones hang, the lower ones stand."""
+    """Draw a picture with a title, fitted into a square; upper pictures align at its top, lower ones at its bottom."""
     x, y = corner
     axes = _axes(figure, x, y, side)
     pixels = image.detach().cpu().clamp(0, 1)
@@ -269,7 +269,7 @@ def _axes(figure: Figure, x: float, y: float, side: float) -> Axes:
 def _text(
     figure: Figure, x: float, y: float, text: str, size: float, color: str = INK, center: bool = False, **style: Any
 ) -> None:
-    """Write at a place in inches: from there on, or around it."""
+    """Write text at a position in inches, left-aligned or centred."""
     ha, va = ("center", "center") if center else ("left", "baseline")
     figure.text(x / WIDTH, y / HEIGHT, text, fontsize=size, color=color, ha=ha, va=va, **style)
 

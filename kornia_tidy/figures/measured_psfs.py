@@ -1,4 +1,4 @@
-"""Measured PSFs in one picture: over depth, how sure they are, and what a fitted mask leaves of them."""
+"""Figure of measured PSFs over depth, with their uncertainty and the residuals of a fitted mask."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ CHANNELS = {1: ("",), 3: (RED, GREEN, BLUE)}
 
 
 def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
-    """Draw measured PSFs over distance: the PSFs, their uncertainty, what the fit makes of them and what it leaves.
+    """Draw measured PSFs over distance, with their uncertainty, the fitted PSFs and the residuals of the fit.
 
     Args:
         measured: the PSFs.
-        fit: the mask behind them, if it was looked for.
+        fit: the retrieved mask, or None.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)``.
@@ -49,8 +49,8 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
     Convention:
         - Far is left. PSFs are drawn with the square root of their light, each scaled to its brightest value; colour
           where there are three channels, else their mean.
-        - Uncertainty and residual are means over the channels, in units of the PSF's brightest value; in each row all
-          have the scale written beside it.
+        - Uncertainty and residual are means over the channels, in units of the PSF's brightest value. Each row has one
+          scale, which is written beside it.
     """
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -102,7 +102,7 @@ def _cell(axes: Axes, values: Tensor, scale: float | None) -> None:
 
 
 def _noise_chart(axes: Axes, measured: MeasuredPSFs, fit: MaskFit | None) -> None:
-    """Relative L1: expected of normal noise of this deviation, and what the fit leaves."""
+    """Chart the relative L1 difference over distance: expected from the noise, and left by the fit."""
     expected = math.sqrt(2 / math.pi) * measured.uncertainty.cpu().sum((2, 3))
     colors = CHANNELS.get(expected.shape[1], tuple(f"C{c}" for c in range(expected.shape[1])))
     for c, color in enumerate(colors):
@@ -119,7 +119,7 @@ def _noise_chart(axes: Axes, measured: MeasuredPSFs, fit: MaskFit | None) -> Non
 
 
 def _misfit_chart(axes: Axes, measured: MeasuredPSFs) -> None:
-    """Every point image's residuals, those left out marked."""
+    """Chart the misfit of every point image, with rejected ones marked."""
     known = [(n, report) for n, report in enumerate(measured.reports) if report.misfit is not None]
     for color, rejected in ((INK, False), (ACCENT, True)):
         shown = [(n, report.misfit) for n, report in known if (report.rejected is not None) == rejected]

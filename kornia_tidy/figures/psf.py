@@ -1,4 +1,4 @@
-"""PSFs as a picture: a montage over depth and colour, a slice through focus, and contrast over spatial frequency."""
+"""Figure of PSFs: a montage over depth and colour, a slice through focus, and the modulation transfer function."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ CELL, MARGIN, PLOTS = 1.25, 0.75, 3.0  # inches
 
 @dataclass(frozen=True)
 class PSFSheet:
-    """What is drawn of a camera's PSFs. D depths, C channels, PSFs of P x P pixels; depths from near to far.
+    """PSFs and transfer functions to draw, for D depths from near to far, C channels and PSFs of P x P pixels.
 
     Args:
-        title: the camera in words.
+        title: name of the camera.
         depths: D labels, such as ``"0.6 m"``.
         channels: C labels, such as ``"530 nm"``.
         psfs: (D, C, P, P), share of a point's light in each pixel.
-        contrast: (D, F) of the middle channel, in rings of equal width from 0 to half a cycle a pixel.
+        contrast: (D, F) MTF of the middle channel, in rings of equal width from 0 to 0.5 cycles per pixel.
         focus: (S,) defocus in radians, ascending.
-        slices: (S, P) the middle row of the middle channel's PSFs there.
+        slices: (S, P) middle row of the middle channel's PSF at each value of ``focus``.
     """
 
     title: str
@@ -42,10 +42,10 @@ class PSFSheet:
 
 
 def draw_psfs(sheet: PSFSheet) -> Figure:
-    """Draw the montage, and below it the slice through focus and the modulation transfer function.
+    """Draw a montage of PSFs, and below it the slice through focus and the modulation transfer function.
 
     Args:
-        sheet: what to draw.
+        sheet: PSFs and transfer functions.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes it some 1600 pixels wide for seven depths.
@@ -54,8 +54,8 @@ def draw_psfs(sheet: PSFSheet) -> Figure:
         ImportError: if matplotlib is missing.
 
     Convention:
-        - Each PSF of the montage is scaled to its own brightest pixel. Both colour scales go with the square root of
-          the light, which shows what is faint.
+        - Each PSF of the montage is scaled to its own brightest pixel. Both colour scales are linear in the square root
+          of the light, so that faint parts are visible.
     """
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -137,7 +137,9 @@ def _middle(sheet: PSFSheet) -> str:
 
 
 def ring_centres(frequencies: int) -> list[float]:
-    """Return the middle of each ring of :func:`kornia_tidy.figures.system_survey.contrast_transfer`, in cycles a pixel.
+    """Return the central frequency of each ring in cycles per pixel.
+
+    The rings are those of :func:`kornia_tidy.figures.system_statistics.contrast_transfer`.
 
     Example:
         >>> ring_centres(2)

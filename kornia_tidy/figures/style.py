@@ -1,4 +1,4 @@
-"""How pictures look: inks, letters, colour maps, ticks. Drawn with matplotlib, imported only when a picture is."""
+"""Style of the figures: colours, font sizes, colour maps and ticks. Matplotlib is imported on first use."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ RED, GREEN, BLUE = "#c0392b", "#2e8b57", "#2563eb"  # a camera's channels
 
 
 def require_matplotlib() -> None:
-    """Raise one clear sentence if matplotlib is missing.
+    """Raise ``ImportError`` with instructions if matplotlib is missing.
 
     Raises:
-        ImportError: if it is.
+        ImportError: if matplotlib is missing.
     """
     try:
         import matplotlib.figure  # noqa: F401, PLC0415
@@ -26,7 +26,7 @@ def require_matplotlib() -> None:
 
 
 def quiet(axes: Axes, spines: bool = True) -> None:
-    """Take the ticks away where nobody set any, and soften the rest."""
+    """Remove all ticks but those of an x axis from 0 to 1, and draw the frame in a faint style."""
     if axes.get_xlim() != (0, 1):
         axes.set_xticks([])
     axes.set_yticks([])
@@ -37,7 +37,7 @@ def quiet(axes: Axes, spines: bool = True) -> None:
 
 
 def open_chart(axes: Axes, label_size: float) -> None:
-    """Lay a faint grid behind a chart, open at the top and the right; ``label_size`` is that of its ticks, in pt."""
+    """Style a chart with a faint grid and without frame at the top and right; ``label_size`` is that of ticks in pt."""
     axes.grid(which="major", color="#e8ecef", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(which="both", labelsize=label_size, labelcolor=INK, color=FAINT)

@@ -1,4 +1,4 @@
-"""Published systems side by side in one picture: masks, PSFs, contrast and depth information over depth, captures."""
+"""Figure of published systems side by side: masks, and PSFs, contrast and depth bounds over depth, and captures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from kornia_tidy.figures.style import (
     RED,
     require_matplotlib,
 )
-from kornia_tidy.figures.system_survey import Survey
+from kornia_tidy.figures.system_statistics import SystemStatistics
 from kornia_tidy.masks.base import central_square
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.systems.system import System
@@ -52,40 +52,41 @@ WIDTH = CAPTURE_X + CAPTURE + 0.3
 
 @dataclass(frozen=True)
 class Portrait:
-    """A system, its camera, what it does over depth, and what it captures.
+    """One row of the figure: a system with its camera, its statistics over defocus, and a capture.
 
     Args:
-        system: the table's entry.
-        optics: the camera made of it.
-        survey: of that camera.
+        system: entry of the table of systems.
+        optics: camera of the system.
+        statistics: of the camera over defocus.
         capture: (3, H, W) in [0, 1], of the scene.
     """
 
     system: System
     optics: TiDyOptics
-    survey: Survey
+    statistics: SystemStatistics
     capture: Tensor
 
 
 def draw_systems(portraits: Sequence[Portrait], image: Tensor, nearness: Tensor, scene: str) -> Figure:
-    """Draw systems below each other: mask, PSFs over depth, contrast, bound on depth, and the capture of one scene.
+    """Draw one row for each system: mask, PSFs over depth, contrast, depth bound, and the capture of one scene.
 
     Args:
         portraits: of the systems, from top to bottom.
         image: the scene, (3, H, W) in [0, 1].
-        nearness: (1, H, W), its place in every system's range of defocus from 0, farthest, to 1, nearest.
-        scene: its name.
+        nearness: normalised inverse depth of the scene, (1, H, W): 0 is the farthest and 1 the nearest end of each
+            system's range.
+        scene: name of the scene.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=120)`` makes it some 2200 pixels wide.
 
     Raises:
         ImportError: if matplotlib is missing.
-        ValueError: if there is nothing to draw, or a system's camera does not know metres.
+        ValueError: if there are no systems, or the camera of a system has no depth in metres.
 
     Convention:
         - Each PSF is scaled to its own brightest value and drawn with the square root of its light; the bar is 10 px.
-        - Near is left everywhere. Contrast is drawn as a colour whose red, green and blue are those of the channels.
+        - Near is left everywhere. Contrast is drawn as a colour, with the contrast of the channels as red, green, blue.
     """
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -95,12 +96,15 @@ def draw_systems(portraits: Sequence[Portrait], image: Tensor, nearness: Tensor,
     height = HEAD + ROW * len(portraits) + FOOT
     figure = Figure(figsize=(WIDTH, height), facecolor="white")
     _head(figure, height, image, nearness, scene)
-    bounds = [(_place(p.survey.defocus), p.survey.bound.numpy()) for p in portraits]
+    bounds = [(_place(p.statistics.defocus), p.statistics.bound.numpy()) for p in portraits]
     values = np.concatenate([bound for _, bound in bounds])
-    limits = (float(values.min()) / 1.4, float(np.quantile(values, 0.95)) * 1.8)  # a plain lens in focus tells nothing
+    limits = (
+        float(values.min()) / 1.4,
+        float(np.quantile(values, 0.95)) * 1.8,
+    )  # infinite for a plain lens
     for row, portrait in enumerate(portraits):
         y = height - HEAD - ROW * row - CELL
-        if row % 2 == 0:  # a faint band leads the eye along every other row
+        if row % 2 == 0:  # every other row has a faint background
             _rectangle(figure, (LEFT - 0.15, y - 0.2), (WIDTH - 0.15, y + CELL + 0.07), facecolor="#f5f7f9", zorder=-2)
         _words(figure, y, portrait)
         _mask(figure, y, portrait.optics)
@@ -178,7 +182,7 @@ def _mask(figure: Figure, y: float, optics: TiDyOptics) -> None:
     amplitude = optics.pupil.amplitude.detach().cpu()
     light = torch.nn.functional.avg_pool2d(amplitude[None, None].double(), amplitude.shape[-1] // phase.shape[-1])
     shown = phase.where(light[0] > 0, math.nan)
-    step = 0.0 if len(shown) == 1 else 0.3 / (len(shown) - 1)  # several lie on each other like cards
+    step = 0.0 if len(shown) == 1 else 0.3 / (len(shown) - 1)  # several masks are drawn as a stack
     side = CELL - step * (len(shown) - 1)
     for k in range(len(shown) - 1, -1, -1):
         axes = _axes(figure, MASK_X + step * k, y + step * k, side, side, zorder=len(shown) - k)
@@ -187,13 +191,13 @@ def _mask(figure: Figure, y: float, optics: TiDyOptics) -> None:
 
 
 def _psfs(figure: Figure, y: float, portrait: Portrait) -> None:
-    camera, psfs = _metric(portrait.optics), portrait.survey.psfs
+    camera, psfs = _metric(portrait.optics), portrait.statistics.psfs
     nodes = torch.linspace(len(psfs) - 1, 0, COLUMNS).round().long().tolist()  # nearest first
     for column, node in enumerate(nodes):
         x = PSF_X + column * (CELL + GAP)
         light = psfs[node].clamp(min=0)
         axes = _picture(figure, (x, y, CELL, CELL), (light / light.amax()).sqrt(), interpolation="nearest")
-        psi = float(portrait.survey.defocus[node])
+        psi = float(portrait.statistics.defocus[node])
         depth = depth_at(psi, camera)
         metres = "∞" if math.isinf(depth) or depth > 100 else f"{depth:.2g} m"
         sign = "0" if abs(psi) < 0.5 else f"{psi:+.0f}".replace("-", "−")
@@ -205,7 +209,7 @@ def _psfs(figure: Figure, y: float, portrait: Portrait) -> None:
 
 def _contrast(figure: Figure, y: float, portrait: Portrait, last: bool) -> None:
     axes = _axes(figure, CONTRAST_X, y, PLOT, CELL)
-    picture = portrait.survey.contrast.flip(0).permute(2, 0, 1).clamp(0, 1).sqrt()  # (F, D, C), near left
+    picture = portrait.statistics.contrast.flip(0).permute(2, 0, 1).clamp(0, 1).sqrt()  # (F, D, C), near left
     axes.imshow(picture.numpy(), origin="lower", aspect="auto", extent=(0, 1, 0, 0.5), interpolation="bilinear")
     axes.set_yticks([0, 0.25, 0.5], ["0", "", "½"])
     _frame(axes)
@@ -242,7 +246,7 @@ def _metric(optics: TiDyOptics) -> ThinLensCamera:
 
 
 def _place(defocus: Tensor) -> np.ndarray:
-    """Where defocus lies between near, 0, and far, 1."""
+    """Return the relative position of defocus in its range, 0 at the near and 1 at the far end."""
     return ((defocus[-1] - defocus) / (defocus[-1] - defocus[0])).numpy()
 
 

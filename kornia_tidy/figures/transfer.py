@@ -1,4 +1,4 @@
-"""The photon-transfer curve as a picture: variance over level, a straight line, and what limits a picture where."""
+"""Figure of the photon-transfer curve: variance over level with the fitted line and its noise components."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEPS = 400  # of a curve
 
 
 def draw_transfer(result: PhotonTransfer) -> Figure:
-    """Draw a calibration: its points with two standard errors, and what was fitted to them.
+    """Draw a photon-transfer calibration: points with two standard errors, and the fitted curve.
 
     Args:
         result: from :func:`~kornia_tidy.calibration.noise.photon_transfer.photon_transfer` or a file.
@@ -61,7 +61,7 @@ def draw_transfer(result: PhotonTransfer) -> Figure:
 
 
 def _parts(result: PhotonTransfer, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Variance without light, of shot noise, and of the fixed pattern."""
+    """Return the variance of read noise, shot noise and fixed pattern over the level."""
     line = result.line
     dark = np.full_like(levels, (line.read_noise / line.gain) ** 2 + ROUNDING)
     return dark, levels / line.gain, (line.fixed_pattern * levels) ** 2

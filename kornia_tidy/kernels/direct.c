@@ -1,11 +1,13 @@
-// Gather by direct convolution with SIMD vectors: each block of pixels is convolved with the PSFs of its own layers only.
+// Direct convolution with SIMD vectors: a block of pixels is convolved only with the PSFs of the layers in the block.
 //
-// A strip is ROWS rows of LANES pixels, as many as a vector holds; a block is two strips side by side. What is added up
-// stays in registers: one vector of light serves all rows of a strip, each with its own sample of the PSF. The last
-// blocks of a row and of a plane are moved back inside it and overlap with their neighbours.
+// For gather, out[y][x] = sum over layers d of weight_d[y][x] * sum over j, k of psf_d[j][k] plane[y + k][x + j].
 //
-// A pixel lies in layer `index`, or with the share `weight` in the next one. PSFs are flipped by 180 degrees, so that
-// output pixel (y, x) sees the plane's pixels (y, x) to (y + side - 1, x + side - 1).
+// A strip is ROWS rows of LANES pixels, one vector per row; a block is two strips side by side. The sums stay in
+// registers: one vector of light is loaded once and multiplied by a different PSF sample for each row of the strip. The
+// last blocks of a row and of a plane are shifted back inside and overlap with their neighbours.
+//
+// Layers are given as in tile_plan.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one. PSFs
+// are flipped by 180 degrees, so output pixel (y, x) reads plane pixels (y, x) to (y + side - 1, x + side - 1).
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
@@ -14,9 +16,9 @@
 #include "vectors.h"
 
 enum { ROWS = 4, WIDTH = 2 * LANES };
-enum { CHUNK_ROWS = 4 };  // rows of light whose products are summed apart from the rest
-enum { TERMS = 2 * ROWS * WIDTH };        // the most layers that a block lists
-enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // of blocks, whose correlations are added up together
+enum { ROW_CHUNK = 4 };  // rows of light that are summed separately
+enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
+enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share one sum
 
 typedef REAL loose __attribute__((vector_size(64), aligned(sizeof(REAL)), may_alias));
 
@@ -33,14 +35,14 @@ typedef struct {
     REAL *out;                  // mix: (images, channels, height, width); correlate: zeros (slabs, layers, channels, side, side)
 } scene;
 
-// A layer in a block, and in which strips: 1 the left one, 2 the right one, 3 both.
+// A layer present in a block, with a bit mask of its strips: 1 left, 2 right, 3 both.
 typedef struct {
     int32_t layer, strips;
 } member;
 
-// Two rows of light meet the rows of strips: `upper` those up to `split`, and `lower`, a PSF's height below, the others:
-// each row once. Columns are taken `step` at a time into sums of their own, so that additions need not wait for one
-// another.
+// Adds the products of two rows of light to the sums of strips. Row `upper` serves the strip's rows up to `split`, row
+// `lower`, a PSF's height below it, the others, so that no product is wasted. `step` columns have separate sums, so that
+// their additions do not depend on each other.
 INLINE void add_rows(const REAL *upper, const REAL *lower, const REAL *psf, int64_t side, int split, int strips, int step,
                      vec sums[2][2][ROWS]) {
     int64_t j = 0;
@@ -59,7 +61,8 @@ INLINE void add_rows(const REAL *upper, const REAL *lower, const REAL *psf, int6
         }
 }
 
-// What some rows of light bring is added up apart from the rest: sums of many numbers lose more digits than sums of sums.
+// Convolves the light of strips with one PSF. Every ROW_CHUNK rows of light have separate sums, which are added at the
+// end: blocked summation has a smaller rounding error than one long sum.
 INLINE void convolve(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, int strips, vec total[2][ROWS]) {
     const int step = strips == 1 ? 2 : 1;
     const REAL *lower = light + side * pitch;
@@ -68,11 +71,11 @@ INLINE void convolve(const REAL *light, int64_t pitch, const REAL *psf, int64_t 
             vec only = *(const loose *)(light + v * pitch + strip * LANES);
             total[strip][v] = side == 1 ? *psf * only : (vec){0};
         }
-    if (side == 1) return;  // lower than a strip
-    for (int64_t first = 0; first < side; first += CHUNK_ROWS) {
+    if (side == 1) return;  // lower than a strip, handled above
+    for (int64_t first = 0; first < side; first += ROW_CHUNK) {
         vec sums[2][2][ROWS];
         memset(sums, 0, sizeof sums);
-        for (int64_t r = first; r < least(first + CHUNK_ROWS, side); r++) {
+        for (int64_t r = first; r < least(first + ROW_CHUNK, side); r++) {
             const REAL *x = light + r * pitch, *z = lower + r * pitch, *p = psf + r;
             if (r >= ROWS - 1) add_rows(x, x, p, side, ROWS - 1, strips, step, sums);
             else if (r == 0) add_rows(x, z, p, side, 0, strips, step, sums);
@@ -101,8 +104,7 @@ INLINE int note(member *members, int count, int64_t layer, int strip) {
     return count;
 }
 
-// Lists the layers of a block's pixels, and says how many there are: none if one of them does not exist, as where depth is
-// not a number.
+// Lists the layers of a block's pixels and returns their number; 0 if a layer index is invalid, as for a NaN depth.
 INLINE int list_members(const scene *s, const int64_t *index, const REAL *weight, member *members) {
     uint64_t other = 0, last = 0, layers = s->layers;
     for (int v = 0; v < ROWS; v++)
@@ -127,7 +129,7 @@ INLINE int list_members(const scene *s, const int64_t *index, const REAL *weight
     return count;
 }
 
-// How much a strip's pixels take of a layer.
+// Computes the weights of a layer for the pixels of a strip; for gradients, -1 for `index` and 1 for the next layer.
 INLINE void weigh(const scene *s, const int64_t *index, const REAL *weight, int64_t layer, vec weights[ROWS]) {
     for (int v = 0; v < ROWS; v++) {
         const int64_t *l = index + v * s->index_row;
@@ -142,7 +144,7 @@ INLINE void weigh(const scene *s, const int64_t *index, const REAL *weight, int6
     }
 }
 
-// The pairs of a strip and a layer present in it, counted in every `every`-th band of rows.
+// Counts the pairs of a strip and a layer present in it, in every `every`-th band of rows.
 int64_t count_pairs(const scene *s, int64_t every) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, pairs = 0;
 #pragma omp parallel for num_threads(s->threads) reduction(+ : pairs)
@@ -184,8 +186,8 @@ static void mix_block(const scene *s, const REAL *light, const int64_t *index, c
         for (int strip = 0; strip < 2; strip++) *(loose *)(out + v * s->width + strip * LANES) = total[strip][v];
 }
 
-// Each pixel takes the light that it sees through its own PSFs. Threads work on many bands that follow one another, whose
-// light they share, before few. Returns 0, or 1 if a layer does not exist.
+// Gathers light: each pixel is convolved with the PSFs of its layers. Guided scheduling gives threads long runs of
+// adjacent bands, which weight light in the cache, and short runs at the end. Returns 0, or 1 for an invalid layer index.
 int mix(const scene *s) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH;
     int failed = 0;
@@ -194,7 +196,7 @@ int mix(const scene *s) {
         int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
         const int64_t *index = s->index + image * s->index_image + y * s->index_row;
         const REAL *weight = s->weight ? s->weight + image * s->weight_image + y * s->weight_row : 0;
-        int skip = band % bands * ROWS - y;  // rows that the band before has made, maybe on another thread
+        int skip = band % bands * ROWS - y;  // rows of the previous band, which another thread may be writing
         member members[TERMS];
         for (int64_t block = 0; block < blocks; block++) {
             int64_t x = least(block * WIDTH, s->width - WIDTH);
@@ -214,7 +216,7 @@ int mix(const scene *s) {
     return failed;
 }
 
-// `count` rows of a PSF's samples against strips: own pixels times the light they see.
+// Adds the correlation of strips with the light for `count` rows of PSF samples: sum over pixels of own times light.
 INLINE void correlate_rows(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, int strips, int count,
                            vec *sums) {
     for (int64_t j = 0; j < side; j++) {
@@ -251,12 +253,12 @@ static void correlate_block(const REAL *light, int64_t pitch, const vec own[2][R
     correlate_with(light, pitch, own, side, 2, sums);
 }
 
-// Where a block of a piece stands, and its layers: those from members[start] to members[stop - 1].
+// Position of a block in a piece, with its layers members[start] to members[stop - 1].
 typedef struct {
     int64_t y, x, skip_rows, skip_columns, start, stop;
 } place;
 
-// A piece's own pixels in one layer and channel against the light they see, added up over the piece.
+// Correlates the pixels of a piece in one layer and channel with the light, summed over the piece.
 static void correlate_piece(const scene *s, int64_t image, int64_t channel, int64_t layer, const place *places, int count,
                             const member *members, vec *sums) {
     const REAL *plane = s->plane + image * s->plane_image + channel * s->plane_channel;
@@ -272,7 +274,7 @@ static void correlate_piece(const scene *s, int64_t image, int64_t channel, int6
                 weigh(s, s->index + image * s->index_image + p->y * s->index_row + x,
                       s->weight ? s->weight + image * s->weight_image + p->y * s->weight_row + x : 0, layer, weights[strip]);
                 for (int v = 0; v < ROWS; v++) weights[strip][v] *= *(const loose *)(gradient + (p->y + v) * s->width + x);
-                // Pixels that the blocks before have counted.
+                // Pixels of the overlap belong to the previous blocks.
                 if (p->skip_rows || p->skip_columns)
                     for (int v = 0; v < ROWS; v++)
                         for (int i = 0; i < LANES; i++)
@@ -284,8 +286,8 @@ static void correlate_piece(const scene *s, int64_t image, int64_t channel, int6
         }
 }
 
-// What each sample of each layer's PSF has brought from the plane to the layer's own pixels, in sums over slabs of rows.
-// Returns 0, or 1 if there is no memory.
+// Computes the gradient in the PSFs: for each sample of each layer's PSF the correlation of the layer's pixels with the
+// light, in separate sums for slabs of rows. Returns 0, or 1 if there is no memory.
 int correlate(const scene *s) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH, area = s->side * s->side;
     int64_t all = s->images * bands, failed = 0;

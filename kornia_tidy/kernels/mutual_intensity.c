@@ -1,8 +1,10 @@
-// The energy of many waves by their mutual intensity, without gradients: see mutual_intensity.py, whose formulas these are.
+// PSF energies of partially coherent light by mutual intensity, without gradients. The formulas are in
+// mutual_intensity.py.
 //
-// For each depth and row of pixels: waves over the pupil's columns, one for each state and point of the row; their mutual
-// intensity J, packed as the sum of real and imaginary part; and its product with each pixel's B. All of it stays in a
-// core's cache. Planes have rows of whole vectors, filled up with zeros.
+// For each depth and row of pixels this computes the waves over the pupil's columns, one for each state and quadrature
+// point of the row; their mutual intensity J, packed as the sum of real and imaginary part; and the inner product of J
+// with the matrix B of each pixel. The intermediate results fit into a core's cache. Rows of planes are padded with zeros
+// to whole vectors.
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
@@ -12,7 +14,7 @@
 
 enum { BLOCK = 8 };  // rows of J that stay in registers
 
-// `count` vectors of a wave: a row of the kernel, x, times the field, u.
+// Computes `count` vectors of a wave: the sum over m of x[m] u[m], complex, with a row x of the kernel and the field u.
 INLINE void add_wave(const REAL *x, const vec *u, int64_t cells, int64_t vecs, int count, vec *re, vec *im) {
     vec a[2] = {0}, b[2] = {0}, c[2] = {0}, e[2] = {0};
     for (int64_t m = 0; m < cells; m++, u += 2 * vecs)
@@ -24,7 +26,7 @@ INLINE void add_wave(const REAL *x, const vec *u, int64_t cells, int64_t vecs, i
     for (int i = 0; i < count; i++) re[i] = a[i] - c[i], im[i] = b[i] + e[i];
 }
 
-// The light in `count` pixels, whose B follow one another.
+// Computes the light in `count` successive pixels: the inner products of J with their matrices B.
 INLINE void add_light(const vec *intensity, const vec *pixel, int64_t plane, int count, REAL *light) {
     vec sums[4][2];
     memset(sums, 0, sizeof sums);
@@ -38,11 +40,11 @@ INLINE void add_light(const vec *intensity, const vec *pixel, int64_t plane, int
     for (int i = 0; n < plane && i < count; i++) sums[i][0] += intensity[n] * pixel[i * plane + n];
     for (int i = 0; i < count; i++) {
         light[i] = sum_of(sums[i][0] + sums[i][1]);
-        if (light[i] < 0) light[i] = 0;  // where there is none, rounding leaves less
+        if (light[i] < 0) light[i] = 0;  // rounding can make dark pixels negative
     }
 }
 
-// J or B, packed: the sum over waves of re[n] one[m] + im[n] two[m]. Rows n beyond the cells are zero like the waves there.
+// Computes J or B in packed form: total[n][m] is the sum over waves of re[n] one[m] + im[n] two[m]. Padded rows n are zero.
 static void products(const vec *re, const vec *im, const vec *one, const vec *two, int64_t waves, int64_t rows,
                      int64_t vecs, vec *total) {
     for (int64_t first = 0; first < rows; first += BLOCK)
@@ -69,7 +71,7 @@ int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels,
     vec *fields = aligned_alloc(64, numbers * sizeof(vec));
     if (!fields) return 1;
     memset(fields, 0, numbers * sizeof(vec));
-    for (int64_t k = 0; k < states; k++)  // real and imaginary part of each row by turns
+    for (int64_t k = 0; k < states; k++)  // the real and the imaginary part of each row alternate
         for (int64_t m = 0; m < cells; m++)
             for (int part = 0; part < 2; part++)
                 for (int64_t n = 0; n < cells; n++)

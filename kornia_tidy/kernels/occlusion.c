@@ -1,14 +1,18 @@
-// Occlusion by direct convolution: a block of pixels meets the layers of its window, each only in the rows and columns
-// where it is.
+// Occlusion-aware compositing by direct convolution: a block of pixels is convolved with the layers in its window, each
+// only in the rows and columns where it is present.
 //
-// A block is BAND rows of LANES pixels, and its sums stay in registers. All that is added up is positive, so that
-// sample by sample in REAL it keeps its relative accuracy however small it is (transforms do not).
+// From near to far, with the blurred light L, alpha A and cumulative alpha E of each layer (the alpha of the layer and all
+// farther ones): total += T L / E and T -= T A / E, where T is the transmission of the nearer layers. With stray light L
+// becomes (1 - veil) L + veil mean A.
 //
-// - Light is convolved, masked to a layer. A row of it above and one below the window's middle together serve each of
-//   the block's rows once: no product is wasted.
-// - Weights are whole ones along runs of pixels. The blur of a run is a difference of two sums over a PSF's row, one for
-//   each of its ends: looked up in double, since differences do keep only their absolute accuracy.
-// - Weights that are shared by two layers are convolved like light.
+// A block is BAND rows of LANES pixels, and its sums stay in registers. All terms are positive, so direct sums in REAL keep
+// their relative accuracy however small they are (transforms do not, see dense_occlusion.py).
+//
+// - Light is masked to a layer and convolved. A row above and a row below the middle of the window together serve each of
+//   the block's rows once, so that no product is wasted.
+// - Weights are 1 along runs of pixels. The blur of a run is the difference of two partial sums over a PSF's row, one for
+//   each end. They come from tables in double, since a difference keeps only absolute accuracy.
+// - Weights between 0 and 1, of pixels shared by two layers, are convolved like light.
 //
 // Compiled by build.py with REAL as float or double.
 
@@ -28,62 +32,63 @@ typedef struct {
     int64_t plane_image, plane_channel, plane_row, map_image, map_row;
     const REAL *plane;  // light
     const REAL *psfs;   // (layers, channels, side, side), flipped, columns first
-    const REAL *lower;  // layers of the plane's pixels; `layers` and more: in none
-    const REAL *share;  // below 1: of the next layer; like lower, or null
-    const REAL *mean;   // (images, channels) light that strays, or null
-    const REAL *stray_light;   // (layers, channels)
+    const REAL *lower;  // layer indices of the plane's pixels; `layers` or more: in no layer
+    const REAL *share;  // weight of the next layer, below 1; like lower, or null
+    const REAL *mean;   // (images, channels) mean light, spread as stray light, or null
+    const REAL *veil;   // (layers, channels) share of stray light
     REAL *out;          // (images, channels, height, width)
 } scene_parameters;
 
-// Pixels of one row and one `lower`, up to the next run: either all of them share light with the next layer, or none.
+// A run of pixels of one row with the same layer index; either all or none of them are shared with the next layer.
 typedef struct {
     int32_t start, layer, shared;
 } run;
 
-// A row of light or weights, and the columns of the PSF that meet any of it.
+// A row of light or weights, and the range of PSF columns with nonzero products.
 typedef struct {
     const REAL *light;
     int32_t from, to;
 } ray;
 
-// Where whole weights begin (sign 1) or end (-1), as a place in the tables of sums.
+// Start (sign 1) or end (-1) of a run of weights 1, as an index into the tables of partial sums.
 typedef struct {
     int64_t at;
     double sign;
 } edge;
 
-// Whole weights in a window: where they begin and end within rows, and from which row to which they fill rows' starts.
+// Weights 1 in a window: their starts and ends within rows, and the ranges of rows that begin with weights 1.
 typedef struct {
     edge *columns, *rows;
     int column_count, row_count, open;
 } region;
 
 typedef struct {
-    ray *light, *lower, *upper;  // of a layer: all of its light; shared weights of runs whose `lower` it is, or is the next
+    ray *light, *lower, *upper;  // light of a layer; shared weights of runs with it as `lower`, or as the next layer
     int lower_count, upper_count;
-    region own, behind;  // of whole weights of the layer; and of it and all behind it
+    region own, behind;  // weights 1 of the layer, and of the layer and all farther ones
 } outline;
 
-// What a thread works with.
+// Buffers of a thread.
 typedef struct {
     run *runs;          // of the rows of a window, at row % rows
-    int64_t *made;      // which row of all maps they are of
-    const run **heads;  // the runs in which the rows of a window begin
+    int64_t *made;      // index of the row, over all maps, to which they belong
+    const run **heads;  // first run of each row of a window
     int32_t *members;   // layers in the window, near to far
-    int64_t *stamps;    // by layer: the window it was last seen in
+    int64_t *stamps;    // by layer: number of the last window that contained it
     int64_t window;
-    REAL *rows[3];      // masked: light, shared weights of runs whose `lower` the layer is, or is the next
+    REAL *rows[3];      // masked rows: light, and the shared weights `lower` and `upper` of the outline
     REAL *nothing;      // a row of zeros
     ray *rays;          // of one channel
-    vec (*total)[BAND], (*through)[BAND];  // by channel: light of the layers so far, and how much they let through
+    vec (*total)[BAND], (*through)[BAND];  // by channel: light of the nearer layers, and their transmission
     outline outline;
     void *all[20];
     int count;
 } workspace;
 
-// ---- Tables: sums over the ends of a PSF's rows.
-// rows (side + 2 BAND - 2, pitch): row BAND - 1 + k holds, rising by u, the sum of row k's samples from column
-// side + LANES - 2 - u on; rows beyond the PSF hold zeros. Then the sums of all rows from k = side + BAND - 2 - u on.
+// ---- Tables: partial sums over the ends of a PSF's rows, by which the blur of a run is a difference of two entries.
+// Rows (side + 2 BAND - 2, pitch): entry u of row BAND - 1 + k is the sum of row k's samples from column
+// side + LANES - 2 - u on; rows beyond the PSF are zero. They are followed by the sums of all rows from
+// k = side + BAND - 2 - u on.
 
 static int64_t table_pitch(const scene_parameters *s) { return s->side + 2 * LANES; }
 static int64_t table_rows(const scene_parameters *s) { return s->side + 2 * BAND - 2; }
@@ -112,7 +117,7 @@ static void find_runs(const scene_parameters *s, const REAL *lower, const REAL *
     for (int64_t x = 0; x < width; x++) {
         int shared = share && share[x] > 0;
         if (!x || lower[x] != lower[x - 1] || (share && shared != runs[count - 1].shared)) {
-            int exists = lower[x] >= 0 && lower[x] + shared < s->layers;  // not where depth is not a number
+            int exists = lower[x] >= 0 && lower[x] + shared < s->layers;  // false for a NaN depth
             runs[count++] = (run){x, exists ? lower[x] : s->layers, exists && shared};
         }
     }
@@ -130,7 +135,7 @@ static void find_runs_of_band(const scene_parameters *s, workspace *d, int64_t i
     }
 }
 
-// Goes on to a window further right in the same rows; says whether all of it is one layer's.
+// Moves to a window further right in the same rows; returns whether the window contains a single layer.
 static int move_heads(workspace *d, int64_t rows, int64_t x, int64_t span) {
     int alone = 1;
     for (int64_t r = 0; r < rows; r++) {
@@ -187,7 +192,7 @@ INLINE void start_row(region *a, int64_t at, int whole) {
     a->open = whole;
 }
 
-// Where a layer is in a window.
+// Finds the runs and rows of a layer in a window.
 static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int32_t layer, int64_t pitch) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1;
     outline *o = &d->outline;
@@ -197,7 +202,7 @@ static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int
     for (int64_t r = 0; r < rows; r++) {
         extent light = {span, 0}, lower = {span, 0}, upper = {span, 0};
         const run *p = d->heads[r];
-        int64_t place = (BAND - 1 + r) * table_pitch(s) + s->side + LANES - 2 + x;  // less the column where a run begins
+        int64_t place = (BAND - 1 + r) * table_pitch(s) + s->side + LANES - 2 + x;  // subtract the first column of a run
         int was_own = p->layer == layer && !p->shared, was_behind = was_own || p->layer < layer;
         int whole = was_own && p[1].start >= x + span;
         start_row(&o->own, rows - 1 - r, was_own);
@@ -213,7 +218,7 @@ static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int
             if (below) reach(&lower, from, to);
             if (above) reach(&upper, from, to);
         }
-        // Rows that are the layer's alone need no mask: null for the plane's own row.
+        // Rows of this layer alone need no mask: null means the row of the plane itself.
         o->light[r] = ray_of(s, light, whole ? 0 : d->rows[0] + r * pitch, d->nothing);
         o->lower[r] = ray_of(s, lower, d->rows[1] + r * pitch, d->nothing);
         o->upper[r] = ray_of(s, upper, d->rows[2] + r * pitch, d->nothing);
@@ -224,7 +229,8 @@ static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int
 
 // ---- Sums.
 
-// Two rows of light meet a PSF: row `a` for the block's rows up to `split`, row `b`, a PSF's height below, for the others.
+// Adds the products of two rows of light with a PSF: row `a` for the block's rows up to `split`, and row `b`, a PSF's
+// height below it, for the others.
 INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, int split, int strips, vec sums[2][BAND]) {
     int64_t from = least(a->from, b->from), to = a->to > b->to ? a->to : b->to;
     for (int64_t j = from; j < to; j++)
@@ -237,7 +243,7 @@ INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, 
         }
 }
 
-// `side` is at least BAND - 1.
+// Convolves rows of light with a PSF. `side` is at least BAND - 1.
 INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int strips, vec total[2][BAND]) {
     vec sums[2][BAND];
     memset(sums, 0, sizeof sums);
@@ -256,7 +262,7 @@ static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec tot
     convolve_rays(rays, psf, side, 2, total);
 }
 
-// The blur of whole weights, from where their runs begin and end.
+// Adds the blur of weights 1: the sum over the starts and ends of runs of sign times the table's partial sum.
 static void add_edges(const scene_parameters *s, const double *table, const region *a, vec total[BAND]) {
     int64_t pitch = table_pitch(s);
     dvec constant = {0}, sums[BAND][PARTS];
@@ -290,14 +296,14 @@ INLINE vec only(vec x, __typeof__((vec){0} == (vec){0}) mask) {
 
 enum { LIGHT, LOWER, UPPER };
 
-// A layer's light, or its shared weights, in the rows that hold any.
+// Masks rows of light to a layer, or computes the rows of its shared weights, where the layer is present.
 INLINE void mask_rows(const scene_parameters *s, const ray *rays, int32_t layer, int what, const REAL *lower, const REAL *share,
                       const REAL *light, REAL *out, int64_t pitch) {
     const vec own = (REAL)layer - (vec){0}, below = (REAL)(layer - 1) - (vec){0};
     for (int64_t r = 0; r < s->side + BAND - 1; r++) {
         if (!rays[r].light || !rays[r].to) continue;
         const REAL *l = lower + r * s->map_row, *f = share ? share + r * s->map_row : 0, *x = light + r * s->plane_row;
-        for (int64_t j = 0;; j = least(j + LANES, s->side - 1)) {  // the last ones overlap
+        for (int64_t j = 0;; j = least(j + LANES, s->side - 1)) {  // the last two vectors overlap
             vec at = *(const loose *)(l + j), weight;
             if (what == LIGHT && !share) weight = only(*(const loose *)(x + j), at == own);
             else {
@@ -321,7 +327,7 @@ static int64_t window_pitch(const scene_parameters *s) { return (s->side + 2 * L
 
 // ---- Blocks.
 
-// A block of two strips whose window is all of one layer.
+// Renders a block of two strips with a single layer in its window: ((1 - veil) L + veil mean A) / A.
 static void lay_alone(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int32_t layer = d->heads[0]->layer;
     int64_t area = s->side * s->side, rows = s->side + BAND - 1;
@@ -338,16 +344,16 @@ static void lay_alone(const scene_parameters *s, workspace *d, const double *tab
             }
             convolve_two(d->rays, s->psfs + (layer * s->channels + c) * area, s->side, light);
         }
-        REAL stray_light = s->stray_light && layer < s->layers ? s->stray_light[layer * s->channels + c] : 0;
-        REAL background = s->stray_light ? stray_light * s->mean[image * s->channels + c] * whole : 0;
+        REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
+        REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
         REAL divisor = (whole > 0 ? whole : 0) + EPSILON;
         for (int v = skip; v < BAND; v++)
             for (int strip = 0; strip < 2; strip++)
-                *(loose *)(out + v * s->width + strip * LANES) = ((1 - stray_light) * light[strip][v] + background) / divisor;
+                *(loose *)(out + v * s->width + strip * LANES) = ((1 - veil) * light[strip][v] + glow) / divisor;
     }
 }
 
-// A block of one strip, layer over layer.
+// Renders a block of one strip by compositing its layers from near to far.
 static void lay_over(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
     int64_t area = s->side * s->side, rows = s->side + BAND - 1, pitch = window_pitch(s);
     int count = list_layers(s, d, rows, x, s->side + LANES - 1);
@@ -374,7 +380,7 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
             mask_light(s, o->light, layer, lower, share, plane, d->rows[0], pitch);
             convolve_one(d->rays, psf, s->side, light);
             add_edges(s, table, &o->own, own[0]);
-            if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // nothing lies behind
+            if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // the farthest layer: the cumulative alpha is its own
             else add_edges(s, table, &o->behind, seen);
             if (o->lower_count) {
                 convolve_one(o->lower, psf, s->side, weight);
@@ -384,11 +390,11 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
                 convolve_one(o->upper, psf, s->side, weight);
                 for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v];
             }
-            REAL stray_light = s->stray_light ? s->stray_light[layer * s->channels + c] : 0;
-            REAL background = s->stray_light ? stray_light * s->mean[image * s->channels + c] : 0;
+            REAL veil = s->veil ? s->veil[layer * s->channels + c] : 0;
+            REAL glow = s->veil ? veil * s->mean[image * s->channels + c] : 0;
             for (int v = 0; v < BAND; v++) {
                 vec passed = through[c][v] / (only(seen[v], seen[v] > 0) + EPSILON);
-                total[c][v] += passed * ((1 - stray_light) * light[0][v] + background * own[0][v]);
+                total[c][v] += passed * ((1 - veil) * light[0][v] + glow * own[0][v]);
                 through[c][v] -= passed * own[0][v];
             }
         }
@@ -399,7 +405,7 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
     }
 }
 
-// What a block of one strip costs, see `direct_cost` in direct_occlusion.py.
+// Counts of operations for the cost of a scene, see `direct_cost` in direct_occlusion.py.
 enum { ALONE, PAIRS, COLUMNS, EDGES, COUNTS };
 
 static int64_t count_columns(const ray *rays, int64_t side) {
@@ -433,7 +439,7 @@ static void *take(workspace *d, int64_t bytes) {
     return d->all[d->count++] = memory;
 }
 
-static int set_up(const scene_parameters *s, workspace *d) {
+static int allocate_workspace(const scene_parameters *s, workspace *d) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1, pitch = window_pitch(s);
     outline *o = &d->outline;
     d->count = 0, d->window = 0;
@@ -460,15 +466,15 @@ static int set_up(const scene_parameters *s, workspace *d) {
     return ok;
 }
 
-static void tear_down(workspace *d) {
+static void free_workspace(workspace *d) {
     for (int n = 0; n < d->count; n++) free(d->all[n]);
 }
 
-// Lays the layers of a band, or with `counts` only counts what that would cost.
+// Renders a band or, with `counts`, only counts its operations.
 static void lay_band(const scene_parameters *s, workspace *d, const double *tables, int64_t band, int64_t *counts) {
     int64_t bands = (s->height + BAND - 1) / BAND, rows = s->side + BAND - 1, image = band / bands;
     int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
-    int skip = top - y;  // rows that the band before has made, maybe on another thread
+    int skip = top - y;  // rows of the previous band, which another thread may be writing
     find_runs_of_band(s, d, image, y);
     for (int64_t x = 0, next; x < s->width; x = next) {
         int64_t left = least(x, s->width - LANES);
@@ -482,17 +488,17 @@ static void lay_band(const scene_parameters *s, workspace *d, const double *tabl
     }
 }
 
-// Adds up what every `every`-th band would cost. Returns 0, or 1 if there is no memory.
+// Counts the operations of every `every`-th band. Returns 0, or 1 if there is no memory.
 int count(const scene_parameters *s, int64_t every, int64_t *counts) {
     int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
     workspace d;
-    int ok = set_up(s, &d);
+    int ok = allocate_workspace(s, &d);
     for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
-    tear_down(&d);
+    free_workspace(&d);
     return !ok;
 }
 
-// Lays the layers of a scene over one another. Returns 0, or 1 if there is no memory.
+// Renders a scene by occlusion-aware compositing of its layers. Returns 0, or 1 if there is no memory.
 int occlude(const scene_parameters *s) {
     int64_t bands = (s->height + BAND - 1) / BAND, all = s->layers * s->channels, failed = 0;
     double *tables = malloc(all * table_size(s) * sizeof(double));
@@ -502,7 +508,7 @@ int occlude(const scene_parameters *s) {
 #pragma omp for
         for (int64_t n = 0; n < all; n++) fill_table(s, s->psfs + n * s->side * s->side, tables + n * table_size(s));
         workspace d;
-        int ok = set_up(s, &d);
+        int ok = allocate_workspace(s, &d);
         if (!ok) {
 #pragma omp atomic write
             failed = 1;
@@ -510,7 +516,7 @@ int occlude(const scene_parameters *s) {
 #pragma omp for schedule(dynamic, 4)
         for (int64_t n = 0; n < s->images * bands; n++)
             if (ok) lay_band(s, &d, tables, n, 0);
-        tear_down(&d);
+        free_workspace(&d);
     }
     free(tables);
     return failed;

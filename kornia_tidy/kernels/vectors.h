@@ -1,9 +1,9 @@
-// What the C sources share: vectors of 64 bytes of REAL.
+// SIMD vectors of 64 bytes of REAL, shared by the C sources.
 
 #include <stdint.h>
 #include <string.h>
 
-// Vectors are passed to functions that are inlined alone, so that it does not matter how a processor would pass them.
+// Only inlined functions take vectors as arguments, so the calling convention for vectors does not matter.
 #pragma GCC diagnostic ignored "-Wpsabi"
 
 #define INLINE static inline __attribute__((always_inline))

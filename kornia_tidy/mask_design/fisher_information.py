@@ -1,4 +1,4 @@
-r"""How well an image of a point can tell its depth: Fisher information and the bound of Cramér and Rao.
+r"""Fisher information of a point's defocus and position in its image, and the Cramér-Rao bound on their estimates.
 
 A pixel counts :math:`\mu = N h + b` photons on average, Poisson distributed: N of the point, whose PSF is h, and b of
 the background. No unbiased estimate of the parameters :math:`\theta` has a covariance below the inverse of
@@ -6,10 +6,10 @@ the background. No unbiased estimate of the parameters :math:`\theta` has a cova
 .. math:: I_{ij} = \sum_{c,p} \frac{1}{\mu_{cp}} \frac{\partial \mu_{cp}}{\partial \theta_i}
     \frac{\partial \mu_{cp}}{\partial \theta_j}
 
-The slopes of the PSF are those of the integrals that make it, not differences: see :func:`defocus_response`.
+The derivatives of the PSF are computed under its integrals, not by finite differences: see :func:`defocus_response`.
 
 Source: Ober, Ram and Ward, Biophysical Journal 86, 1185 (2004), for the information; Shechtman, Sahl, Backer and
-Moerner, Physical Review Letters 113, 133902 (2014), for the bound as the measure of a mask.
+Moerner, Physical Review Letters 113, 133902 (2014), for the bound as an objective of mask design.
 """
 
 from __future__ import annotations
@@ -30,39 +30,41 @@ from kornia_tidy.psf.psf_model import CodedLens
 from kornia_tidy.psf.pupil import gapped_cells, gapped_pupil_field, pupil_field
 
 PHOTONS, BACKGROUND = 3000.0, 5.0
-"""Of a point, and of each pixel behind it: the setting of the field since Shechtman et al."""
+"""Photons of a point, and background photons of each pixel: the usual setting since Shechtman et al."""
 
 
-_ROUNDING = 1e-20  # per rad²; less information than that, a bound of 1e10 rad, is what rounding makes of none
+_ROUNDING = 1e-20  # per rad²; information below this (a bound of 1e10 rad) is round-off and counts as zero
 
 
 class PointResponse(NamedTuple):
-    """PSFs and how they change with the point's defocus and place."""
+    """PSFs and their derivatives with respect to the point's defocus and position."""
 
     psfs: Tensor
-    """(D, C, P, P), the share of the point's light in each pixel."""
-    slopes: Tensor
-    """(3, D, C, P, P), per radian of defocus at 530 nm, and per pixel of the point's image along x and y."""
+    """(D, C, P, P), fraction of the point's light in each pixel."""
+    derivatives: Tensor
+    """(3, D, C, P, P): per radian of defocus at 530 nm, and per pixel of shift of the image along x and along y."""
 
 
 def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) -> PointResponse:
-    r"""Return the average PSFs of a lens and their slopes, exactly propagated, whatever the lens' own propagation.
+    r"""Return the time-averaged PSFs of a lens and their derivatives with respect to defocus and position.
 
-    Where :math:`W = K U K^T` is the wave on the sensor (see :mod:`~kornia_tidy.psf.propagation`) and K' and K'' are
-    made like K with x and x² under the integral,
+    The wave on the sensor is :math:`W = K U K^T` with the pupil field U (see :mod:`~kornia_tidy.psf.propagation`). With
+    K' and K'' the kernels that have an additional factor x and x² under the integral,
 
     .. math:: \partial_\psi W = i (K'' U K^T + K U K''^T), \qquad \partial_x W = 2\pi i\, s\, K U K'^T
 
+    Propagation is always exact, even if the fidelity of the lens asks for another.
+
     Args:
-        lens: masks, modulator, camera and spectrum; its window and pixel tolerance. Light outside the window is lost.
+        lens: gives masks, modulator, camera, spectrum, window and pixel tolerance. Light outside the window is lost.
         defocus: nodes in radians at 530 nm. Default: those of the lens.
 
     Returns:
-        PSFs and slopes in float64; gradients reach masks and modulator, and may be taken again.
+        PSFs and derivatives in float64, differentiable twice with respect to masks and modulator.
 
     Example:
-        >>> psfs, slopes = defocus_response(CodedLens(), [-8.0, 0.0, 8.0])
-        >>> psfs.shape[:2], slopes.shape[:3]
+        >>> psfs, derivatives = defocus_response(CodedLens(), [-8.0, 0.0, 8.0])
+        >>> psfs.shape[:2], derivatives.shape[:3]
         (torch.Size([3, 3]), torch.Size([3, 3, 3]))
     """
     nodes = lens.defocus_nodes if defocus is None else tuple(map(float, defocus))
@@ -73,7 +75,7 @@ def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) ->
     field = pupil_field if gaps is None else gapped_pupil_field
     distance = torch.as_tensor(camera.image_distance, dtype=torch.float64).detach()
     pixel = camera.pixel_pitch * camera.aperture_radius / float(distance)
-    psfs, slopes = [], []
+    psfs, derivatives = [], []
     for wavelength in lens.spectrum.wavelengths:
         scale, shift = REFERENCE_WAVELENGTH / wavelength, camera.chromatic_defocus(wavelength)
         kernels = _exact_kernels(
@@ -84,35 +86,36 @@ def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) ->
             states.device,
         )
         waves = field(states, pupil.amplitude.to(states), lens.masks.dispersion(wavelength))
-        psf, slope = _energies(waves, weights / pupil.light, kernels, pixel / wavelength)
+        psf, derivative = _energies(waves, weights / pupil.light, kernels, pixel / wavelength)
         psfs.append(psf)
-        slopes.append(torch.cat([slope[:1] * scale, slope[1:]]))
-    shares = states.new_tensor(lens.spectrum.flat().channel_weights)
+        derivatives.append(torch.cat([derivative[:1] * scale, derivative[1:]]))
+    channel_weights = states.new_tensor(lens.spectrum.flat().channel_weights)
     return PointResponse(
-        torch.einsum("wdyx,cw->dcyx", torch.stack(psfs), shares),
-        torch.einsum("wsdyx,cw->sdcyx", torch.stack(slopes), shares),
+        torch.einsum("wdyx,cw->dcyx", torch.stack(psfs), channel_weights),
+        torch.einsum("wsdyx,cw->sdcyx", torch.stack(derivatives), channel_weights),
     )
 
 
 def sampled_response(
     phase: Tensor, aperture: Tensor, defocus: Sequence[float], samples: int = 64, weights: Tensor | None = None
 ) -> PointResponse:
-    r"""Return the PSFs of the published way to rate depth masks, and their slopes: points in the pupil, one FFT.
+    r"""Return PSFs and their derivatives in the published setting of depth masks: a point-sampled pupil and one FFT.
 
     .. math:: h_d = \frac{|\mathrm{FFT}_M\{A e^{i\phi + i\psi_d \rho^2}\}|^2}{M^2 \sum A^2}
 
-    Numbers found so compare with others found so. They are some 5 % too good: pixels of a mask, which have a width,
-    throw light far out that points do not, and light that leaves the M x M pixels comes back on the other side.
+    Bounds from these PSFs compare with published ones. They are about 5 % too low, for two reasons: real mask pixels
+    have a width and scatter light far out, which point samples do not; and light beyond the M x M pixels is aliased
+    back into them.
 
     Args:
         phase: radians at 530 nm, (K, N, N); the PSFs are averaged over the K masks.
         aperture: amplitude, (N, N).
         defocus: nodes in radians.
         samples: M, pixels along a side of the PSF.
-        weights: share of the exposure of each mask, (K,). Default: equal.
+        weights: fraction of the exposure of each mask, (K,). Default: equal.
 
     Returns:
-        PSFs of one channel and slopes in float64. A pixel is 10 / M cycles per pupil radius where N is 23.
+        PSFs of one channel and derivatives in float64. For N = 23 a pixel is 10 / M cycles per pupil radius.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 3.
 
@@ -127,48 +130,52 @@ def sampled_response(
     weights = phase.new_full((count,), 1 / count, dtype=torch.float64) if weights is None else weights.double()
     kernels, step = _sampled_kernels(tuple(map(float, defocus)), samples, size, phase.device)
     field = pupil_field(phase.double(), amplitude, 1.0)
-    psfs, slopes = _energies(field, weights / amplitude.square().sum(), kernels, step)
-    return PointResponse(psfs[:, None], slopes[:, :, None])
+    psfs, derivatives = _energies(field, weights / amplitude.square().sum(), kernels, step)
+    return PointResponse(psfs[:, None], derivatives[:, :, None])
 
 
 def fisher_information(response: PointResponse, photons: float = PHOTONS, background: float = BACKGROUND) -> Tensor:
-    """Return the Fisher information of defocus and place, (D, 3, 3), summed over pixels and channels.
+    """Return the Fisher information matrix of defocus, x and y, summed over pixels and channels.
 
     Args:
-        response: PSFs and slopes.
-        photons: expected from the point in each channel, of which the PSF's sum arrives.
-        background: expected in each pixel of each channel besides.
+        response: PSFs and their derivatives.
+        photons: expected photons of the point in each channel; the PSF gives the fraction that each pixel receives.
+        background: expected background photons in each pixel of each channel.
+
+    Returns:
+        (D, 3, 3), per rad² and per pixel².
 
     Raises:
-        ValueError: if there are no photons, or the background is negative or not finite.
+        ValueError: if ``photons`` is not positive, or the background is negative or not finite.
 
     Example:
         >>> psfs = torch.full((1, 1, 1, 2), 0.5)
-        >>> slopes = torch.tensor([0.5, -0.5]).expand(3, 1, 1, 1, 2)
-        >>> fisher_information(PointResponse(psfs, slopes), photons=100.0, background=0.0)[0, 0, 0]
+        >>> derivatives = torch.tensor([0.5, -0.5]).expand(3, 1, 1, 1, 2)
+        >>> fisher_information(PointResponse(psfs, derivatives), photons=100.0, background=0.0)[0, 0, 0]
         tensor(100.)
     """
     check_positive("photons", photons)
     if not 0 <= background < math.inf:
         raise ValueError(f"background must be finite and not negative, got {background}")
     expected = photons * response.psfs + background
-    # Where no light is expected none is at any defocus near: such a pixel says nothing, and 0/0 must not say NaN.
-    informative = expected.clamp(min=torch.finfo(expected.dtype).tiny)
-    slopes = photons * response.slopes
-    return torch.einsum("idcyx,jdcyx->dij", slopes / informative, slopes)
+    # A pixel without expected light has zero derivatives and no information; the clamp avoids 0/0 there.
+    divisor = expected.clamp(min=torch.finfo(expected.dtype).tiny)
+    derivatives = photons * response.derivatives
+    return torch.einsum("idcyx,jdcyx->dij", derivatives / divisor, derivatives)
 
 
 def defocus_bound(information: Tensor, known_position: bool = False) -> Tensor:
-    r"""Return the least standard deviation of defocus that this information allows, in radians, (D,).
+    r"""Return the square root of the Cramér-Rao bound on defocus from Fisher information, in radians, (D,).
 
     .. math:: \sqrt{[I^{-1}]_{\psi\psi}} = (I_{\psi\psi} - I_{\psi p} I_{pp}^{-1} I_{p\psi})^{-1/2}
 
     Args:
         information: (D, 3, 3) of defocus, x and y.
-        known_position: the point's place is known and need not be found from the same image.
+        known_position: whether the point's position is known and need not be estimated from the same image.
 
     Returns:
-        ``inf`` where the image does not change with defocus, as that of a plain lens in focus; no gradient there.
+        Standard deviation in radians. It is ``inf``, without gradient, where the image does not change with defocus,
+        as for a plain lens in focus.
 
     Example:
         >>> defocus_bound(torch.diag(torch.tensor([100.0, 4.0, 4.0]))[None])
@@ -188,30 +195,30 @@ def crlb(
     background: float = BACKGROUND,
     known_position: bool = False,
 ) -> Tensor:
-    r"""Return the square root of the Cramér-Rao bound on the defocus of a point seen through a lens, in radians.
+    r"""Return the square root of the Cramér-Rao bound on the defocus of a point imaged by a lens, in radians.
 
-    A time-averaged lens is rated by its average PSFs: one image is all an estimate has.
+    For several masks the bound is that of the time-averaged PSFs, because the estimate has only one image.
 
     Args:
         lens: masks, modulator, camera and spectrum.
         defocus: nodes in radians at 530 nm. Default: those of the lens.
-        photons: expected from the point in each channel: grey, and as bright in each.
-        background: expected in each pixel of each channel besides.
-        known_position: the point's place is known; by default x and y are found from the same image.
+        photons: expected photons of the point in each channel; the point is grey.
+        background: expected background photons in each pixel of each channel.
+        known_position: whether the point's position is known. By default x and y are estimated from the same image.
 
     Returns:
         (D,) float64, differentiable with respect to masks and modulator.
 
-    Convention:
-        - In metres it is times :math:`\lambda_0 z^2 / (\pi R^2)` at a depth z, see
-          :func:`~kornia_tidy.optics.thin_lens.thin_lens_defocus`.
-        - The bound is reached where photons are many, and is a lower one for all. Maximum likelihood from 2000 images
-          each, at psi = -8, 0 and 8 rad, of :func:`~kornia_tidy.masks.initial_heights.fisher_mask` before a background
-          of 5 scattered by 1.01, 0.99 and 1.02 times the bound at 3000 photons, by 0.99, 1.03 and 1.00 times at 1000,
-          and by 1.25, 1.07 and 1.25 times at 200: so few photons tell depth up to a quarter worse than it says.
-
     Raises:
-        ValueError: if there are no photons, or the background is negative or not finite.
+        ValueError: if ``photons`` is not positive, or the background is negative or not finite.
+
+    Convention:
+        - For a bound in metres at a depth z multiply by :math:`\lambda_0 z^2 / (\pi R^2)`, see
+          :func:`~kornia_tidy.optics.thin_lens.thin_lens_defocus`.
+        - Estimates reach the bound with many photons only. Maximum likelihood estimates with
+          :func:`~kornia_tidy.masks.initial_heights.fisher_mask` and a background of 5, from 2000 images at each of
+          psi = -8, 0 and 8 rad, had a standard deviation of 1.01, 0.99 and 1.02 times the bound at 3000 photons, 0.99,
+          1.03 and 1.00 times at 1000, and 1.25, 1.07 and 1.25 times at 200.
 
     Source: Shechtman et al., Physical Review Letters 113, 133902 (2014).
 
@@ -224,22 +231,26 @@ def crlb(
     return defocus_bound(fisher_information(defocus_response(lens, defocus), photons, background), known_position)
 
 
-# ---------------------------------------------------------------------- inside
-
-
 def _energies(field: Tensor, weights: Tensor, kernels: Tensor, step: float) -> tuple[Tensor, Tensor]:
-    """Energies (D, P, P) and slopes (3, D, P, P) over defocus, x and y of K fields (K, N, N) of these weights.
+    """Return the PSFs of K pupil fields and their derivatives with respect to defocus, x and y.
 
-    Kernels are (3, D, P, q, N): of the moments 0, 1 and 2.
+    Args:
+        field: (K, N, N) complex.
+        weights: of the fields, (K,).
+        kernels: propagation matrices of the moments 0, 1 and 2, (3, D, P, q, N), with q samples in a pixel.
+        step: pixel in cycles per pupil radius.
+
+    Returns:
+        Energies (D, P, P) and derivatives (3, D, P, P).
     """
     window = kernels.shape[2]
     k0, k1, k2 = kernels.flatten(2, 3)[:, :, None]  # (D, 1, Pq, N)
     rows = [kernel @ field for kernel in (k0, k1, k2)]
     wave = rows[0] @ k0.mT
-    turn = 2j * math.pi * step
-    slopes = (1j * (rows[2] @ k0.mT + rows[0] @ k2.mT), turn * (rows[0] @ k1.mT), turn * (rows[1] @ k0.mT))
+    tilt = 2j * math.pi * step
+    wave_derivatives = (1j * (rows[2] @ k0.mT + rows[0] @ k2.mT), tilt * (rows[0] @ k1.mT), tilt * (rows[1] @ k0.mT))
     products = [wave.real.square() + wave.imag.square()]
-    products += [2 * (wave.real * slope.real + wave.imag * slope.imag) for slope in slopes]
+    products += [2 * (wave.real * change.real + wave.imag * change.imag) for change in wave_derivatives]
     energies = [
         torch.einsum("k,dkyqxr->dyx", weights, product.unflatten(-1, (window, -1)).unflatten(2, (window, -1)))
         for product in products
@@ -262,7 +273,7 @@ def _exact_kernels(
 
 @lru_cache(maxsize=12)
 def _sampled_kernels(defocus: tuple[float, ...], samples: int, size: int, device: torch.device) -> tuple[Tensor, float]:
-    """Return the FFT of point samples as matrices, normed by M, and a pixel in cycles per pupil radius."""
+    """Return the matrices of an FFT of pupil samples, normalised by sqrt(M), and the pixel in cycles per radius."""
     pitch = MASK_SPAN / size
     step = 1 / (samples * pitch)
     with torch.inference_mode(False), torch.no_grad():

@@ -1,9 +1,9 @@
-r"""Theorem 1 in numbers: an average of PSFs need not be the PSF of any single mask.
+r"""Non-convexity of the set of PSFs: an average of PSFs need not be the PSF of any single mask (theorem 1).
 
-The Fourier transform of a PSF is the autocorrelation of the pupil field. Take the two points u, v of the aperture that
-are farthest apart along some direction: only one pair of points is that far apart, so for a single mask the
-autocorrelation at v - u is one unit phasor, of modulus exactly 1. An average over masks is a mean of unit phasors,
-whose modulus is below 1 unless they agree. So no single mask makes that average.
+The Fourier transform of a PSF is the autocorrelation of the pupil field. Let u, v be the two points of the aperture
+that are farthest apart along some direction. No other pair has the distance v - u, so for a single mask the
+autocorrelation at v - u is one unit phasor, of modulus exactly 1. For an average over masks it is a mean of unit
+phasors, of modulus below 1 unless they are equal. Then no single mask has this average as its PSF.
 """
 
 from __future__ import annotations
@@ -13,14 +13,17 @@ from torch import Tensor
 
 from kornia_tidy.psf.pupil import pupil_field
 
-_DIRECTION = (1.0, 2**-0.5 - 0.5)  # no two points of a grid have the same extent along it
+_DIRECTION = (1.0, 2**-0.5 - 0.5)  # irrational, so that no two grid points have the same projection on it
 
 
 def extreme_points(aperture: Tensor) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the two open pixels (row, column) that are farthest apart along a generic direction.
+    """Return the two open pixels of an aperture that are farthest apart along a generic direction.
 
     Args:
         aperture: (N, N), open where it is not zero.
+
+    Returns:
+        (row, column) of the first and of the last pixel along the direction.
 
     Example:
         >>> extreme_points(torch.ones(3, 3))
@@ -32,15 +35,17 @@ def extreme_points(aperture: Tensor) -> tuple[tuple[int, int], tuple[int, int]]:
     return (int(first[0]), int(first[1])), (int(last[0]), int(last[1]))
 
 
-def autocorrelation_witness(phase: Tensor, aperture: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return :math:`|\sum_k w_k (X_k \star X_k)_{v-u}|` of the pupil fields :math:`X_k = A e^{i\phi_k}`.
+def autocorrelation_bound(phase: Tensor, aperture: Tensor, weights: Tensor | None = None) -> Tensor:
+    r"""Return the autocorrelation bound of non-convexity: 1 for a single mask, below 1 for an average that no mask has.
 
-    It is 1 for every single mask. Below 1, no single mask has the averaged PSF.
+    .. math:: \left| \sum_k w_k (X_k \star X_k)_{v-u} \right|, \qquad X_k = A e^{i\phi_k}
+
+    with the pupil fields X and the extreme points u, v of the aperture.
 
     Args:
-        phase: K masks in radians, (K, N, N); defocus may be added to all of them, it changes nothing.
+        phase: K masks in radians, (K, N, N). A defocus added to all of them does not change the result.
         aperture: binary, (N, N).
-        weights: share of the exposure of each mask, (K,). Default: equal.
+        weights: fraction of the exposure of each mask, (K,). Default: equal.
 
     Returns:
         A number between 0 and 1, 0-dimensional float64.
@@ -53,17 +58,17 @@ def autocorrelation_witness(phase: Tensor, aperture: Tensor, weights: Tensor | N
     Example:
         >>> opposite = torch.zeros(2, 4, 4, dtype=torch.float64)
         >>> opposite[1, 0, 0] = torch.pi
-        >>> round(float(autocorrelation_witness(opposite[:1], torch.ones(4, 4))), 9)
+        >>> round(float(autocorrelation_bound(opposite[:1], torch.ones(4, 4))), 9)
         1.0
-        >>> round(float(autocorrelation_witness(opposite, torch.ones(4, 4))), 9)
+        >>> round(float(autocorrelation_bound(opposite, torch.ones(4, 4))), 9)
         0.0
     """
     if not bool(((aperture == 0) | (aperture == 1)).all()):
-        raise ValueError("the witness needs a binary aperture, got values other than 0 and 1")
+        raise ValueError("aperture must be binary, got values other than 0 and 1")
     masks, size = phase.shape[0], phase.shape[-1]
     weights = torch.full((masks,), 1 / masks, dtype=torch.float64) if weights is None else weights
     field = pupil_field(phase.double(), aperture, 1.0)
-    # Through the PSF, as a camera would measure it: zero-padded so that no lag wraps around.
+    # By way of the PSF, as a camera would measure it. Zero padding keeps lags from wrapping around.
     psf = torch.fft.fft2(field, s=(2 * size, 2 * size)).abs().square()
     average = torch.einsum("k,kyx->yx", weights.to(psf), psf)
     autocorrelation = torch.fft.ifft2(average)

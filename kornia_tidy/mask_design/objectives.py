@@ -1,7 +1,7 @@
-"""Mask design: what a mask is to be good for, as one number that gradients can lower, without an image or a network.
+"""Objectives of mask design, and their minimisation by gradient descent without an image or a network.
 
-For depth the number is the mean of :func:`~kornia_tidy.mask_design.fisher_information.crlb` over defocus. For extended
-depth of field it is :func:`restoration_error`, or :func:`point_error` where nothing restores the image.
+For depth estimation the objective is the mean of :func:`~kornia_tidy.mask_design.fisher_information.crlb` over defocus.
+For extended depth of field it is :func:`restoration_error`, or :func:`point_error` if the image is not restored.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from kornia_tidy.masks.zernike import ZernikeMask
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.psf_bank import PSFBank
 
-SCENE_SIZE = 64  # pixels over which the scene of the restoration error is alike; beyond, its spectrum is flat
+SCENE_SIZE = 64  # pixels; correlation length of the scene in the restoration error, beyond which its spectrum is flat
 
 
 def design(
     masks: PhaseMasks, objective: Callable[[], Tensor], iterations: int = 150, lr_metres: float = 2e-8
 ) -> list[float]:
-    """Lower an objective by Adam, with a learning rate that falls to zero along a cosine; masks change in place.
+    """Optimise masks in place: minimise an objective by Adam with a learning rate that decays to zero along a cosine.
 
     Args:
-        masks: what to design, of any family.
-        objective: gives the number to lower for the masks as they are now, for a lens that has them, say.
+        masks: masks of any family.
+        objective: function without arguments that returns the value to minimise, for example of a lens with these
+            masks.
         iterations: gradient steps.
-        lr_metres: height that the first steps move, in metres, see :func:`adam_groups`.
+        lr_metres: initial learning rate in metres of height, see :func:`adam_groups`.
 
     Returns:
-        The objective before each step.
+        The value of the objective before each step.
 
     Raises:
         ValueError: if the iterations or the learning rate are not positive.
@@ -66,10 +67,14 @@ def point_error(bank: PSFBank) -> Tensor:
 
     .. math:: \frac{1}{DC} \sum_{dc} \| h_{dc} - \delta \|^2
 
-    It is 1 where the light is spread thin and 0 for a perfect point at all depths.
+    It is 1 if the light is spread over many pixels, and 0 for a perfect point at all depths.
 
     Args:
-        bank: of a lens whose fidelity discards stray light, or else light thrown far away comes back as a reward.
+        bank: PSFs of a lens whose fidelity discards stray light. Otherwise the renormalised window would reward masks
+            that scatter light out of it.
+
+    Returns:
+        0-dimensional, without unit.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), the experiment on extended depth of field without a network.
 
@@ -84,29 +89,28 @@ def point_error(bank: PSFBank) -> Tensor:
 
 
 def restoration_error(bank: PSFBank, noise: float = 0.05) -> Tensor:
-    r"""Return how much of a picture is lost at unknown depth, after the best restoration that is alike at all depths.
-
-    One linear filter restores images of all depths of the bank. The best one leaves the mean squared error
+    r"""Return the mean squared error of restoration by one Wiener filter for all depths.
 
     .. math:: \sum_f S_f \left( 1 - \frac{|\langle H_f \rangle|^2}{\langle |H_f|^2 \rangle + \sigma^2 / S_f} \right)
         \Big/ \sum_f S_f
 
-    with the transfer functions H, means over defocus, and natural scenes' power spectrum S, as one over the frequency
-    squared. It is low where H is high (noise is not amplified) and depth changes it little (one filter serves all): a
-    small image of a point at one depth only, or one that is alike at all but large, will not do.
+    H is the transfer function, :math:`\langle\rangle` the mean over defocus, and S the power spectrum of natural
+    scenes, proportional to one over the frequency squared. The error is low if H is large, so that noise is not
+    amplified, and if it depends little on depth, so that one filter fits all depths. A small PSF at one depth only does
+    not suffice, nor does a large PSF that is the same at all depths.
 
     Args:
-        bank: of a lens whose fidelity discards stray light; averaged over its channels.
-        noise: standard deviation of the noise, as a share of that of the scene.
+        bank: PSFs of a lens whose fidelity discards stray light; the result is the mean over its channels.
+        noise: standard deviation of the noise, as a fraction of that of the scene.
 
     Returns:
-        Share of the scene's variance, between 0 and 1, 0-dimensional.
+        Fraction of the scene's variance, between 0 and 1, 0-dimensional.
 
     Raises:
         ValueError: if the noise is not positive.
 
     Source: Diaz, Goudail, Loiseaux and Huignard, Optics Letters 34(19) 2970 (2009), for the error after one filter as
-    the measure of a mask; Field, J. Opt. Soc. Am. A 4(12) 2379 (1987), for the spectrum.
+    an objective of mask design; Field, J. Opt. Soc. Am. A 4(12) 2379 (1987), for the spectrum.
 
     Example:
         >>> point = torch.zeros(2, 1, 9, 9)
@@ -119,38 +123,41 @@ def restoration_error(bank: PSFBank, noise: float = 0.05) -> Tensor:
     size = 2 * bank.window
     frequency = torch.fft.fftfreq(size, dtype=torch.float64, device=bank.psfs.device)
     spectrum = 1 / (frequency[:, None] ** 2 + frequency[: size // 2 + 1] ** 2 + (1 / SCENE_SIZE) ** 2)
-    twice = torch.full_like(frequency[: size // 2 + 1], 2.0)  # frequencies that the real transform leaves out
-    twice[0] = twice[-1] = 1
-    spectrum = spectrum * size**2 / (spectrum * twice).sum()  # a variance of one
+    count = torch.full_like(frequency[: size // 2 + 1], 2.0)  # the real transform omits the conjugate frequencies
+    count[0] = count[-1] = 1
+    spectrum = spectrum * size**2 / (spectrum * count).sum()  # variance 1
     transfer = torch.fft.rfft2(bank.psfs.to(torch.promote_types(bank.psfs.dtype, torch.float32)), s=(size, size))
     mean = transfer.mean(0)
     power = (transfer.real.square() + transfer.imag.square()).mean(0)
-    kept = (mean.real.square() + mean.imag.square()) / (power + (noise**2 / spectrum).to(power))
-    share = (spectrum * twice / size**2).to(power)
-    return (share * (1 - kept)).sum((-2, -1)).mean()
+    restored = (mean.real.square() + mean.imag.square()) / (power + (noise**2 / spectrum).to(power))
+    variance = (spectrum * count / size**2).to(power)
+    return (variance * (1 - restored)).sum((-2, -1)).mean()
 
 
 def design_fisher_mask(
     limit: float = 10.0, seed: int = 0, size: int = 23, num_modes: int = 55, iterations: int = 150
 ) -> tuple[ZernikeMask, float]:
-    """Design a mask for depth in the published setting: the lowest mean bound over a range of defocus.
+    """Design a mask for depth estimation in the published setting, by its mean Cramér-Rao bound over defocus.
 
-    The bound is that of :func:`sampled_response` at 21 depths: 3000 photons, 5 of background in each of 64 x 64
-    pixels, defocus and place unknown. For a range, camera or colours of your own, :func:`design` the masks of a lens
-    by its :func:`~kornia_tidy.mask_design.fisher_information.crlb`.
+    The bound is that of :func:`sampled_response` at 21 depths, with 3000 photons, a background of 5 photons in each of
+    64 x 64 pixels, and unknown defocus and position. For another range, camera or spectrum, :func:`design` the masks of
+    a lens by its :func:`~kornia_tidy.mask_design.fisher_information.crlb`.
 
     Args:
-        limit: largest defocus in radians either way; beyond 10 light leaves the 64 x 64 pixels.
-        seed: of the start, Zernike coefficients of 0.5 rad rms in all.
-        size: pixels of the mask.
-        num_modes: Zernike polynomials.
-        iterations: gradient steps, of which 150 take 4 s on one core.
+        limit: largest defocus in radians on either side of focus; beyond 10 rad light leaves the 64 x 64 pixels.
+        seed: seed of the initial Zernike coefficients, 0.5 rad rms in all.
+        size: pixels along a side of the mask.
+        num_modes: number of Zernike polynomials.
+        iterations: gradient steps; 150 take 4 s on one core.
 
     Returns:
-        The mask, and its mean bound in radians. With the defaults 0.0668 to 0.0671 for seeds 0 to 5.
+        The mask, and its mean bound in radians. With the defaults this is 0.0668 to 0.0671 for seeds 0 to 5.
 
-    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for a mask so designed, which has 0.0785; Shechtman et al.,
-    Physical Review Letters 113, 133902 (2014), for the tetrapod that comes of it.
+    Raises:
+        ValueError: if ``limit`` or ``iterations`` is not positive.
+
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for a mask designed in this way, whose bound is 0.0785;
+    Shechtman et al., Physical Review Letters 113, 133902 (2014), for the tetrapod PSF that results.
 
     Example:
         >>> mask, bound = design_fisher_mask(iterations=2)

@@ -1,4 +1,8 @@
-"""Masks leave the computer: frames for a spatial light modulator, heights for a printer, and back."""
+"""Mask export: masks as frames for a spatial light modulator (SLM), as height files, and as a body for 3-D printing.
+
+Phase masks, or heights in metres, come in. Files go out, and can be read back to heights: a folder of SLM frames with a
+timing sheet, NPY or safetensors, STL (written only). Read ``slm_frames.py`` first.
+"""
 
 from kornia_tidy.mask_export.frame_files import SLMFrames, read_slm_frames, write_slm_frames
 from kornia_tidy.mask_export.mask_files import read_heights, write_heights

@@ -1,4 +1,4 @@
-"""A folder of SLM frames: pictures of the panel's size, a timing sheet, and what is needed to read them back."""
+"""Files of SLM frames: a folder of pictures of the panel's size, a timing sheet, and a sidecar with all parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kornia_tidy.mask_export.timing import FrameTime, frame_times, timing_sheet
 
 FORMAT = "kornia-tidy SLM frames 1"
 SIDECAR, TIMING, TURNS = "frames.json", "timing.csv", "turns.npy"
-LEVELS = 1 << 10  # of grey, at most
+LEVELS = 1 << 10  # largest number of grey levels
 SUFFIXES = (".png", ".tif", ".tiff")
 ALIGNMENT = "least significant bits: grey level g is stored as the number g"
 ORIENTATION = (
@@ -40,25 +40,29 @@ def write_slm_frames(
     suffix: str = ".png",
     replace: bool = False,
 ) -> None:
-    """Write frames for a modulator's panel: one picture for each mask, a timing sheet and a sidecar; all or nothing.
+    """Write a folder of frames for an SLM: one picture for each mask, a timing sheet and a sidecar.
+
+    After an error no partial folder remains.
 
     Args:
-        folder: where to; it is made, the folder it lies in must exist.
+        folder: folder to create; its parent must exist.
         frames: grey levels of the masks.
-        placement: where on the panel. Default: as large as fits 1920x1200 pixels of 8 um.
-        times: when each frame is shown. Default: equal shares of 100 ms, instant swaps.
+        placement: position on the panel. Default: the largest that fits 1920x1200 pixels of 8 um.
+        times: when each frame is shown. Default: equal parts of 100 ms with instant transitions.
         suffix: ``".png"``, ``".tif"`` or ``".tiff"``.
-        replace: whether a folder that holds frames written before, and nothing else, may be replaced.
+        replace: whether to replace an existing folder of frames. A folder with other files is never replaced.
 
     Raises:
-        FileExistsError: if the folder exists and is not to be replaced, or holds other files.
-        FileNotFoundError: if the folder it is to lie in does not exist.
-        ValueError: if the mask does not fit on the panel, times are not those of the frames, or the suffix is unknown.
+        FileExistsError: if the folder exists and is not to be replaced, or has other files.
+        FileNotFoundError: if the parent folder does not exist.
+        ValueError: if the mask does not fit on the panel, there is not one time for each frame, or the suffix is
+            unknown.
 
     Convention:
-        - Up to 8 bits are stored in 8-bit files, 9 and 10 bits in 16-bit files, in the least significant bits: level g
-          is the number g, so that a 10-bit frame looks almost black.
-        - ``turns.npy`` (int16) is there only where heights are beyond one wave: what the panel cannot show.
+        - Up to 8 bits are written to 8-bit files, 9 and 10 bits to 16-bit files, in the least significant bits. The
+          value of a pixel is its grey level, so a 10-bit frame looks almost black.
+        - ``turns.npy`` (int16) exists only if heights exceed one wave. It has the whole waves that the panel does not
+          show.
 
     Example:
         >>> import tempfile
@@ -76,7 +80,7 @@ def write_slm_frames(
     count, *size = frames.grey.shape
     times = frame_times([1] * count, 0.1) if times is None else times
     if len(times) != count:
-        raise ValueError(f"there are times for {len(times)} frames, and {count} masks")
+        raise ValueError(f"times must be one for each of the {count} masks, got {len(times)}")
     check_replaceable(folder, replace)
     rows, columns = size
     names = [f"frame_{k:03d}{suffix}" for k in range(count)]
@@ -86,14 +90,14 @@ def write_slm_frames(
         picture = placement.place(grey, frames.background)[0].numpy()
         contents[name] = cv2.imencode(suffix, picture if frames.bits <= 8 else picture.view(np.uint16))[1].tobytes()
     contents[TIMING] = timing_sheet(times, names).encode()
-    turned = bool(frames.turns.any())
-    if turned:
+    wraps = bool(frames.turns.any())
+    if wraps:
         contents[TURNS] = _encoded_turns(frames.turns)
     sidecar = {
         "format": FORMAT,
         "files": names,
         "timing": TIMING,
-        "turns": TURNS if turned else None,
+        "turns": TURNS if wraps else None,
         "bits": frames.bits,
         "bits_of_file": 8 if frames.bits <= 8 else 16,
         "alignment": ALIGNMENT,
@@ -118,11 +122,14 @@ def write_slm_frames(
 
 
 def read_slm_frames(folder: str | os.PathLike[str]) -> SLMFrames:
-    """Read the frames of a folder written by :func:`write_slm_frames`, and check every pixel of every mask.
+    """Read the frames of a folder written by :func:`write_slm_frames`, and check every panel pixel.
+
+    Args:
+        folder: folder to read.
 
     Raises:
         FileNotFoundError: if the folder, its sidecar or a frame is missing.
-        ValueError: if one is damaged, or a frame is not what the sidecar says.
+        ValueError: if a file is damaged, or a frame contradicts the sidecar.
     """
     folder = Path(folder)
     about = _sidecar(folder)
@@ -138,28 +145,32 @@ def read_slm_frames(folder: str | os.PathLike[str]) -> SLMFrames:
         )
         level_phases = torch.tensor(about["level_phases_rad"], dtype=torch.float64)
         wavelength, per_metre = float(about["wavelength_m"]), float(about["radians_per_metre"])
-        names, turned, depth = about["files"], about["turns"], about["bits_of_file"]
+        names, turns_file, depth = about["files"], about["turns"], about["bits_of_file"]
         _check_sidecar(names, level_phases, wavelength, per_metre)
         placement.scale(size)
     except (KeyError, TypeError, IndexError, OverflowError, RuntimeError, ValueError) as error:
-        told = f"there is no {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{folder / SIDECAR} does not describe frames: {told:.300}") from None
+        reason = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{folder / SIDECAR} does not describe frames: {reason:.300}") from None
     grey = torch.cat(
         [_read_frame(folder / Path(name).name, depth, len(level_phases), placement, size) for name in names]
     )
     turns = torch.zeros_like(grey)
-    if turned is not None:
-        turns = torch.from_numpy(read_stored_turns(folder / TURNS)).long()
+    if turns_file is not None:
+        turns = torch.from_numpy(_read_turns(folder / TURNS)).long()
         if turns.shape != grey.shape:
             raise ValueError(f"{folder / TURNS} must have shape {tuple(grey.shape)}, got {tuple(turns.shape)}")
     return SLMFrames(grey, turns, level_phases, wavelength, per_metre)
 
 
 def check_replaceable(folder: str | os.PathLike[str], replace: bool) -> None:
-    """Refuse a folder that exists, unless it is to be replaced and holds nothing but frames written before.
+    """Raise if a folder exists, unless it may be replaced and has only files of :func:`write_slm_frames`.
+
+    Args:
+        folder: folder to be written.
+        replace: whether an existing folder may be replaced.
 
     Raises:
-        FileExistsError: if it exists and is not.
+        FileExistsError: if the folder exists and may not be replaced, is a file, or has other files.
     """
     folder = Path(folder)
     if not folder.exists():
@@ -168,28 +179,28 @@ def check_replaceable(folder: str | os.PathLike[str], replace: bool) -> None:
         raise FileExistsError(f"cannot write {folder}: it exists")
     if not folder.is_dir():
         raise FileExistsError(f"cannot write {folder}: it is a file, not a folder of frames")
-    own: set[str] = set()
+    known: set[str] = set()
     if (folder / SIDECAR).exists():
         files = _sidecar(folder).get("files")
-        own = {SIDECAR, TIMING, TURNS, *map(str, files if isinstance(files, list) else [])}
-    strange = sorted(entry.name for entry in folder.iterdir() if entry.name not in own)
-    if strange:
-        raise FileExistsError(f"cannot replace {folder}: it holds {strange[0]}, which is no part of frames written")
+        known = {SIDECAR, TIMING, TURNS, *map(str, files if isinstance(files, list) else [])}
+    foreign = sorted(entry.name for entry in folder.iterdir() if entry.name not in known)
+    if foreign:
+        raise FileExistsError(f"cannot replace {folder}: it holds {foreign[0]}, which is no file of a folder of frames")
 
 
-def read_stored_turns(path: Path) -> np.ndarray:
-    """Read the whole turns of masks.
+def _read_turns(path: Path) -> np.ndarray:
+    """Read the whole waves of masks from an NPY file.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it does not hold whole numbers.
+        ValueError: if the file is damaged or its values are not int16.
     """
     try:
         turns = decode_npy(read_bytes(path))
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from None
     if turns.dtype != np.int16:
-        raise ValueError(f"cannot read {path}: whole turns are int16, not {turns.dtype}")
+        raise ValueError(f"cannot read {path}: whole waves must be int16, got {turns.dtype}")
     return turns
 
 
@@ -217,14 +228,12 @@ def _check_sidecar(names: Any, level_phases: Tensor, wavelength: float, per_metr
 
 
 def _read_frame(path: Path, depth: int, levels: int, placement: PanelPlacement, size: tuple[int, int]) -> Tensor:
-    stored = read_stored(path)
-    if stored.dtype.kind != "u" or stored.dtype.itemsize * 8 != depth or stored.shape[2] != 1:
-        raise ValueError(
-            f"{path} must be a grey picture of {depth} bits, got {stored.dtype} in {stored.shape[2]} planes"
-        )
-    picture = torch.from_numpy(stored[..., 0].astype(np.int16 if depth == 16 else np.uint8))
+    codes = read_stored(path)
+    if codes.dtype.kind != "u" or codes.dtype.itemsize * 8 != depth or codes.shape[2] != 1:
+        raise ValueError(f"{path} must be a grey picture of {depth} bits, got {codes.dtype} in {codes.shape[2]} planes")
+    picture = torch.from_numpy(codes[..., 0].astype(np.int16 if depth == 16 else np.uint8))
     if int(picture.max()) >= levels or int(picture.min()) < 0:
-        raise ValueError(f"{path} must hold grey levels from 0 to {levels - 1}, found {int(stored.max())}")
+        raise ValueError(f"{path} must hold grey levels from 0 to {levels - 1}, found {int(codes.max())}")
     try:
         return placement.read(picture[None], size).long()
     except ValueError as error:

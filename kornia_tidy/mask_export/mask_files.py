@@ -1,4 +1,4 @@
-"""Files of masks: heights as NPY, and the state of a camera as safetensors."""
+"""Mask files: heights in NPY files, and phases in the safetensors state of a camera."""
 
 from __future__ import annotations
 
@@ -21,41 +21,39 @@ from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.tensor_files import read_tensors
 
 SUFFIXES = (".npy", ".safetensors")
-_KEYS = ("masks.phase", "phase")  # of a camera's state, and of its masks alone
+_KEYS = ("masks.phase", "phase")  # in the state of a camera, and in that of masks alone
 
 
 def read_heights(path: str | os.PathLike[str], material: Material | None = None) -> Tensor:
-    """Read masks.
+    """Read the heights of masks from a file.
 
     Args:
-        path: NPY of heights in metres, (K, rows, columns) or (rows, columns); or safetensors with a camera's or a
-            mask's ``state_dict``, whose ``masks.phase`` or ``phase`` is radians at 530 nm.
-        material: what turns radians into metres. Default: index 1.5, as the masks'.
+        path: NPY file of heights in metres, (K, rows, columns) or (rows, columns); or safetensors file with the
+            ``state_dict`` of a camera or of masks, whose ``masks.phase`` or ``phase`` is in radians at 530 nm.
+        material: material for the conversion of radians to metres. Default: index 1.5, the default of masks.
 
     Returns:
         (K, rows, columns) metres, float64.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is neither, has no pixelwise masks in it, or a height is not finite.
+        ValueError: if the suffix is another, the file is damaged or has no pixel-wise masks, or a height is not finite.
 
     Convention:
-        - A state does not tell its constraint. Masks with one, and families without a ``phase``, are exported from
-          Python, where :class:`~kornia_tidy.mask_export.SLMFrames` takes the masks themselves.
+        - A state does not include the constraint of its masks. Masks with a constraint, and families without a
+          ``phase``, are exported from Python: :meth:`~kornia_tidy.mask_export.SLMFrames.of` takes the masks themselves.
     """
     path = Path(path)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)
     if path.suffix.lower() == ".npy":
         data = read_bytes(path)
         try:
-            stored = decode_npy(data)
+            array = decode_npy(data)
         except ValueError as error:
             raise ValueError(f"cannot read {path}: {error}") from None
-        if stored.dtype.kind != "f" or stored.ndim not in (2, 3):
-            raise ValueError(
-                f"cannot read {path}: heights are floats in 2 or 3 axes, not {stored.dtype} {stored.shape}"
-            )
-        heights = torch.from_numpy(stored.astype(np.float64))
+        if array.dtype.kind != "f" or array.ndim not in (2, 3):
+            raise ValueError(f"cannot read {path}: heights are floats in 2 or 3 axes, not {array.dtype} {array.shape}")
+        heights = torch.from_numpy(array.astype(np.float64))
     else:
         state = read_tensors(path)[0]
         names = [key for key in _KEYS if key in state]
@@ -73,11 +71,17 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
 
 
 def read_dwell_shares(path: str | os.PathLike[str]) -> list[float] | None:
-    """Return the dwell shares that a camera's state holds, where they were learnt; else None.
+    """Read the learnt dwell shares from the state of a camera.
+
+    Args:
+        path: safetensors file of a camera's state, or any other file of masks.
+
+    Returns:
+        One share for each mask, summing to one. None if the state has no learnt dwell times, or the file no state.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it cannot be read.
+        ValueError: if the file is damaged.
     """
     path = Path(path)
     if path.suffix.lower() != ".safetensors":
@@ -88,17 +92,18 @@ def read_dwell_shares(path: str | os.PathLike[str]) -> list[float] | None:
 
 
 def write_heights(path: str | os.PathLike[str], heights: Tensor, material: Material | None = None) -> None:
-    """Write masks, whole or not at all; an existing file is replaced.
+    """Write the heights of masks to a file; an existing one is replaced, and after an error no partial file remains.
 
     Args:
-        path: ``.npy`` for metres, float64; ``.safetensors`` for ``masks.phase`` in radians at 530 nm, float32, which
-            ``TiDyOptics.load_state_dict`` takes.
+        path: ``.npy`` for metres in float64; ``.safetensors`` for ``masks.phase`` in radians at 530 nm and float32,
+            which ``TiDyOptics.load_state_dict`` accepts.
         heights: (K, rows, columns) metres.
-        material: of safetensors only. Default: index 1.5.
+        material: material for the conversion to radians, for safetensors only. Default: index 1.5.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if the suffix is another, or heights are not finite maps.
+        TypeError: if heights are not a floating-point tensor.
+        ValueError: if the suffix is another, or heights have another shape or are not finite.
     """
     path, heights = Path(path), checked_heights(heights)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)

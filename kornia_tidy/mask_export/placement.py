@@ -1,4 +1,4 @@
-"""Where a mask lies on the panel of a modulator: which panel pixels show which mask pixel."""
+"""Placement of a mask on the panel of a modulator: the block of panel pixels that shows each mask pixel."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from kornia_tidy.masks.base import MASK_SPAN
 
 FLIPS = ("none", "left-right", "up-down")
 ROTATIONS = (0, 90, 180, 270)
-_SLACK = 1e-6  # of a panel pixel: an edge that is halfway but for rounding is halfway
+_SLACK = 1e-6  # panel pixels; tolerance for edges that lie on a pixel centre
 
 
 @dataclass(frozen=True)
 class PanelPlacement:
-    r"""A mask on a panel: each mask pixel becomes a block of whole panel pixels.
+    r"""Placement of masks on a panel: each mask pixel becomes a block of whole panel pixels.
 
     A mask pixel is :math:`s = 2.3 R / (N p)` panel pixels wide, with R the pupil's radius on the panel, N the mask's
-    shorter side and p the panel's pitch. A panel pixel shows the mask pixel that its centre lies in. Where s is whole,
-    so are all blocks alike; else their sides differ by one.
+    shorter side and p the panel's pitch. A panel pixel shows the mask pixel that contains its centre. If s is a whole
+    number, all blocks are equal; else their sides differ by one.
 
     Args:
         panel: rows and columns of the panel.
         panel_pitch: distance p between panel pixels in metres.
-        pupil_radius: R in metres, on the panel. Default: the largest with blocks all alike that fits.
-        offset: of the mask's centre from the panel's, in panel pixels to the right and down.
-        flip: ``"none"``, ``"left-right"`` or ``"up-down"``: mirror the mask, before it is rotated.
-        rotate: degrees by which it is then turned counter-clockwise: 0, 90, 180 or 270.
+        pupil_radius: R in metres, on the panel. Default: the largest that fits with equal blocks.
+        offset: position of the mask's centre relative to the panel's, in panel pixels to the right and down.
+        flip: ``"none"``, ``"left-right"`` or ``"up-down"``; mirrors the mask before rotation.
+        rotate: counter-clockwise rotation in degrees: 0, 90, 180 or 270.
 
     Raises:
-        ValueError: if one of them is not as above.
+        ValueError: if an argument is out of range.
 
     Convention:
-        - Rows count downwards. Not flipped nor rotated, a phase that rises to larger columns of the panel moves the
-          PSF to larger columns of the image: what mirrors and lenses turn over on the way, flip and rotate turn back.
-        - Where a block's edge falls on the centre of a panel pixel, that pixel belongs to the block right of or below
-          it. So an odd number of panel pixels left over leaves the mask half a pixel left of or above the centre.
+        - Rows count downwards. Without flip and rotation, a phase that increases to larger columns of the panel moves
+          the PSF to larger columns of the image. Use flip and rotate if the mirrors and lenses of a setup change this.
+        - A panel pixel whose centre lies on the edge of two blocks belongs to the right or lower one. So if an odd
+          number of panel pixels is left over, the mask lies half a pixel left of or above the centre.
 
     Example:
         >>> import torch
@@ -71,7 +71,7 @@ class PanelPlacement:
         check_choice("rotate", self.rotate, ROTATIONS)
 
     def scale(self, size: tuple[int, int]) -> float:
-        """Return how many panel pixels a mask pixel is wide.
+        """Return the width of a mask pixel in panel pixels.
 
         Args:
             size: rows and columns of the mask.
@@ -84,8 +84,7 @@ class PanelPlacement:
             52.0
         """
         room = [side - 2 * abs(shift) for side, shift in zip(self.panel, reversed(self.offset), strict=True)]
-        turned = self._turned(size)
-        fitting = min(space / count for space, count in zip(room, turned, strict=True))
+        fitting = min(space / count for space, count in zip(room, self._rotated_size(size), strict=True))
         if self.pupil_radius is None:
             scale = float(math.floor(fitting))
         else:
@@ -105,7 +104,13 @@ class PanelPlacement:
         return scale
 
     def radius(self, size: tuple[int, int]) -> float:
-        """Return the pupil's radius on the panel in metres, for a mask of so many rows and columns.
+        """Return the pupil's radius on the panel in metres.
+
+        Args:
+            size: rows and columns of the mask.
+
+        Raises:
+            ValueError: as :meth:`scale`.
 
         Example:
             >>> round(PanelPlacement().radius((23, 23)), 6)
@@ -114,10 +119,10 @@ class PanelPlacement:
         return self.scale(size) * min(size) * self.panel_pitch / MASK_SPAN
 
     def edges(self, size: tuple[int, int]) -> tuple[list[int], list[int]]:
-        """Return the first panel row of each row of blocks, and where the last ends; then the same for columns.
+        """Return the edges of the blocks: the first panel row of each, then the end of the last; the same for columns.
 
         Args:
-            size: rows and columns of the mask, before it is rotated.
+            size: rows and columns of the mask before rotation.
 
         Example:
             >>> PanelPlacement((4, 7)).edges((2, 2))
@@ -126,29 +131,29 @@ class PanelPlacement:
         scale = self.scale(size)
         down, right = [
             [math.ceil((side - 1 + scale * (2 * i - count)) / 2 + shift - _SLACK) for i in range(count + 1)]
-            for side, count, shift in zip(self.panel, self._turned(size), reversed(self.offset), strict=True)
+            for side, count, shift in zip(self.panel, self._rotated_size(size), reversed(self.offset), strict=True)
         ]
         return down, right
 
     def place(self, values: Tensor, background: int) -> Tensor:
-        """Return frames of the panel's size that show these values.
+        """Return frames of the panel's size that show the values of masks.
 
         Args:
-            values: (K, rows, columns), one a mask pixel.
-            background: what the panel shows beyond the mask.
+            values: (K, rows, columns), one for each mask pixel.
+            background: value of panel pixels outside the mask.
 
         Returns:
             (K, panel rows, panel columns), the type of ``values``.
         """
         down, right = self.edges((values.shape[1], values.shape[2]))
         frames = values.new_full((len(values), *self.panel), background)
-        blocks = self._turn(values).repeat_interleave(torch.tensor(down).diff(), 1)
+        blocks = self._orient(values).repeat_interleave(torch.tensor(down).diff(), 1)
         blocks = blocks.repeat_interleave(torch.tensor(right).diff(), 2)
         frames[:, down[0] : down[-1], right[0] : right[-1]] = blocks
         return frames
 
     def read(self, frames: Tensor, size: tuple[int, int]) -> Tensor:
-        """Return the values that frames made by :meth:`place` show.
+        """Return the mask values in frames made by :meth:`place`.
 
         Args:
             frames: (K, panel rows, panel columns).
@@ -158,7 +163,7 @@ class PanelPlacement:
             (K, rows, columns).
 
         Raises:
-            ValueError: if the frames are not of the panel's size, or a block does not have one value.
+            ValueError: if the frames are not of the panel's size, or the pixels of a block differ.
 
         Example:
             >>> placement = PanelPlacement((20, 30), flip="left-right", rotate=90)
@@ -174,15 +179,15 @@ class PanelPlacement:
         blocks = blocks.repeat_interleave(torch.tensor(right).diff(), 2)
         if not torch.equal(blocks, frames[:, down[0] : down[-1], right[0] : right[-1]]):
             raise ValueError("each mask pixel must be a block of panel pixels of one grey level, found a mixed block")
-        return self._turn_back(values)
+        return self._orient_back(values)
 
-    def _turned(self, size: tuple[int, int]) -> tuple[int, int]:
+    def _rotated_size(self, size: tuple[int, int]) -> tuple[int, int]:
         return (size[1], size[0]) if self.rotate % 180 else (size[0], size[1])
 
-    def _turn(self, values: Tensor) -> Tensor:
-        return torch.rot90(self._mirror(values), self.rotate // 90, (-2, -1))  # from rows to columns: as on paper
+    def _orient(self, values: Tensor) -> Tensor:
+        return torch.rot90(self._mirror(values), self.rotate // 90, (-2, -1))
 
-    def _turn_back(self, values: Tensor) -> Tensor:
+    def _orient_back(self, values: Tensor) -> Tensor:
         return self._mirror(torch.rot90(values, -self.rotate // 90, (-2, -1)))
 
     def _mirror(self, values: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A mask to be printed or milled: its surface as a closed body of triangles, STL."""
+"""STL export: a mask as a closed triangle mesh for 3-D printing or milling."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from kornia_tidy.files import write_bytes
 from kornia_tidy.mask_export.slm_frames import checked_heights
 from kornia_tidy.masks.base import MASK_SPAN
 
-WALL = 0.01  # pitches that a wall between two pixels leans over: a body, as a printer can make it
+WALL = 0.01  # width of the inclined wall between two pixels, in pitches; upright walls would not give a valid body
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def write_stl(path: str | os.PathLike[str], heights: Tensor, pupil_radius: float, base: float = 1e-3) -> None:
-    """Write one mask on a plate as binary STL in millimetres, whole or not at all; an existing file is replaced.
+    """Write one mask on a plate as a binary STL file in millimetres.
+
+    An existing file is replaced, and after an error no partial file remains.
 
     Args:
-        path: where to.
-        heights: (rows, columns) metres over the plate; below zero they go into it.
-        pupil_radius: in metres; 2.3 of it span the mask's shorter side.
+        path: file to write.
+        heights: (rows, columns) metres above the plate; negative ones are recesses.
+        pupil_radius: in metres; the mask's shorter side is 2.3 times as long.
         base: thickness of the plate in metres.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if a size is not positive, or a height is not finite or goes through the plate.
+        ValueError: if a size is not positive, or a height is not finite or below the plate's bottom.
 
     Convention:
-        - x to the right, y up, z towards the viewer: the relief seen from above is the mask as the image sees it.
-        - The volume is that of the pixels' columns. See :func:`relief`.
+        - x points right, y up and z towards the viewer: from above, the relief has the orientation of the image.
+        - The volume equals that of the pixels with upright walls. See :func:`relief`.
     """
     check_positive("pupil_radius", pupil_radius, "metres")
     check_positive("base", base, "metres")
@@ -47,22 +49,23 @@ def write_stl(path: str | os.PathLike[str], heights: Tensor, pupil_radius: float
 
 
 def relief(columns: NDArray[np.float64], pitch: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return a closed body under flat pixels, with walls between them that lean over a hundredth of a pitch.
+    """Return a closed triangle mesh with flat pixels and slightly inclined walls between them.
 
-    Upright walls of four pixels would meet in one edge. Leaning ones make a surface of one height over each place:
-    each edge belongs to two triangles. A wall leans as far into one pixel as into the other, and where four pixels meet
-    a vertex has their mean, so the volume is that of the columns.
+    With upright walls, four pixels would share one edge, which is not a valid body. An inclined wall is a hundredth of
+    a pitch wide, so the surface has one height at every point and each edge belongs to two triangles. Walls extend
+    equally into both pixels, and a vertex where four pixels meet has their mean height, so the volume is that of the
+    columns.
 
     Args:
-        columns: (rows, columns) heights over the bottom.
+        columns: (rows, columns) heights above the bottom.
         pitch: side of a pixel, in the same unit.
 
     Returns:
-        Vertices (V, 3), and for each triangle its vertices (T, 3), counter-clockwise seen from outside.
+        Vertices (V, 3), and the three vertex indices of each triangle (T, 3), counter-clockwise from outside.
 
     Example:
         >>> vertices, triangles = relief(np.ones((1, 1)), 2.0)
-        >>> len(vertices), len(triangles)  # a box of which top and sides have two triangles each and the bottom four
+        >>> len(vertices), len(triangles)  # a box: two triangles for the top and each side, four for the bottom
         (9, 14)
     """
     rows, cols = columns.shape
@@ -76,7 +79,7 @@ def relief(columns: NDArray[np.float64], pitch: float) -> tuple[NDArray[np.float
     index = np.arange(4 * rows * cols).reshape(2 * rows, 2 * cols)
     nw, ne, sw, se = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     meeting = np.zeros(nw.shape, bool)
-    meeting[1::2, 1::2] = True  # where four pixels meet: a fan; elsewhere two triangles in one plane
+    meeting[1::2, 1::2] = True  # a fan of four triangles where four pixels meet, elsewhere two triangles in a plane
     plain, centre = ~meeting, len(top) + np.arange(len(seams))
     faces = [_stack(nw[plain], sw[plain], se[plain]), _stack(nw[plain], se[plain], ne[plain])]
     fan = [corner[meeting] for corner in (nw, sw, se, ne)]
@@ -93,11 +96,14 @@ def relief(columns: NDArray[np.float64], pitch: float) -> tuple[NDArray[np.float
 
 
 def encode_stl(vertices: NDArray[np.float64], triangles: NDArray[np.int64]) -> bytes:
-    """Turn a body into the bytes of a binary STL file, which has no unit; millimetres are usual.
+    """Encode a triangle mesh as a binary STL file. The format has no unit; millimetres are usual.
 
     Args:
-        vertices: (V, 3).
-        triangles: (T, 3), counter-clockwise seen from outside.
+        vertices: (V, 3) coordinates.
+        triangles: (T, 3) vertex indices, counter-clockwise from outside.
+
+    Returns:
+        Bytes of the file.
 
     Source: 3D Systems, StereoLithography Interface Specification (1989).
 
@@ -115,7 +121,7 @@ def encode_stl(vertices: NDArray[np.float64], triangles: NDArray[np.int64]) -> b
 
 
 def _corners(count: int, pitch: float) -> NDArray[np.float64]:
-    """Return where pixels begin and end along an axis: half a wall short of their neighbours."""
+    """Return the start and end of each pixel's flat part along an axis, half a wall from its neighbours."""
     begin, end = np.arange(count, dtype=np.float64), np.arange(1, count + 1, dtype=np.float64)
     begin[1:] += WALL / 2
     end[:-1] -= WALL / 2

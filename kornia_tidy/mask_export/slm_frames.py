@@ -1,4 +1,4 @@
-"""From heights to the grey levels of a modulator's panel, and back."""
+"""SLM frames: heights of masks converted to the grey levels of a panel, and back."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from kornia_tidy.modulator.phase_panel import GreyLevels, nearest_level
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
-_TURN = 2 * math.pi
+_WAVE = 2 * math.pi
 
 
 @dataclass(frozen=True, eq=False)
 class SLMFrames:
-    r"""What a panel shows for K masks: a grey level for each mask pixel, and what is needed to read heights from it.
+    r"""Grey levels of a panel for K masks, with the parameters that convert them back to heights.
 
-    At the working wavelength λ a height h wants the phase :math:`\phi = 2 \pi h (n(\lambda) - 1) / \lambda`; the panel
-    shows the level whose phase :math:`\phi_g` is nearest modulo 2π, and :math:`\phi \approx \phi_g + 2 \pi t` with t
-    whole turns that light at λ does not see.
+    A height h has the phase :math:`\phi = 2 \pi h (n(\lambda) - 1) / \lambda` at the working wavelength λ. The panel
+    shows the level whose phase :math:`\phi_g` is nearest modulo 2π, so :math:`\phi \approx \phi_g + 2 \pi t`. The t
+    whole waves have no effect at λ, and the panel does not show them.
 
     Args:
         grey: g, (K, rows, columns) int64.
-        turns: t, likewise.
+        turns: t, (K, rows, columns) int64.
         level_phases: :math:`\phi_g`, (2^b,) radians at the working wavelength, float64.
         wavelength: λ in metres.
         radians_per_metre: :math:`2 \pi (n(\lambda) - 1) / \lambda`.
@@ -54,17 +54,19 @@ class SLMFrames:
         wavelength: float = REFERENCE_WAVELENGTH,
         material: Material | None = None,
     ) -> SLMFrames:
-        """Return the frames of masks.
+        """Return the frames that show given masks on a panel.
 
         Args:
             masks: phase masks of any family, or heights in metres (K, rows, columns).
-            panel: its levels. Their phases are taken at ``wavelength``, where panels are calibrated, not at 530 nm.
-            wavelength: the working wavelength in metres, at which the frames have the phase of the masks.
-            material: what heights are made of. Default: that of the masks; index 1.5 for bare heights.
+            panel: grey levels of the panel. Their phases are taken to be those at ``wavelength``, at which panels are
+                calibrated, and not those at 530 nm.
+            wavelength: working wavelength in metres, at which the frames have the phase of the masks.
+            material: material of the heights. Default: that of the masks; index 1.5 for heights alone.
 
         Raises:
             TypeError: if heights are not a floating-point tensor.
-            ValueError: if they are not finite maps, or the material's index at the wavelength is not known.
+            ValueError: if heights have another shape or are not finite, or the material's index at the wavelength is
+                not known.
         """
         if isinstance(masks, PhaseMasks):
             material = masks.material if material is None else material
@@ -74,47 +76,50 @@ class SLMFrames:
         per_metre = metres_to_radians(constant_index(1.5) if material is None else material, wavelength)
         wanted = heights * per_metre
         grey = nearest_level(wanted, panel.levels)
-        turns = ((wanted - panel.levels[grey]) / _TURN).round().long()
+        turns = ((wanted - panel.levels[grey]) / _WAVE).round().long()
         return cls(grey, turns, panel.levels.clone(), wavelength, per_metre)
 
     @property
     def bits(self) -> int:
-        """Bits of a grey level."""
+        """Number of bits of a grey level."""
         return (len(self.level_phases) - 1).bit_length()
 
     @property
     def background(self) -> int:
-        """Level of a panel pixel that shows no mask: the one nearest to phase 0."""
+        """Grey level nearest to phase 0, for panel pixels outside the mask."""
         return int(nearest_level(torch.zeros(1, dtype=torch.float64), self.level_phases))
 
     def heights(self) -> Tensor:
-        """Return the heights the frames were made for, to within :meth:`largest_error`: (K, rows, columns) float64."""
-        return (self.level_phases[self.grey] + _TURN * self.turns.double()) / self.radians_per_metre
+        """Return the heights of the masks in metres, (K, rows, columns) float64, accurate to :meth:`largest_error`."""
+        return (self.level_phases[self.grey] + _WAVE * self.turns.double()) / self.radians_per_metre
 
     def heights_shown(self) -> Tensor:
-        """Return the heights that the panel shows, without the turns: what light of other wavelengths sees too."""
+        """Return the heights that the panel really shows, without the whole waves, for PSFs at other wavelengths."""
         return self.level_phases[self.grey] / self.radians_per_metre
 
     def largest_error(self) -> float:
-        """Return the largest phase between a wanted height and its level in radians at the working wavelength.
+        """Return the largest quantisation error of phase, in radians at the working wavelength.
 
-        Half of the widest gap between levels, modulo 2π: π / 2^b for a range of 2π.
+        It is half of the widest gap between levels, modulo 2π: π / 2^b for a range of 2π.
 
         Example:
             >>> frames = SLMFrames.of(torch.zeros(1, 3, 3), GreyLevels(3, phase_range=math.pi))
-            >>> round(frames.largest_error() / math.pi, 4)  # levels from 0 to 7/8 pi: what is beyond is far from both
+            >>> round(frames.largest_error() / math.pi, 4)  # levels from 0 to 7/8 pi leave a gap of 9/8 pi
             0.5625
         """
-        around = self.level_phases.remainder(_TURN).sort().values
-        return float(torch.cat([around, around[:1] + _TURN]).diff().max()) / 2
+        ascending = self.level_phases.remainder(_WAVE).sort().values
+        return float(torch.cat([ascending, ascending[:1] + _WAVE]).diff().max()) / 2
 
 
 def checked_heights(heights: Tensor) -> Tensor:
-    """Return heights as float64 of three axes, on the CPU.
+    """Check heights and return them as float64 on the CPU.
+
+    Args:
+        heights: (K, rows, columns) metres.
 
     Raises:
-        TypeError: if they are not a floating-point tensor.
-        ValueError: if they have another shape or are not finite.
+        TypeError: if heights are not a floating-point tensor.
+        ValueError: if heights have another shape or are not finite.
     """
     check_float_tensor("heights", heights, 3, "(K, rows, columns)")
     if not heights.numel() or not bool(torch.isfinite(heights).all()):

@@ -1,4 +1,4 @@
-"""When each frame is shown: the timing sheet of one exposure."""
+"""Timing sheet of an exposure: start and dwell time of each frame."""
 
 from __future__ import annotations
 
@@ -14,35 +14,39 @@ from kornia_tidy.modulator.switching import Switching
 
 
 class FrameTime(NamedTuple):
-    """One line of a timing sheet; times in seconds."""
+    """One line of a timing sheet, with times in seconds."""
 
     frame: int
     """Index of the frame, from 0."""
     start: float
-    """When it stands, after the shutter opened."""
+    """Time from the opening of the shutter until the frame is fully shown."""
     dwell: float
-    """How long it stands."""
+    """Time for which the frame is shown, without transitions."""
     weight: float
-    """Share of the exposure in which it stands."""
+    """Dwell time as a fraction of the exposure."""
     swap: float
-    """How long the panel takes from it to the next; 0 for the last, unless frames repeat."""
+    """Duration of the transition to the next frame; 0 for the last frame, unless frames repeat."""
 
 
 def frame_times(
     shares: Sequence[float], exposure: float, switching_time: float = 0.0, cyclic: bool = False
 ) -> list[FrameTime]:
-    """Return when each frame of an exposure is shown, as :class:`~kornia_tidy.modulator.switching.Switching` counts.
+    """Return the start and dwell time of each frame of an exposure.
 
-    The shutter opens as the first frame stands. Swaps fall into the exposure: frames share what they leave.
+    The shutter opens when the first frame is fully shown. Transitions are within the exposure, and the frames share the
+    remaining time, as in :class:`~kornia_tidy.modulator.switching.Switching`.
 
     Args:
         shares: relative dwell time of each frame.
         exposure: in seconds.
-        switching_time: of each swap in seconds.
-        cyclic: whether the swap back to the first frame falls into the exposure too.
+        switching_time: duration of each transition in seconds.
+        cyclic: whether the exposure includes the transition from the last frame back to the first.
+
+    Returns:
+        One line for each frame.
 
     Raises:
-        ValueError: if the shares are negative or all zero, or the swaps take longer than the exposure.
+        ValueError: if the shares are negative or all zero, or the transitions take longer than the exposure.
 
     Example:
         >>> [round(line.start, 4) for line in frame_times((1, 1, 2), 0.1, switching_time=10e-3)]
@@ -60,11 +64,11 @@ def frame_times(
 
 
 def timing_sheet(lines: Sequence[FrameTime], files: Sequence[str]) -> str:
-    """Return the sheet as CSV, times in milliseconds to a nanosecond.
+    """Return a timing sheet as CSV text, with times in milliseconds rounded to nanoseconds.
 
     Args:
-        lines: from :func:`frame_times`.
-        files: name of each frame's file.
+        lines: result of :func:`frame_times`.
+        files: file name of each frame.
 
     Example:
         >>> print(timing_sheet(frame_times((1,), 0.1), ["frame_000.png"]))

@@ -1,4 +1,4 @@
-"""What all phase masks share: their unit, their grid, their limits and the unit of their learning rate."""
+"""Base class of phase masks: phase in radians, pixel grid, height limits, and learning rates in metres of height."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ from kornia_tidy.masks.limits import CONSTRAINTS, limited_phase
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
-MASK_SPAN = 2.3  # pupil radii across a mask's shorter side: the paper's 23 pixels of a tenth of a radius
-NOISE_RMS = 2.05  # radians at 530 nm: that of the paper's start, heights uniform on [0, 1.2e-6] m at index 1.5
-HEIGHTS = (1e-9, 1e-3)  # m; what an element or a panel may be high
-HEIGHT_STEPS = (1e-40, 1e-4)  # m; what a step of learning may move: next to nothing is no wrong unit
+MASK_SPAN = 2.3  # pupil radii along a mask's shorter side: 23 pixels of a tenth of a radius, as in the paper
+NOISE_RMS = 2.05  # rad at 530 nm, as the paper's initial masks: heights uniform on [0, 1.2e-6] m at index 1.5
+HEIGHTS = (1e-9, 1e-3)  # m; limits of ``max_height``
+HEIGHT_STEPS = (1e-40, 1e-4)  # m; limits of a learning rate; a tiny one is harmless, a large one is a wrong unit
 
 Size = int | tuple[int, int]
 """Pixels of a mask: along both sides, or (rows, columns)."""
 
 
 def metres_to_radians(material: Material, wavelength: float = REFERENCE_WAVELENGTH) -> float:
-    """Return the phase in radians that one metre of a material adds over air.
+    r"""Return the phase delay of one metre of a material relative to air, :math:`2\pi (n - 1) / \lambda`.
 
     Args:
-        material: the element's refractive index.
+        material: refractive index n of the element.
         wavelength: in metres.
+
+    Returns:
+        Radians at this wavelength for each metre of height.
 
     Source: Goodman, Introduction to Fourier Optics, section 6.1.
 
@@ -39,32 +42,34 @@ def metres_to_radians(material: Material, wavelength: float = REFERENCE_WAVELENG
 
 
 class PhaseMasks(nn.Module):
-    r"""K height maps held as radians of phase at 530 nm. The families of masks differ in how they make the phase.
+    r"""Base class of the mask families: K phase masks, with the phase in radians at 530 nm.
 
-    Metres (order 1e-7) would be lost in half precision and to weight decay; radians are of order one. A family either
-    has a parameter or buffer named ``phase``, or computes :meth:`free_phase` from its own parameters.
+    Parameters are in radians, which are of order one. Metres, of order 1e-7, would suffer from half precision and
+    weight decay. A family either registers a parameter or buffer named ``phase``, or computes :meth:`free_phase` from
+    its own parameters.
 
     Args:
         material: refractive index of the element. Default: 1.5 at every wavelength, as in the paper.
-        constraint: how heights are kept between 0 and ``max_height``: ``"none"`` (default) lets them be;
-            ``"clamp"`` cuts them off; ``"sigmoid"`` bends them smoothly; ``"wrapped"`` takes the remainder, as in a
-            diffractive lens. See :mod:`kornia_tidy.masks.limits`.
+        constraint: mapping of heights to the range from 0 to ``max_height``: ``"none"`` (default) has no limits;
+            ``"clamp"`` clips the heights; ``"sigmoid"`` compresses them smoothly; ``"wrapped"`` takes the remainder, as
+            in a diffractive lens. See :mod:`kornia_tidy.masks.limits`.
         max_height: in metres. Default: one wave at 530 nm, 1.06e-6 m at index 1.5.
 
     Shape:
-        - ``phase``: (K, N, N) radians at 530 nm, or (K, rows, columns): the constraint is applied.
+        - ``phase``: (K, N, N) or (K, rows, columns), radians at 530 nm with the constraint applied.
         - ``heights()``: the same in metres.
 
     Raises:
-        ValueError: if the constraint is unknown, or the largest height not positive or given without a constraint.
+        ValueError: if the constraint is unknown, or ``max_height`` is not between 1 nm and 1 mm, or it is given without
+            a constraint.
 
     Convention:
-        - Axes are (mask, y, x), seen in the orientation of the image: a phase that rises along +x moves the PSF
-          towards +x (columns to the right), one that rises along +y moves it down.
-        - The shorter side spans 2.3 pupil radii, pixels are square; rho = 1 is the edge of the aperture. Of a longer
-          side, light passes only through as much in the middle.
-        - Each pixel has one phase: that of the family's formula at the pixel's centre.
-        - "clamp" and "sigmoid" raise a free phase of 0 to half of ``max_height``, so that shapes have room both ways.
+        - Axes are (mask, y, x) in the orientation of the image: a phase that increases along +x moves the PSF towards
+          +x (columns to the right); one that increases along +y moves it down.
+        - Pixels are square, and the shorter side spans 2.3 pupil radii; rho = 1 is the edge of the aperture. Of a
+          longer side, only the central part of that length is in the pupil.
+        - The phase is constant over a pixel: the value of the family's formula at the pixel's centre.
+        - "clamp" and "sigmoid" map a free phase of 0 to half of ``max_height``, so that it can move both ways.
     """
 
     def __init__(
@@ -82,24 +87,24 @@ class PhaseMasks(nn.Module):
 
     @property
     def phase(self) -> Tensor:
-        """The phase shown, (K, N, N) radians at 530 nm, within the limits of the constraint."""
+        """Phase with the constraint applied, (K, N, N) radians at 530 nm."""
         return limited_phase(self.free_phase(), self.constraint, self.max_phase)
 
     def free_phase(self) -> Tensor:
         """Return the phase before the constraint: here the parameter or buffer registered as ``phase``."""
-        return cast("Tensor", super().__getattr__("phase"))  # an AttributeError as long as none is registered
+        return cast("Tensor", super().__getattr__("phase"))  # AttributeError if a family registered none
 
     def heights(self) -> Tensor:
-        """Return the height maps in metres, (K, N, N); at least float32, since they are of order 1e-7."""
+        """Return the height maps in metres, (K, N, N), in float32 or better because they are of order 1e-7."""
         phase = self.phase
         return phase.to(torch.promote_types(phase.dtype, torch.float32)) / metres_to_radians(self.material)
 
     def dispersion(self, wavelength: float) -> float:
-        """Return the factor from phase at 530 nm to phase at a wavelength in metres: colour and the element's index."""
+        """Return the ratio of the phase at a wavelength in metres to the phase at 530 nm, index included."""
         return metres_to_radians(self.material, wavelength) / metres_to_radians(self.material)
 
     def extra_repr(self) -> str:
-        """Describe the masks in a person's words."""
+        """Return a one-line description of the masks."""
         masks, rows, columns = self.phase.shape
         learnable = "learnable" if any(p.requires_grad for p in self.parameters()) else "fixed"
         limit = ""
@@ -110,11 +115,17 @@ class PhaseMasks(nn.Module):
 
 
 def mask_coordinates(size: int, pitch: float | None = None) -> Tensor:
-    """Return the centres of a mask's pixels along one axis in pupil radii, (N,) float64.
+    """Return the pixel centres of a mask along one axis in pupil radii.
 
     Args:
-        size: pixels along the axis.
-        pitch: distance between pixels in pupil radii. Default: that of a square mask, 2.3 / size.
+        size: pixels N along the axis.
+        pitch: distance between pixels in pupil radii. Default: 2.3 / size, that of a square mask.
+
+    Returns:
+        (N,) float64, symmetric about zero.
+
+    Raises:
+        ValueError: if the size is not positive.
 
     Example:
         >>> mask_coordinates(23)[[0, 11, 22]]
@@ -125,10 +136,13 @@ def mask_coordinates(size: int, pitch: float | None = None) -> Tensor:
 
 
 def mask_axes(size: Size) -> tuple[Tensor, Tensor]:
-    """Return the centres of a mask's pixels in pupil radii: y down the rows (N, 1), and x along the columns (N,).
+    """Return the pixel centres of a mask along y and x in pupil radii.
 
     Args:
         size: pixels along both sides, or (rows, columns); the shorter side spans 2.3 pupil radii.
+
+    Returns:
+        y of the rows, downwards, (rows, 1), and x of the columns, (columns,); float64.
 
     Raises:
         ValueError: if a size is not positive, or one is odd and the other even (see :func:`central_square`).
@@ -147,13 +161,13 @@ def mask_axes(size: Size) -> tuple[Tensor, Tensor]:
 
 
 def central_square(phase: Tensor) -> Tensor:
-    """Return the middle of masks that are longer along one axis: the square over the pupil, where the light passes.
+    """Return the central square of rectangular masks, which covers the pupil.
 
     Args:
-        phase: (K, rows, columns), both odd or both even, so that the square falls on whole pixels.
+        phase: (K, rows, columns), both odd or both even, so that the square consists of whole pixels.
 
     Returns:
-        (K, N, N) with N the shorter side; the same tensor where it is square.
+        (K, N, N) with N the shorter side; a view of ``phase``.
 
     Example:
         >>> central_square(torch.arange(5.0).reshape(1, 1, 5))
@@ -164,29 +178,39 @@ def central_square(phase: Tensor) -> Tensor:
     return phase[..., top : rows - top, left : columns - left]
 
 
-def spread(values: Tensor, place: Tensor) -> Tensor:
-    """Return the values of each mask, (K, M), at the place each pixel names, (N, N): (K, N, N).
+def gather_values(values: Tensor, index: Tensor) -> Tensor:
+    """Gather for every pixel of each mask one of the mask's parameters, by an index map.
+
+    Args:
+        values: M parameters of each mask, (K, M).
+        index: which of them a pixel takes, (N, N) int64, the same for all masks.
+
+    Returns:
+        (K, N, N).
 
     Example:
-        >>> spread(torch.tensor([[1.0, 2.0]]), torch.tensor([[0, 1], [1, 1]]))
+        >>> gather_values(torch.tensor([[1.0, 2.0]]), torch.tensor([[0, 1], [1, 1]]))
         tensor([[[1., 2.],
                  [2., 2.]]])
     """
-    return values.index_select(1, place.flatten()).unflatten(1, place.shape)  # half the time of values[:, place]
+    return values.index_select(1, index.flatten()).unflatten(1, index.shape)  # half the time of values[:, index]
 
 
 def initial_values(
     initial: str | Tensor, num_masks: int, shape: tuple[int, ...], rms: float, generator: torch.Generator | None
 ) -> Tensor:
-    """Return the parameters that a family of masks starts from, (K, *shape).
+    """Return the initial parameters of a mask family, (K, *shape).
 
     Args:
-        initial: ``"noise"`` (normal, of this root mean square), ``"flat"`` (zeros), or the values themselves, with or
-            without the axis of masks.
-        num_masks: number K of masks; given values have their own.
-        shape: of the parameters of one mask.
-        rms: of the noise.
+        initial: ``"noise"`` (normally distributed), ``"flat"`` (zeros), or the values themselves, with or without the
+            axis of masks.
+        num_masks: number K of masks; ignored if values are given.
+        shape: shape of the parameters of one mask.
+        rms: root mean square of the noise.
         generator: source of the noise.
+
+    Returns:
+        Parameters in the default dtype, detached from any graph.
 
     Raises:
         ValueError: if the name is unknown, or given values have another shape or are not finite.
@@ -212,21 +236,24 @@ def initial_values(
 
 
 def adam_groups(masks: nn.Module, lr_metres: float, **options: float) -> dict[str, object]:
-    """Return the optimiser group of a mask whose learning rate is quoted in metres of height.
+    """Return the Adam parameter group of masks for a learning rate in metres of height.
 
-    Gradients per radian are small (median 2.5e-8 on a point-PSF task), so Adam's default eps of 1e-8 would damp
-    them by a third; 1e-15 does not.
+    Gradients per radian are small (median 2.5e-8 on a point-PSF task), so Adam's default eps of 1e-8 would reduce the
+    steps by a third. The group has an eps of 1e-15.
 
     Args:
         masks: module with a ``material`` and its parameters in radians.
-        lr_metres: height that one Adam step moves each parameter by, in metres. Where a parameter is a pixel or the
-            height at a radius, that is how far the surface moves there. Where it is the strength of a shape, it is how
-            far that shape's root mean square moves (Zernike over the pupil, Fourier over the mask), and M shapes
+        lr_metres: change of each parameter in one Adam step, in metres. If a parameter is the height of a pixel or at
+            a radius, the surface there moves by this much. If it is the coefficient of a polynomial or wave, the root
+            mean square of that term changes by this much (Zernike over the pupil, Fourier over the mask), and M terms
             together move the surface by up to sqrt(M) times as much.
         options: further settings of the group.
 
     Returns:
         Dictionary with ``params``, ``lr`` in radians, ``eps`` and the options.
+
+    Raises:
+        ValueError: if ``lr_metres`` is not between 1e-40 and 1e-4.
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask

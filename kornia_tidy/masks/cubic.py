@@ -1,4 +1,4 @@
-"""The cubic mask: the classic of extended depth of field."""
+"""Cubic masks: cubic phase for extended depth of field."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from kornia_tidy.optics.materials import Material
 
 
 class CubicMask(PhaseMasks):
-    r"""Masks of cubic phase, whose transfer function hardly changes with defocus: :math:`\alpha (x^3 + y^3)`.
+    r"""Masks of cubic phase :math:`\alpha (x^3 + y^3)`, whose transfer function hardly changes with defocus.
 
     Args:
-        strength: :math:`\alpha` in radians at 530 nm where an axis meets the pupil's edge; one number for each mask.
+        strength: :math:`\alpha` in radians at 530 nm, the phase at the pupil's edge on the x or y axis; one number for
+            each mask.
         size: pixels N along a side, or (rows, columns).
         material: refractive index of the element. Default: 1.5 at every wavelength.
         constraint: see :class:`PhaseMasks`.
         max_height: in metres, see :class:`PhaseMasks`.
 
     Shape:
-        - ``strength``: learnable parameter (K,), radians at 530 nm. Its shape is 0.40 rad rms over the pupil.
+        - ``strength``: learnable parameter (K,), radians at 530 nm. A strength of 1 rad has 0.40 rad rms over the
+          pupil.
         - ``phase``: (K, N, N).
 
     Raises:
@@ -54,5 +56,5 @@ class CubicMask(PhaseMasks):
         self.strength = nn.Parameter(values)
 
     def free_phase(self) -> Tensor:
-        """Return the cubics, (K, N, N) radians."""
+        """Return the cubic phase, (K, N, N) radians."""
         return self.strength[:, None, None] * self.shape

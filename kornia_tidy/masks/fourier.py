@@ -1,4 +1,4 @@
-"""Fourier masks: smooth surfaces made of the lowest spatial frequencies."""
+"""Fourier masks: smooth surfaces of low spatial frequency."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class FourierMask(PhaseMasks):
     r"""Masks that are sums of waves of low spatial frequency: :math:`\varphi_k = \sum_{pq} c_{kpq}\, w_p(y)\, w_q(x)`.
 
     The 2F + 1 waves along an axis are :math:`1, \sqrt2 \cos(2\pi f x / W), \sqrt2 \sin(2\pi f x / W)` for f = 1 to F
-    over the mask's width W, so a coefficient is the root mean square of its wave over the mask. Together they span all
-    that the Fourier transform holds up to F along both axes.
+    over the mask's width W, so a coefficient is the root mean square of its wave over the mask. Together they span
+    every surface whose frequencies along both axes are at most F cycles across the mask.
 
     Args:
         num_masks: number K of masks shown one after the other during the exposure.
@@ -73,13 +73,13 @@ class FourierMask(PhaseMasks):
         self.coefficients = nn.Parameter(values)
 
     def free_phase(self) -> Tensor:
-        """Return the sum of the waves, (K, N, N) radians."""
+        """Return the sum of the waves before the constraint, (K, N, N) radians."""
         return self.waves_y.mT @ self.coefficients @ self.waves_x
 
 
 def _waves(axis: Tensor, max_frequency: int) -> Tensor:
-    """Return 1, the cosines and the sines along an axis of even pitch, (2F + 1, N), orthonormal in the mean."""
-    turns = torch.arange(1, max_frequency + 1, dtype=torch.float64)[:, None] * (
+    """Return the constant, cosines and sines along an evenly spaced axis, (2F + 1, N), each of mean square one."""
+    angles = torch.arange(1, max_frequency + 1, dtype=torch.float64)[:, None] * (
         axis / (axis.diff().mean() * len(axis)) * 2 * math.pi
     )
-    return torch.cat([torch.ones_like(axis)[None], math.sqrt(2) * turns.cos(), math.sqrt(2) * turns.sin()])
+    return torch.cat([torch.ones_like(axis)[None], math.sqrt(2) * angles.cos(), math.sqrt(2) * angles.sin()])

@@ -1,4 +1,4 @@
-"""The diffractive lens: a fixed mask, the baseline without learning."""
+"""Diffractive lens: a fixed mask, the baseline for learnt ones."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from kornia_tidy.optics.materials import Material
 
 
 class FresnelLens(PhaseMasks):
-    r"""A fixed diffractive lens: quadratic phase wrapped at one wavelength. The paper's baseline without learning.
+    r"""A fixed diffractive lens: quadratic phase wrapped at 530 nm. It is the paper's baseline without learning.
 
     .. math:: h(\rho) = \frac{\lambda_0}{2\pi (n - 1)} \left[ \psi_F \rho^2 \bmod 2\pi \right]
 
-    It moves the focus by :math:`-\psi_F` at 530 nm, and by other amounts at other colours, which is its use.
+    It shifts the focus by :math:`-\psi_F` at 530 nm and by other amounts at other wavelengths. This chromatic
+    aberration encodes depth.
 
     Args:
         defocus: strength :math:`\psi_F` in radians at the edge of the pupil. The paper does not state its value; 10
-            is the strongest round number whose phase steps by less than :math:`\pi` between pixels of the 23x23 mask.
+            is the largest round number whose phase changes by less than :math:`\pi` between pixels of the 23x23 mask.
         size: pixels N along a side, or (rows, columns).
         material: refractive index of the element. Default: 1.5 at every wavelength.
 

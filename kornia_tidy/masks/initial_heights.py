@@ -1,4 +1,4 @@
-"""What sequences of masks start from: noise, a mask designed for depth, mixtures of the two, and lenses."""
+"""Initial heights of mask sequences: noise, a mask designed for depth, combinations of the two, and lenses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ CLEAN = {"noisy fishers": 0, "fisher, noisy fishers": 1, "3 fishers, 2 noisy": 3
 STARTS = ("noise", "fisher, noise", *CLEAN, "like fishers", "focal sweep")
 
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
-SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; each of the five is sharp at a depth of its own
-SMALL_NOISE = 6e-8  # m; without it masks stay round, or alike
+SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; defocus at which each of the five masks is in focus
+SMALL_NOISE = 6e-8  # m; breaks the symmetry: without it lenses stay round and equal masks stay equal
 
-# What design_fisher_mask(seed=3) found: radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
+# Result of design_fisher_mask(seed=3): radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
 # fmt: off
 FISHER_COEFFICIENTS = (
     -0.0056, 0.2993, -0.2471, 0.7524, 0.0021, -0.0805, 0.0000, 0.0000, 0.0001, 0.0000, 0.0000,
@@ -33,9 +33,9 @@ FISHER_COEFFICIENTS = (
 
 
 def fisher_mask(size: int = 23) -> Tensor:
-    """Return a mask designed for depth, that of seed 3.
+    """Return the Fisher mask, a mask designed for depth estimation by the Cramér-Rao bound.
 
-    It is the one of :func:`~kornia_tidy.mask_design.objectives.design_fisher_mask`.
+    It is the result of :func:`~kornia_tidy.mask_design.objectives.design_fisher_mask` with seed 3.
 
     Args:
         size: pixels N along a side.
@@ -44,10 +44,11 @@ def fisher_mask(size: int = 23) -> Tensor:
         Heights in metres for an index of 1.5, (N, N) float64, from 0 to 7.1e-7.
 
     Convention:
-        - In the published setting it tells defocus to 0.0668 rad on average over -10 to 10 rad; the mask published
-          with PhaseCam3D to 0.0785 rad. See :func:`~kornia_tidy.mask_design.fisher_information.sampled_response`.
+        - In the published setting its bound on the error of defocus is 0.0668 rad on average over -10 to 10 rad. That
+          of the mask published with PhaseCam3D is 0.0785 rad. See
+          :func:`~kornia_tidy.mask_design.fisher_information.sampled_response`.
 
-    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for the idea; the mask is our own.
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for the method; the mask is our own.
 
     Example:
         >>> fisher_mask().shape, fisher_mask(64).shape
@@ -62,38 +63,39 @@ def fisher_mask(size: int = 23) -> Tensor:
 
 
 def initial_heights(start: str, generator: torch.Generator | None = None) -> Tensor:
-    """Return the five masks that a sequence starts from.
+    """Return the initial heights of a sequence of five masks.
 
     Args:
-        start: one of the paper's, or of our own:
+        start: name of the initialisation. The first five are the paper's, the last two our own:
 
-            - ``"noise"``: each uniform on [0, 1.2e-6] m.
-            - ``"fisher, noise"``: the first the Fisher mask, the others such noise.
-            - ``"noisy fishers"``: Fisher masks turned by a quarter each, with noise added, normal of mean 5.35e-7 and
-              standard deviation 3.05e-7 m.
-            - ``"fisher, noisy fishers"``: the same, the first without noise.
-            - ``"3 fishers, 2 noisy"``: the same, with noise on the last two.
-            - ``"like fishers"``: the Fisher mask, and four times the same with normal noise of 6e-8 m: their average is
-              not blurred by turns.
-            - ``"focal sweep"``: for extended depth of field, lenses focused at a defocus of 0, -8, 8, -16 and 16 rad,
-              with the same noise.
+            - ``"noise"``: noise uniform on [0, 1.2e-6] m.
+            - ``"fisher, noise"``: the Fisher mask, and four masks of such noise.
+            - ``"noisy fishers"``: the Fisher mask, each next one rotated by another 90 degrees, plus normal noise of
+              mean 5.35e-7 m and standard deviation 3.05e-7 m.
+            - ``"fisher, noisy fishers"``: the same with noise on the last four only.
+            - ``"3 fishers, 2 noisy"``: the same with noise on the last two only.
+            - ``"like fishers"``: five Fisher masks without rotation, the last four with normal noise of standard
+              deviation 6e-8 m. Rotated masks would blur the average PSF.
+            - ``"focal sweep"``: for extended depth of field, lenses in focus at a defocus of 0, -8, 8, -16 and 16 rad,
+              with normal noise of standard deviation 6e-8 m.
         generator: source of the noise.
 
     Returns:
         Heights in metres, (5, 23, 23), for ``PixelwiseMask(initial=...)``.
 
     Raises:
-        ValueError: if there is no such start.
+        ValueError: if ``start`` is unknown.
 
     Convention:
-        - Quarter turns are exact on the grid, but there are four of them: the fifth mask is the first again, noisy.
-        - The noise's mean only raises a mask, which changes nothing; its numbers are the mean and the standard
-          deviation of PhaseCam3D's published heights.
+        - Rotations by 90 degrees are exact on the grid, but only four differ: the fifth mask equals the first but for
+          its noise.
+        - The mean of the noise adds a constant phase, which has no effect. Mean and standard deviation are those of
+          PhaseCam3D's published heights.
 
-    Source: Shah et al., TiDy-PSFs (ICCV 2023): the ablation of initial masks ranks them for depth (RMSE 0.0254 for
-    noise, then 0.0329, 0.0271 and 0.0207 for those that begin with a Fisher mask, in this order), and in that of their
-    number all Fisher masks have noise; Nagahara et al., Flexible Depth of Field Photography (ECCV 2008), for the sweep
-    of focus.
+    Source: Shah et al., TiDy-PSFs (ICCV 2023). Their ablation of initial masks gives a depth RMSE of 0.0254 for
+    "noise", 0.0329 for "fisher, noise", 0.0271 for "fisher, noisy fishers" and 0.0207 for "3 fishers, 2 noisy"; their
+    ablation of the number of masks has "noisy fishers". Nagahara et al., Flexible Depth of Field Photography (ECCV
+    2008), for the focal sweep.
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
@@ -116,7 +118,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
         return SMALL_NOISE * normal - defocus * REFERENCE_WAVELENGTH / (2 * math.pi * 0.5)  # an index of 1.5
     if start == "like fishers":
         return torch.cat([fisher[None], fisher + SMALL_NOISE * normal[1:]])
-    turned = torch.stack([fisher.rot90(quarters) for quarters in range(5)])
+    rotated = torch.stack([fisher.rot90(quarters) for quarters in range(5)])
     noise = NOISE_MEAN + NOISE_STD * normal
     noise[: CLEAN[start]] = 0
-    return turned + noise
+    return rotated + noise

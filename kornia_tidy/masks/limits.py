@@ -1,11 +1,12 @@
-r"""Limits of height: what can be made has a lowest and a highest place. Phases here are radians at 530 nm.
+r"""Height limits: a free phase is clamped, compressed or wrapped to the range that a mask can have.
 
-With the largest phase m and a free phase :math:`\varphi`:
+Phases are radians at 530 nm. With the largest phase m and a free phase :math:`\varphi`:
 
-- clamp: :math:`\min(\max(\varphi + m/2, 0), m)`; beyond a limit only gradients that lead back pass.
-- sigmoid: :math:`m / (1 + e^{-4\varphi/m})`, of slope 1 in the middle of the range, so a learning rate keeps its unit.
-- wrapped: :math:`\varphi \bmod m`; the gradient is that of the free phase, which passes over the steps. Where m is a
-  whole number of waves, as it is by default, light at 530 nm does not see them.
+- clamp: :math:`\min(\max(\varphi + m/2, 0), m)`. Beyond a limit, gradients pass only if descent leads back.
+- sigmoid: :math:`m / (1 + e^{-4\varphi/m})`. Its gradient is 1 in the middle of the range, so a learning rate keeps
+  its unit.
+- wrapped: :math:`\varphi \bmod m`. Its gradient is 1 everywhere; the jumps are ignored. If m is a whole number of
+  waves, as it is by default, the jumps have no effect at 530 nm.
 """
 
 from __future__ import annotations
@@ -16,16 +17,19 @@ import torch
 from torch import Tensor
 
 CONSTRAINTS = ("none", "clamp", "sigmoid", "wrapped")
-_SIGMOID_REACH = 1e-3  # of the range: a sigmoid comes to its ends only at infinity
+_SIGMOID_MARGIN = 1e-3  # of the range; the inverse of a sigmoid is infinite at the ends of the range
 
 
 def limited_phase(free: Tensor, constraint: str, max_phase: float) -> Tensor:
-    """Return a phase between 0 and ``max_phase``.
+    """Return a free phase limited to the range from 0 to ``max_phase``.
 
     Args:
         free: any phase in radians.
-        constraint: one of ``CONSTRAINTS``.
+        constraint: one of ``CONSTRAINTS``; "none" returns ``free``.
         max_phase: in radians.
+
+    Returns:
+        Radians, the shape of ``free``.
 
     Example:
         >>> free = torch.tensor([-4.0, 0.0, 1.0, 7.0])
@@ -42,7 +46,16 @@ def limited_phase(free: Tensor, constraint: str, max_phase: float) -> Tensor:
 
 
 def unlimited_phase(phase: Tensor, constraint: str, max_phase: float) -> Tensor:
-    """Return a free phase that :func:`limited_phase` takes to this one, or as near as the limits allow.
+    """Return the free phase of a limited phase: an inverse of :func:`limited_phase`.
+
+    Args:
+        phase: radians between 0 and ``max_phase``. For "sigmoid", values nearer to an end than a thousandth of the
+            range are moved to that distance.
+        constraint: one of ``CONSTRAINTS``.
+        max_phase: in radians.
+
+    Returns:
+        Radians, the shape of ``phase``.
 
     Example:
         >>> phase = torch.tensor([0.5, 3.0, 5.5])
@@ -52,12 +65,12 @@ def unlimited_phase(phase: Tensor, constraint: str, max_phase: float) -> Tensor:
     if constraint == "clamp":
         return phase - max_phase / 2
     if constraint == "sigmoid":
-        return torch.logit(phase / max_phase, eps=_SIGMOID_REACH) * (max_phase / 4)
+        return torch.logit(phase / max_phase, eps=_SIGMOID_MARGIN) * (max_phase / 4)
     return phase
 
 
 class _Clamp(torch.autograd.Function):
-    """Clamp to [0, limit]; a value beyond an end feels a descent that leads back, but none that leads further out."""
+    """Clamp to [0, limit], with a gradient beyond the limits only where gradient descent leads back into the range."""
 
     generate_vmap_rule = True
 
@@ -68,7 +81,7 @@ class _Clamp(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
         value, limit = inputs
-        ctx.save_for_backward((value < 0).to(value) - (value > limit).to(value))  # the way back: +1, -1, or 0
+        ctx.save_for_backward((value < 0).to(value) - (value > limit).to(value))  # direction back: +1, -1, or 0 inside
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:

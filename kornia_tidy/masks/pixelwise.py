@@ -1,4 +1,4 @@
-"""Pixel-wise masks: every pixel of the modulator has its own height."""
+"""Pixel-wise masks: one free height for each pixel of the modulator."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ class PixelwiseMask(PhaseMasks):
     Args:
         num_masks: number K of masks shown one after the other during the exposure.
         size: pixels N along a side, or (rows, columns).
-        initial: ``"noise"`` (heights uniform on [0, 1.2e-6] m, the paper's start), ``"flat"``, or heights in metres
-            as a (K, N, N) or (N, N) tensor, which then gives ``num_masks`` and ``size``; the paper's other starts are
-            :func:`~kornia_tidy.masks.initial_heights.initial_heights`.
+        initial: ``"noise"`` (heights uniform on [0, 1.2e-6] m, as in the paper), ``"flat"``, or heights in metres as a
+            (K, N, N) or (N, N) tensor, whose shape replaces ``num_masks`` and ``size``. The paper's other initial masks
+            are in :func:`~kornia_tidy.masks.initial_heights.initial_heights`.
         material: refractive index of the element. Default: 1.5 at every wavelength, as in the paper.
         generator: source of the noise.
-        constraint: see :class:`PhaseMasks`; a sigmoid begins within a thousandth of the range of given heights.
+        constraint: see :class:`PhaseMasks`. With "sigmoid", given heights change by up to a thousandth of the range.
         max_height: in metres, see :class:`PhaseMasks`.
 
     Shape:
         - ``phase``: learnable parameter (K, N, N). With a constraint the parameter holds the free phase.
 
     Raises:
-        ValueError: if a size is not positive, or given heights are not finite maps.
+        ValueError: if a size is not positive, or given heights have another shape, are not finite or exceed 1 mm.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), section 5; Liu et al., Optics Express 30(20) 36973 (2022).
 
@@ -57,7 +57,7 @@ class PixelwiseMask(PhaseMasks):
             heights = initial[None] if initial.ndim == 2 else initial
             if heights.ndim != 3 or heights.numel() == 0:
                 raise ValueError(f"initial heights must have shape (K, N, N) or (N, N), got {tuple(initial.shape)}")
-            mask_axes((heights.shape[1], heights.shape[2]))  # refuses what cannot be centred on the pupil
+            mask_axes((heights.shape[1], heights.shape[2]))  # raises if the mask cannot be centred on the pupil
             if not bool(torch.isfinite(heights).all()):
                 raise ValueError("initial heights must be finite metres, got NaN or infinity")
             if (highest := float(heights.detach().abs().max())) > HEIGHTS[1]:

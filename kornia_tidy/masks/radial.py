@@ -1,4 +1,4 @@
-"""Rotationally symmetric masks: a profile of height along the radius, as a diamond-turned element has."""
+"""Rotationally symmetric masks: a height profile along the radius, as of a diamond-turned element."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import math
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.masks.base import MASK_SPAN, NOISE_RMS, PhaseMasks, Size, initial_values, mask_axes, spread
+from kornia_tidy.masks.base import (
+    MASK_SPAN,
+    NOISE_RMS,
+    PhaseMasks,
+    Size,
+    gather_values,
+    initial_values,
+    mask_axes,
+)
 from kornia_tidy.optics.materials import Material
 
 
@@ -17,7 +25,7 @@ class RadialMask(PhaseMasks):
     Args:
         num_masks: number K of masks shown one after the other during the exposure.
         size: pixels N along a side, or (rows, columns).
-        num_radii: number of radii from 0 to 1 at which the phase is free, at least 2. Default: as fine as the pixels.
+        num_radii: number of radii from 0 to 1 with a free phase, at least 2. Default: spaced no wider than the pixels.
         initial: ``"noise"`` (normal, 2.05 rad rms), ``"flat"``, or the phase at the radii in radians at 530 nm as a
             (K, num_radii) or (num_radii,) tensor.
         material: refractive index of the element. Default: 1.5 at every wavelength.
@@ -33,7 +41,7 @@ class RadialMask(PhaseMasks):
         ValueError: if ``num_radii`` is below 2, or given values have another shape or are not finite.
 
     Convention:
-        - Beyond the pupil's edge a mask keeps the phase it has at the edge.
+        - Beyond the pupil's edge the phase is that at the edge.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), section 3.
 
@@ -43,8 +51,8 @@ class RadialMask(PhaseMasks):
         tensor([0.0000, 0.5000, 1.0000, 1.5000, 2.0000, 2.5000])
     """
 
-    inner: Tensor
-    share: Tensor
+    inner_index: Tensor
+    outer_weight: Tensor
 
     def __init__(
         self,
@@ -63,12 +71,13 @@ class RadialMask(PhaseMasks):
             num_radii = math.ceil(min(len(y), len(x)) / MASK_SPAN - 1e-9) + 1
         if num_radii < 2:
             raise ValueError(f"num_radii must be at least 2, got {num_radii}")
-        place = torch.hypot(y, x).clamp(max=1) * (num_radii - 1)
-        inner = place.floor().clamp(max=num_radii - 2)
-        self.register_buffer("inner", inner.long(), persistent=False)
-        self.register_buffer("share", (place - inner).to(torch.get_default_dtype()), persistent=False)
+        position = torch.hypot(y, x).clamp(max=1) * (num_radii - 1)
+        inner = position.floor().clamp(max=num_radii - 2)
+        self.register_buffer("inner_index", inner.long(), persistent=False)
+        self.register_buffer("outer_weight", (position - inner).to(torch.get_default_dtype()), persistent=False)
         self.profile = nn.Parameter(initial_values(initial, num_masks, (num_radii,), NOISE_RMS, generator))
 
     def free_phase(self) -> Tensor:
-        """Return the profile turned around the axis, (K, N, N) radians."""
-        return torch.lerp(spread(self.profile, self.inner), spread(self.profile, self.inner + 1), self.share)
+        """Return the profile interpolated at the radius of each pixel, (K, N, N) radians."""
+        inner, outer = (gather_values(self.profile, self.inner_index + step) for step in (0, 1))
+        return torch.lerp(inner, outer, self.outer_weight)

@@ -1,4 +1,4 @@
-"""Zernike masks: sums of the polynomials that are orthonormal on the pupil's disc."""
+"""Zernike masks: sums of Zernike polynomials, which are orthonormal on the pupil's disc."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class ZernikeMask(PhaseMasks):
     Args:
         num_masks: number K of masks shown one after the other during the exposure.
         size: pixels N along a side, or (rows, columns).
-        num_modes: number M of polynomials, in the order of OSA/ANSI from piston on: 55 are all of radial order 9 and
-            lower (PhaseCam3D), 350 all but the last of order 25 and lower (Sitzmann et al.).
+        num_modes: number M of polynomials, in the order of OSA/ANSI from piston on. 55 are those up to radial order 9
+            (PhaseCam3D); 350 are those up to order 25 but for the last one (Sitzmann et al.).
         initial: ``"noise"`` (normal coefficients, 2.05 rad rms over the pupil in all), ``"flat"``, or coefficients as
             a (K, M) or (M,) tensor.
         material: refractive index of the element. Default: 1.5 at every wavelength.
@@ -32,9 +32,13 @@ class ZernikeMask(PhaseMasks):
         - ``coefficients``: learnable parameter (K, M), radians rms over the pupil at 530 nm.
         - ``phase``: (K, N, N).
 
+    Raises:
+        ValueError: if ``num_modes`` is not positive, or given values have another shape or are not finite.
+
     Convention:
-        - See :func:`zernike_polynomials`. Beyond the pupil's edge a mask keeps the phase it has at the edge, so that
-          pixels which a smooth iris cuts through have a sensible one.
+        - Axes and normalisation are those of :func:`zernike_polynomials`.
+        - Beyond the pupil's edge the phase is that at the edge, so that the polynomials do not grow in pixels that a
+          smooth iris cuts through.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019); Sitzmann et al., ACM Trans. Graph. 37(4) 114 (2018).
 
@@ -60,8 +64,8 @@ class ZernikeMask(PhaseMasks):
     ) -> None:
         super().__init__(material, constraint, max_height)
         y, x = mask_axes(size)
-        self.odd_sides = len(y) % 2 == 1  # both are, or neither: the middle row and column lie on the axes
-        # Every polynomial is even or odd along each axis: a quarter of the mask is all that needs to be held.
+        self.odd_sides = len(y) % 2 == 1  # of both sides or neither; then a middle row and column lie on the axes
+        # Every polynomial is even or odd along each axis, so a quarter of the mask determines the rest.
         y, x = y[len(y) // 2 :], x[len(x) // 2 :]
         inward = torch.hypot(y, x).clamp(min=1)
         polynomials = zernike_polynomials(num_modes, y / inward, x / inward).to(torch.get_default_dtype())
@@ -75,7 +79,7 @@ class ZernikeMask(PhaseMasks):
         self.coefficients = nn.Parameter(initial_values(initial, num_masks, (num_modes,), rms, generator))
 
     def free_phase(self) -> Tensor:
-        """Return the sum of the polynomials, (K, N, N) radians."""
+        """Return the sum of the polynomials before the constraint, (K, N, N) radians."""
         groups = zip(
             self.coefficients[:, self.order].split(self.group_sizes, 1),
             self.polynomials.split(self.group_sizes),
@@ -86,7 +90,7 @@ class ZernikeMask(PhaseMasks):
         return self._mirrored(halves[0], halves[1], -2)
 
     def _mirrored(self, even: Tensor, odd: Tensor, axis: int) -> Tensor:
-        """Both sides of an axis, from what is even and odd about it on its positive side."""
+        """Return the sum of an even and an odd part on both sides of an axis, from its positive side."""
         middle = int(self.odd_sides)
         negative = (even - odd).narrow(axis, middle, even.shape[axis] - middle).flip(axis)
         return torch.cat([negative, even + odd], axis)
@@ -109,7 +113,7 @@ def zernike_polynomials(num_modes: int, y: Tensor, x: Tensor) -> Tensor:
     Args:
         num_modes: number M of polynomials.
         y: coordinates in pupil radii, (..., N, 1) or of the shape of the grid.
-        x: the same along the other axis.
+        x: the same along the other axis, (N,) or of the shape of the grid.
 
     Returns:
         (M, ...) float64, each of mean square one over the disc (Noll's normalisation).
@@ -120,7 +124,7 @@ def zernike_polynomials(num_modes: int, y: Tensor, x: Tensor) -> Tensor:
     Convention:
         - The azimuth runs from +x towards +y, which is down in an image: :math:`Z_1 = 2y`, :math:`Z_2 = 2x`.
 
-    Source: Thibos et al., J. Refract. Surg. 18, S652 (2002), for order and norm; the radial polynomials by the
+    Source: Thibos et al., J. Refract. Surg. 18, S652 (2002), for order and norm. The radial polynomials come from the
     recurrence :math:`R_n^m = \rho (R_{n-1}^{|m-1|} + R_{n-1}^{m+1}) - R_{n-2}^m` of Honarvar Shakibaei and Paramesran,
     Optics Letters 38(14) 2487 (2013), which needs no factorials and is stable at every order.
 
@@ -139,11 +143,11 @@ def zernike_polynomials(num_modes: int, y: Tensor, x: Tensor) -> Tensor:
             modes.append(norm * radial[abs(m)] * wave)
             if len(modes) == num_modes:
                 return torch.stack(modes)
-    raise AssertionError  # the orders never end
+    raise AssertionError  # unreachable: the loop above returns
 
 
 def _radial_polynomials(radius: Tensor) -> Iterator[tuple[int, dict[int, Tensor]]]:
-    """Yield the orders n with their polynomials R_n^m by m."""
+    """Yield the radial orders n = 0, 1, ..., each with its polynomials R_n^m as a dictionary over m."""
     zero = torch.zeros_like(radius)
     before: dict[int, Tensor] = {}
     last: dict[int, Tensor] = {0: torch.ones_like(radius)}

@@ -1,7 +1,8 @@
-"""What shows the masks during the exposure: dwell times, switching, grey levels, crosstalk, diffraction efficiency.
+"""Modulators: devices that show phase masks in sequence during one exposure, with their imperfections.
 
-Phase masks come in; the states that the light really meets and their shares of the exposure go out. Read
-``modulator.py`` first.
+Phase masks come in. The phase states that the device really shows, transitions included, and their fractions of the
+exposure go out. ``modulator.py`` has dwell times and diffraction efficiency, ``switching.py`` the transitions between
+masks, ``phase_panel.py`` grey levels, phase gain and crosstalk. Read ``modulator.py`` first.
 """
 
 from kornia_tidy.modulator.modulator import (

@@ -1,4 +1,4 @@
-"""The modulator: which states it shows during one exposure, when, and for what share of it."""
+"""Modulators: the phase states shown during one exposure, their times and their fractions of the light."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from kornia_tidy.checks import check_part, described
 
 
 class Timeline(NamedTuple):
-    r"""What a modulator shows during one exposure: moments that follow one another, and in each of them its states.
+    r"""Sequence of phase states during one exposure: M moments, each with one or several states.
 
-    Light that leaves through two states at once, such as what a grating diffracts and what passes it undiffracted, is
-    of one moment: it sees the same scene. So a state may be there in many moments, and a moment may have many states.
+    A moment has several states where the light divides, as into the diffracted and the undiffracted light of a
+    grating. Both parts image the scene at the same time. A state may occur in several moments.
 
     Args:
         states: (S, N, N) radians.
-        durations: (M,) share of the exposure that each moment takes, summing to one. The first K moments are those of
-            the K masks, in their order; what lies between masks follows.
-        mixture: (M, S) share of a moment's light that each state has, each row summing to one. None: M = S, and each
-            moment has a state of its own.
-        middles: (M,) the middle of each moment in [0, 1], from the start of the exposure to its end. None: they follow
-            one another in their order, without a gap.
+        durations: (M,) duration of each moment as a fraction of the exposure, summing to one. The first K moments are
+            those of the K masks, in their order; transitions between masks follow.
+        mixture: (M, S) fraction of a moment's light in each state, each row summing to one. None: M = S, and each
+            moment has one state.
+        middles: (M,) middle of each moment in [0, 1], from the start of the exposure to its end. None: the moments
+            follow one another in their order, without a gap.
 
     Example:
         >>> shown = DiffractionEfficiency(0.75).timeline(torch.zeros(2, 23, 23))
@@ -43,7 +43,7 @@ class Timeline(NamedTuple):
 
     @property
     def weights(self) -> Tensor:
-        """Share of the exposure's light that each state has, (S,)."""
+        """Fraction of the exposure's light in each state, (S,)."""
         return self.durations if self.mixture is None else (self.durations[:, None] * self.mixture).sum(0)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Timeline:
@@ -52,39 +52,45 @@ class Timeline(NamedTuple):
         return Timeline(function(self.states), function(self.durations), mixture, middles)
 
     def moment(self, index: int) -> tuple[Tensor, Tensor]:
-        """Return the states of one moment, and their weights, which sum to one."""
+        """Return the states of one moment, (S', N, N), and their weights, (S',), which sum to one."""
         if self.mixture is None:
             return self.states[index : index + 1], torch.ones_like(self.durations[:1])
-        there = self.mixture[index].nonzero()[:, 0]
-        return self.states[there], self.mixture[index, there]
+        present = self.mixture[index].nonzero()[:, 0]
+        return self.states[present], self.mixture[index, present]
 
     def moment_times(self) -> Tensor:
-        """Return the middle of each moment as a share of the exposure, (M,)."""
+        """Return the middle of each moment as a fraction of the exposure, (M,)."""
         return self.durations.cumsum(0) - self.durations / 2 if self.middles is None else self.middles
 
     def state_times(self) -> Tensor:
-        """Return the mean time of the light of each state as a share of the exposure, (S,): 1/2 where it has none."""
+        """Return the mean time of each state's light as a fraction of the exposure, (S,); 1/2 if it has no light."""
         times = self.moment_times()
         if self.mixture is None:
             return times
         light = self.durations[:, None] * self.mixture
         return torch.where(self.weights > 0, (light * times[:, None]).sum(0) / self.weights, 0.5)
 
-    def beside_flat(self, share: float) -> Self:
-        """Return the exposure with this share of its light, at every moment, in a flat state instead, the last."""
+    def with_undiffracted(self, fraction: float) -> Self:
+        """Return the timeline with a fraction of the light of every moment moved to a flat state, added as the last."""
         mixture = torch.eye(len(self.states)).to(self.durations) if self.mixture is None else self.mixture
-        flat = torch.full_like(self.durations, share)[:, None]
+        flat = torch.full_like(self.durations, fraction)[:, None]
         states = torch.cat([self.states, torch.zeros_like(self.states[:1])])
-        return self._replace(states=states, mixture=torch.cat([mixture * (1 - share), flat], 1))
+        return self._replace(states=states, mixture=torch.cat([mixture * (1 - fraction), flat], 1))
 
 
 def timeline_of(modulator: nn.Module, phase: Tensor) -> Timeline:
-    """Return what any modulator shows of masks (K, N, N): states that follow one another where it does not say when."""
+    """Return the timeline of any modulator.
+
+    Args:
+        modulator: a :class:`Modulator`, or any module that returns states and weights. The latter gives no times, so
+            its states follow one another in their order.
+        phase: masks, (K, N, N) radians.
+    """
     return modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
 
 
 class Modulator(nn.Module):
-    """A modulator that knows when it shows what. A subclass says so in :meth:`timeline`.
+    """Base class of modulators: converts masks to the timeline of an exposure. A subclass implements :meth:`timeline`.
 
     Shape:
         - input: phase (K, N, N) radians.
@@ -92,7 +98,7 @@ class Modulator(nn.Module):
     """
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what is shown of these masks, and when.
+        """Return the states shown for these masks, with their times and weights.
 
         Args:
             phase: (K, N, N) radians.
@@ -100,23 +106,24 @@ class Modulator(nn.Module):
         raise NotImplementedError
 
     def forward(self, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states shown and their weights."""
+        """Return the states shown for these masks, (S, N, N) radians, and their weights, (S,)."""
         shown = self.timeline(phase)
         return shown.states, shown.weights
 
 
 class DwellTimes(Modulator):
-    """An ideal modulator: it shows each mask for its share of the exposure and switches in no time.
+    """An ideal modulator: it shows each mask for its dwell time and switches without delay.
 
     Args:
-        shares: relative dwell time of each mask; scaled to sum to one. Default: equal.
+        shares: relative dwell time of each mask; normalised to sum to one. Default: equal.
 
     Shape:
         - input: phase (K, N, N) radians.
         - output: states (S, N, N) radians and weights (S,), which sum to one. Here S = K.
 
     Raises:
-        ValueError: if a share is negative or not finite, all are zero, or their number is not that of the masks.
+        ValueError: if a share is negative or not finite, or all are zero; on use, if there are not as many as masks.
+        TypeError: if ``shares`` is not a sequence of numbers.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), section 4.
 
@@ -135,7 +142,7 @@ class DwellTimes(Modulator):
         self.shares = None if shares is None else tuple(s / sum(shares) for s in shares)
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what is shown of these masks, and when: one after another."""
+        """Return the masks one after another, each for its dwell time."""
         masks = phase.shape[0]
         if self.shares is None:
             return Timeline(phase, phase.new_full((masks,), 1 / masks))
@@ -143,7 +150,7 @@ class DwellTimes(Modulator):
         return Timeline(phase, phase.new_tensor(self.shares))
 
     def extra_repr(self) -> str:
-        """Describe the exposure in a person's words."""
+        """Return a one-line description of the dwell times."""
         return "equal dwell times" if self.shares is None else f"dwell shares {tuple(round(s, 4) for s in self.shares)}"
 
 
@@ -151,14 +158,15 @@ class LearnableDwellTimes(Modulator):
     r"""Dwell times that are learnt with the masks, :math:`w_k = e^{a_k} / \sum_j e^{a_j}`: positive, summing to one.
 
     Args:
-        shares: relative dwell times to start from, one for each mask, all positive.
+        shares: initial relative dwell times, one for each mask, all positive.
 
     Shape:
         - ``logits``: learnable parameter (K,).
         - input: phase (K, N, N) radians; output: states (K, N, N) and weights (K,).
 
     Raises:
-        ValueError: if a share is not positive and finite, or their number is not that of the masks.
+        ValueError: if a share is not positive and finite; on use, if there are not as many as masks.
+        TypeError: if ``shares`` is not a sequence of numbers.
 
     Example:
         >>> import torch
@@ -175,23 +183,23 @@ class LearnableDwellTimes(Modulator):
         self.logits = nn.Parameter(torch.tensor([math.log(s) for s in shares]))
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what is shown of these masks, and when: one after another."""
+        """Return the masks one after another, each for its learnt dwell time."""
         _check_count(len(self.logits), phase.shape[0])
         return Timeline(phase, self.logits.to(phase).softmax(0))
 
     def extra_repr(self) -> str:
-        """Describe the exposure in a person's words."""
+        """Return a one-line description of the dwell times."""
         return f"learnable dwell shares {tuple(round(s, 4) for s in self.logits.detach().softmax(0).tolist())}"
 
 
 class DiffractionEfficiency(Modulator):
-    """A fixed diffractive element: a share of the light sees the masks, the rest passes as if they were flat.
+    """Diffraction efficiency: only a fraction of the light is modulated by the masks, the rest passes a flat state.
 
-    What a real element does not send where its design says is added as intensity, as a state of its own that is there
-    all the time. Several masks have equal dwell times; for others make it a part of a :class:`SpatialLightModulator`.
+    The undiffracted light is added in intensity, as a state that lasts for the whole exposure. Several masks have
+    equal dwell times. For other dwell times make this a part of a :class:`SpatialLightModulator`.
 
     Args:
-        efficiency: share of the light that sees the masks, above 0 and at most 1.
+        efficiency: fraction of the light that the masks modulate, above 0 and at most 1.
 
     Shape:
         - input: phase (K, N, N) radians; output: states (K + 1, N, N), the last flat, and weights (K + 1,).
@@ -215,38 +223,40 @@ class DiffractionEfficiency(Modulator):
         self.efficiency = efficiency
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what is shown of these masks, and when: one after another, and the flat state all the time."""
-        return DwellTimes().timeline(phase).beside_flat(1 - self.efficiency)
+        """Return the masks one after another for equal times, each together with the flat state."""
+        return DwellTimes().timeline(phase).with_undiffracted(1 - self.efficiency)
 
     def extra_repr(self) -> str:
-        """Describe the element in a person's words."""
-        return f"{self.efficiency:.0%} of the light sees the mask"
+        """Return a one-line description of the efficiency."""
+        return f"{self.efficiency:.0%} of the light is modulated"
 
 
 class SpatialLightModulator(Modulator):
-    """A modulator made of parts: what its panel does to each mask, and how it passes from one to the next.
+    """A spatial light modulator (SLM) composed of parts: the errors of its panel and its switching between masks.
 
     Args:
-        parts: modules, each taking what the one before gives: those that turn masks (K, N, N) into masks as the panel
-            shows them, such as :class:`~kornia_tidy.modulator.phase_panel.GreyLevels` and
-            :class:`~kornia_tidy.modulator.phase_panel.PixelCrosstalk`, and one that gives states and weights, such as
-            :class:`DwellTimes` or :class:`~kornia_tidy.modulator.switching.Switching`. What turns masks and stands
-            after that one turns all that is shown. A :class:`DiffractionEfficiency` may stand anywhere, and alone means
-            equal dwell times, as no part at all does.
-        fill_factor: share of the area of each pixel that modulates: a square in its middle. Light through the gaps
-            between the squares passes with phase zero; see :func:`~kornia_tidy.psf.exact.exact_psf_bank`.
+        parts: modules, applied in this order. Panel parts convert masks (K, N, N) to masks as the panel shows them,
+            such as :class:`~kornia_tidy.modulator.phase_panel.GreyLevels` and
+            :class:`~kornia_tidy.modulator.phase_panel.PixelCrosstalk`. One timing part gives states and weights, such
+            as :class:`DwellTimes` or :class:`~kornia_tidy.modulator.switching.Switching`. Panel parts after it act on
+            all its states, transitions included. A :class:`DiffractionEfficiency` may have any position, and can
+            replace the timing part: then, as without any part, dwell times are equal.
+        fill_factor: fraction of each pixel's area that modulates, a square in its middle. Light through the gaps
+            between the squares keeps phase zero; see :func:`~kornia_tidy.psf.exact.exact_psf_bank`.
 
     Shape:
         - input: phase (K, N, N) radians; output: states (S, N, N) radians and weights (S,).
 
     Raises:
         ValueError: if the fill factor is not in (0, 1].
-        TypeError: if no part gives states and weights, or more than one does.
+        TypeError: if a part is not a module; on use, if panel parts come without a timing part or a
+            :class:`DiffractionEfficiency`, or if there are two timing parts.
 
     Convention:
-        - Light that misses the masks misses the panel: what a :class:`DiffractionEfficiency` leaves is flat wherever
-          that part stands.
-        - Any module that maps phase to states and weights is a modulator; without a ``fill_factor``, it has no gaps.
+        - The panel does not modulate undiffracted light, so that light stays flat whatever the position of the
+          :class:`DiffractionEfficiency`.
+        - Any module that maps phase to states and weights can serve as a modulator. Without an attribute
+          ``fill_factor`` it has no gaps.
 
     Example:
         >>> from kornia_tidy.modulator.phase_panel import GreyLevels
@@ -267,30 +277,30 @@ class SpatialLightModulator(Modulator):
         self.fill_factor = fill_factor
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what is shown of these masks, and when."""
+        """Return the states that the panel shows for these masks, with their times and weights."""
         shown: Tensor | Timeline = phase
-        splits = [part for part in self.parts if isinstance(part, DiffractionEfficiency)]
+        efficiencies = [part for part in self.parts if isinstance(part, DiffractionEfficiency)]
         for part in self.parts:
-            if part not in splits:
-                shown = self._next(part, shown)
+            if part not in efficiencies:
+                shown = self._apply_part(part, shown)
         if isinstance(shown, Tensor):
-            if not splits:
+            if not efficiencies:
                 raise TypeError(
                     "a part of a modulator must give states and weights, as DwellTimes and Switching do, got "
                     f"{self._names()}"
                 )
             shown = DwellTimes().timeline(shown)
-        for part in splits:
-            shown = shown.beside_flat(1 - part.efficiency)
+        for part in efficiencies:
+            shown = shown.with_undiffracted(1 - part.efficiency)
         return shown
 
-    def _next(self, part: nn.Module, shown: Tensor | Timeline) -> Tensor | Timeline:
-        """Return what a part makes of what the parts before it show."""
+    def _apply_part(self, part: nn.Module, shown: Tensor | Timeline) -> Tensor | Timeline:
+        """Apply one part to the masks, or to the timeline once a timing part has given one."""
         if isinstance(shown, Tensor):
             if isinstance(part, Modulator):
                 return part.timeline(shown)
-            panel = part(shown)
-            return Timeline(*panel) if isinstance(panel, tuple) else panel
+            result = part(shown)
+            return Timeline(*result) if isinstance(result, tuple) else result
         if isinstance(part, Modulator) or not isinstance(states := part(shown.states), Tensor):
             raise TypeError(
                 f"one part of a modulator may give states and weights, as DwellTimes or Switching do, got "
@@ -302,7 +312,7 @@ class SpatialLightModulator(Modulator):
         return [type(part).__name__ for part in self.parts]
 
     def extra_repr(self) -> str:
-        """Describe the panel in a person's words."""
+        """Return a one-line description of the fill factor."""
         return f"fill factor {self.fill_factor:g}"
 
 
@@ -313,4 +323,4 @@ def _check_numbers(shares: object) -> None:
 
 def _check_count(shares: int, masks: int) -> None:
     if shares != masks:
-        raise ValueError(f"there are {shares} dwell shares for {masks} masks")
+        raise ValueError(f"dwell shares must be one for each of the {masks} masks, got {shares}")

@@ -1,4 +1,4 @@
-"""The panel of a phase modulator: what it shows when it is asked for a mask. Grey levels, stroke, crosstalk."""
+"""Phase panel: the phase that a panel shows for a wanted mask. Grey levels, phase gain, pixel crosstalk."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from kornia_tidy.checks import check_positive
 
 
 def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
-    r"""Return the phases of a panel with a straight response, :math:`g \, \Phi / 2^b` for grey levels g = 0 to 2^b - 1.
+    r"""Return the phases of a panel with a linear response, :math:`g \, \Phi / 2^b` for grey levels g = 0 to 2^b - 1.
 
     Args:
         bits: bits b of the grey levels, 1 to 10.
-        phase_range: :math:`\Phi` in radians at 530 nm; with 2π, the level after the last is the first.
+        phase_range: :math:`\Phi` in radians at 530 nm; with 2π the steps continue across the wrap.
 
     Returns:
         (2^b,) radians, float64.
@@ -36,40 +36,40 @@ def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
 
 
 def nearest_level(phase: Tensor, levels: Tensor) -> Tensor:
-    """Return the grey level whose phase is nearest, modulo 2π: what is to be written to the panel.
+    """Quantise phase to grey levels: return for each value the level of the nearest phase, modulo 2π.
 
     Args:
         phase: wanted radians, any shape.
         levels: (L,) radians of each grey level, in any order.
 
     Returns:
-        Indices into ``levels``, int64, the shape of ``phase``.
+        Grey levels as indices into ``levels``, int64, the shape of ``phase``.
 
     Example:
         >>> nearest_level(torch.tensor([0.1, 3.0, 6.2, -1.6]), level_phases(2))
         tensor([0, 2, 0, 3])
     """
-    turn = 2 * math.pi
-    wanted = phase.detach().to(torch.promote_types(phase.dtype, torch.float32)).remainder(turn)
-    ascending, order = levels.double().remainder(turn).sort()
-    around = torch.cat([ascending[-1:] - turn, ascending, ascending[:1] + turn])
-    middles = (around[1:] + around[:-1]) / 2  # levels change here
-    place = torch.bucketize(wanted, middles.to(wanted))
-    return order.to(phase.device)[(place - 1) % len(order)]
+    wave = 2 * math.pi
+    wanted = phase.detach().to(torch.promote_types(phase.dtype, torch.float32)).remainder(wave)
+    ascending, order = levels.double().remainder(wave).sort()
+    extended = torch.cat([ascending[-1:] - wave, ascending, ascending[:1] + wave])
+    thresholds = (extended[1:] + extended[:-1]) / 2
+    index = torch.bucketize(wanted, thresholds.to(wanted))
+    return order.to(phase.device)[(index - 1) % len(order)]
 
 
 def show_levels(phase: Tensor, levels: Tensor) -> Tensor:
-    """Return the phases a panel shows instead of those wanted: for each its nearest level's, modulo 2π.
+    """Quantise phase to the phases of a panel's grey levels: the nearest, modulo 2π.
 
     Args:
         phase: wanted radians, any shape.
         levels: (L,) radians of each grey level.
 
     Returns:
-        Radians of the levels, the shape and dtype of ``phase``.
+        Phases of the levels in radians, the shape and dtype of ``phase``.
 
     Convention:
-        - Gradient: straight through, 1 everywhere.
+        - The gradient is a straight-through estimate: 1 everywhere.
 
     Example:
         >>> show_levels(torch.tensor([0.1, 3.0, 6.2]), level_phases(1))
@@ -80,17 +80,17 @@ def show_levels(phase: Tensor, levels: Tensor) -> Tensor:
 
 
 class GreyLevels(nn.Module):
-    r"""A panel that shows one of 2^b phases in each pixel: the nearest to the one wanted, modulo 2π.
+    r"""Quantisation of phase by a panel with 2^b grey levels: each pixel shows the nearest of their phases, modulo 2π.
 
-    With :math:`\Phi = 2\pi` the error is uniform within half a step: its variance is step²/12, and the share
-    :math:`\mathrm{sinc}^2(2^{-b})` of the light goes where it should.
+    With :math:`\Phi = 2\pi` the error is uniform within half a step. Its variance is step²/12, and the diffraction
+    efficiency is :math:`\mathrm{sinc}^2(2^{-b})`.
 
     Args:
         bits: bits b of the grey levels, 1 to 10.
-        phase_range: phase in radians at 530 nm that the grey levels span. With less than 2π some phases are out of
-            reach: the nearer end is shown.
-        response: measured phase in radians at 530 nm over grey level, evenly spaced from level 0 to 2^b - 1, straight
-            lines between; instead of ``phase_range``. Software that writes through the measured curve is assumed.
+        phase_range: phase :math:`\Phi` in radians at 530 nm that the grey levels span. With less than 2π a phase out
+            of range gives the nearer end.
+        response: measured phase in radians at 530 nm, at grey levels evenly spaced from 0 to 2^b - 1 and linear
+            between; it replaces ``phase_range``. The frames are assumed to be computed with this curve.
 
     Shape:
         - input and output: (K, N, N) radians.
@@ -99,8 +99,9 @@ class GreyLevels(nn.Module):
         ValueError: if bits or range are out of range, or a response has fewer than two samples or one not finite.
 
     Convention:
-        - The phase shown is that of the level: other colours do not see the 2π that 530 nm does not see.
-        - Gradient: straight through.
+        - The phase shown is the level's own, without the multiples of 2π that were removed from the wanted phase.
+          They have no effect at 530 nm but would have one at other wavelengths.
+        - The gradient is a straight-through estimate: 1 everywhere.
 
     Source: Goodman, Introduction to Fourier Optics, on binary optics; Dallas, Applied Optics 10, 673 (1971).
 
@@ -126,15 +127,15 @@ class GreyLevels(nn.Module):
                 raise ValueError(
                     f"a measured response must have at least two finite phases in radians, got {curve.tolist()}"
                 )
-            place = torch.linspace(0, len(curve) - 1, len(levels), dtype=torch.float64)
-            lower = place.long().clamp(max=len(curve) - 2)
-            levels = torch.lerp(curve[lower], curve[lower + 1], place - lower)
+            position = torch.linspace(0, len(curve) - 1, len(levels), dtype=torch.float64)
+            lower = position.long().clamp(max=len(curve) - 2)
+            levels = torch.lerp(curve[lower], curve[lower + 1], position - lower)
             self.response = tuple(curve.tolist())
-        # Not a buffer: module.to(float16) must not round what a panel does.
+        # Not a buffer, because module.to(float16) must not round the phases of the panel.
         self.levels = levels
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Return the masks as the panel shows them."""
+        """Return the masks quantised to the panel's phases, (K, N, N) radians."""
         return show_levels(phase, self.levels)
 
     def frames(self, phase: Tensor) -> Tensor:
@@ -142,19 +143,20 @@ class GreyLevels(nn.Module):
         return nearest_level(phase, self.levels)
 
     def extra_repr(self) -> str:
-        """Describe the panel in a person's words."""
+        """Return a one-line description of the panel."""
         return f"{self.bits} bits, {float(self.levels.min()):.2f} to {float(self.levels.max()):.2f} rad at 530 nm"
 
 
 class StrokeError(nn.Module):
-    r"""A panel whose phase is off by a factor everywhere, :math:`\phi \mapsto g \phi`: drive voltage or temperature.
+    r"""Phase gain error of a panel, from a wrong drive voltage or temperature: :math:`\phi \mapsto g \phi`.
+
+    Put :class:`GreyLevels` before it, so that the gain applies to the phase that the panel shows, between 0 and 2π.
 
     Args:
-        gain: g, 1 for no error.
+        gain: factor g, 1 for no error.
 
     Shape:
-        - input and output: (K, N, N) radians. Put :class:`GreyLevels` before it: what is off is the phase within the
-          panel's range, not multiples of 2π it never shows.
+        - input and output: (K, N, N) radians.
 
     Raises:
         ValueError: if the gain is not positive and finite.
@@ -170,18 +172,18 @@ class StrokeError(nn.Module):
         self.gain = gain
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Return the masks as the panel shows them."""
+        """Return the masks times the gain, (K, N, N) radians."""
         return phase * self.gain
 
     def extra_repr(self) -> str:
-        """Describe the error in a person's words."""
+        """Return a one-line description of the gain."""
         return f"stroke times {self.gain:g}"
 
 
 def crosstalk_kernel(sigma: float) -> Tensor:
-    r"""Return what the neighbours of a pixel along one axis share in its phase.
+    r"""Return the crosstalk kernel along one axis: the weights of a pixel and its neighbours in the phase shown.
 
-    Phase is a staircase over the pixels, blurred by a Gaussian and averaged over each pixel again:
+    The phase is piecewise constant over the pixels. It is blurred by a Gaussian and averaged over each pixel:
 
     .. math:: w_d = G(d + 1) - 2 G(d) + G(d - 1), \quad
         G(x) = x \, \Phi(x/\sigma) + \frac{\sigma}{\sqrt{2\pi}} e^{-x^2 / 2\sigma^2}
@@ -190,7 +192,10 @@ def crosstalk_kernel(sigma: float) -> Tensor:
         sigma: standard deviation of the Gaussian in pixels.
 
     Returns:
-        (2 r + 1,) float64, summing to one, with r the first pixel beyond six standard deviations.
+        (2 r + 1,) float64, summing to one, with r six standard deviations, rounded up.
+
+    Raises:
+        ValueError: if sigma is not positive and finite.
 
     Example:
         >>> crosstalk_kernel(0.25)
@@ -206,16 +211,16 @@ def crosstalk_kernel(sigma: float) -> Tensor:
 
 
 class PixelCrosstalk(nn.Module):
-    """A panel whose pixels pull at their neighbours: fringing fields blur the phase. See :func:`crosstalk_kernel`.
+    """Pixel crosstalk of a panel: fringing fields blur the phase over neighbouring pixels.
 
-    It blurs what is shown, steps of 2π too: put it after :class:`GreyLevels`. Pixels keep one phase each: that the
-    blur also rounds the edges within a pixel is left out.
+    Put it after :class:`GreyLevels`, so that it blurs the phase shown, jumps of 2π included. The phase stays constant
+    over each pixel; its variation within a pixel is neglected. See :func:`crosstalk_kernel`.
 
     Args:
         sigma: standard deviation of the blur in pixels.
 
     Shape:
-        - input and output: (K, N, N) radians; beyond the border the outermost pixels go on.
+        - input and output: (K, N, N) radians; beyond the border the outermost pixels are repeated.
 
     Raises:
         ValueError: if sigma is not positive and finite.
@@ -232,16 +237,16 @@ class PixelCrosstalk(nn.Module):
     def __init__(self, sigma: float) -> None:
         super().__init__()
         self.sigma = sigma
-        self.kernel = crosstalk_kernel(sigma)  # not a buffer: as GreyLevels
+        self.kernel = crosstalk_kernel(sigma)  # not a buffer, for the reason in GreyLevels
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Return the masks as the panel shows them."""
+        """Return the blurred masks, (K, N, N) radians."""
         kernel = self.kernel.to(phase)
         reach = len(kernel) // 2
-        wide = pad(phase[:, None], (reach,) * 4, mode="replicate")
-        rows = conv2d(wide, kernel[None, None, None, :])
+        padded = pad(phase[:, None], (reach,) * 4, mode="replicate")
+        rows = conv2d(padded, kernel[None, None, None, :])
         return conv2d(rows, kernel[None, None, :, None])[:, 0]
 
     def extra_repr(self) -> str:
-        """Describe the blur in a person's words."""
+        """Return a one-line description of the blur."""
         return f"sigma {self.sigma:g} pixels"

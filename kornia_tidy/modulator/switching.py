@@ -1,4 +1,4 @@
-"""Switching: a modulator takes time from mask to mask, and the shutter is open meanwhile."""
+"""Switching: the finite transition time between masks, during which the shutter stays open."""
 
 from __future__ import annotations
 
@@ -15,55 +15,57 @@ from kornia_tidy.modulator.modulator import DwellTimes, Modulator, Timeline, tim
 from kornia_tidy.optics.quadrature import gauss_legendre
 
 BETWEEN = ("random", "linear", "exponential")
-SLOWEST = 10.0  # s; what turns a plate by a motor takes less
-SETTLED = 0.99  # share of a step done at the end of the switching time, where the response is exponential
+SLOWEST = 10.0  # s; even motors that exchange phase plates are faster
+SETTLED = 0.99  # fraction of an exponential response that is complete at the end of the switching time
 
 
 class Switching(Modulator):
-    r"""A modulator that needs time from each mask to the next; the capture holds the light of the states in between.
+    r"""A modulator with a finite switching time: the capture includes the light of the transitions between masks.
 
-    With S swaps of duration t in an exposure T, mask k is shown for :math:`s_k (1 - S t / T)` of it, where s are the
-    dwell shares, and each swap takes :math:`t / T`. Within a swap, at time u t with u in [0, 1], it shows
+    With S transitions of duration t in an exposure T, mask k is shown for the fraction :math:`s_k (1 - S t / T)` of the
+    exposure, where s are the dwell shares, and each transition takes :math:`t / T`. At time u t of a transition, u in
+    [0, 1], the state is
 
-    * ``"random"``: one random pattern, each pixel uniform in [0, 2π) at 530 nm: the paper's worst case;
+    * ``"random"``: one random pattern, each pixel uniform in [0, 2π) at 530 nm, the paper's worst case;
     * ``"linear"``: :math:`\phi_k + u (\phi_{k+1} - \phi_k)`;
-    * ``"exponential"``: the same with :math:`1 - e^{-u t/\tau} = 1 - 0.01^u` for u: first-order relaxation of a liquid
-      crystal that has done 99 % when the swap is over, :math:`t = 4.6 \tau`. A data sheet's time from 10 to 90 % is
-      :math:`2.2 \tau`: see :func:`settling_time`. The last 1 % of the step is left out;
-    * samples of a measured response, evenly spaced over the swap, for u: 0 at its start, 1 at its end, overshoot
-      allowed, straight lines between them.
+    * ``"exponential"``: the same with :math:`1 - e^{-u t/\tau} = 1 - 0.01^u` for u. This is the first-order relaxation
+      of a liquid crystal, 99 % complete at the end of the transition, :math:`t = 4.6 \tau`; the last 1 % is neglected.
+      A data sheet's rise time from 10 to 90 % is :math:`2.2 \tau`, see :func:`settling_time`;
+    * a measured response for u, as samples evenly spaced over the transition and linear between. It starts at 0 and
+      ends at 1; overshoot is allowed.
 
     Args:
-        switching_time: duration t of a swap in seconds.
+        switching_time: duration t of a transition in seconds.
         exposure: duration T of the exposure in seconds.
-        between: what is shown within a swap: a name, or the samples of a measured response.
-        dwell: dwell shares of the masks, a module like :class:`DwellTimes`. Default: equal.
-        cyclic: whether the swap back to the first mask falls into the exposure too.
-        samples: Gauss-Legendre points in time for each swap; a random pattern needs none.
-        seed: of the random patterns. Other seeds give others; set it to draw anew, in training at each step, say.
+        between: state within a transition, a name or the samples of a measured response.
+        dwell: module that gives the dwell shares of the masks, such as :class:`DwellTimes`. Default: equal.
+        cyclic: whether the exposure includes the transition from the last mask back to the first.
+        samples: Gauss-Legendre points in time for each transition; not used for "random".
+        seed: seed of the random patterns. Change it to draw new ones, for example at each training step.
 
     Shape:
         - input: phase (K, N, N) radians.
-        - output: states (S', N, N) radians and weights (S',), which sum to one: the K masks, then what is between.
+        - output: states (S', N, N) radians and weights (S',), which sum to one: the K masks, then the transitions.
 
     Raises:
-        ValueError: if a time is negative or not finite, the swaps take longer than the exposure, ``between`` is not
-            known, or a response has fewer than two samples or one that is not finite.
+        ValueError: if a time is negative or not finite, ``between`` is unknown, or a response has fewer than two
+            samples or one that is not finite; on use, if the transitions take longer than the exposure.
 
     Convention:
-        - There are K - 1 swaps: the first mask is set before the shutter opens, so that one mask has none, as in the
-          paper. A camera whose exposures follow each other without a gap also pays for the way back: ``cyclic=True``
-          gives K swaps (and none for one mask).
-        - The response moves the phase as it is given: put :class:`~kornia_tidy.modulator.phase_panel.GreyLevels` before
-          it, and it moves between the phases that the panel really shows.
+        - There are K - 1 transitions, as in the paper: the first mask is set before the shutter opens. A camera whose
+          exposures follow each other without a gap also has the transition back: ``cyclic=True`` gives K transitions.
+          A single mask has none.
+        - Transitions run between the phases as given. Put :class:`~kornia_tidy.modulator.phase_panel.GreyLevels` before
+          it to run between the phases that the panel shows.
         - The same seed gives the same patterns at every call, on any device and in any dtype. The global generator is
           neither read nor changed.
-        - Error of the PSF of a swap between two masks of the paper's noise, against 64 samples (L1, worst of three
+        - L1 error of the PSF of a transition between two masks of the paper's noise, against 64 samples (worst of three
           colours and three depths in 41 px): linear 1e-2, 1e-4, 6e-7 and exponential 5e-2, 1e-2, 2e-3 with 4, 6 and 8
-          samples. A response with an overshoot given by 9 samples: 3e-2 with 8, 1e-2 with 12. In a capture it counts
-          times S t / T.
-        - Cost: that of its states. Five masks have 9 with random patterns and 37 with 8 samples a swap: the bank takes
-          1.7 and 4.6 times as long, with its gradients 1.1 and 6.4 times (41 px, one core).
+          samples. A measured response of 9 samples with an overshoot: 3e-2 with 8 samples, 1e-2 with 12. In a capture
+          this error is multiplied by S t / T.
+        - The cost grows with the number of states. Five masks have 9 states with random patterns and 37 with 8 samples
+          a transition. The PSF bank then takes 1.7 and 4.6 times as long, and its gradients 1.1 and 6.4 times (41 px,
+          one core).
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), "Modeling State Switching in SLMs", for random states.
 
@@ -103,7 +105,7 @@ class Switching(Modulator):
         self.cyclic, self.samples, self.seed = cyclic, samples, seed
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what is shown of these masks, and when: the masks, then what lies between them.
+        """Return the masks and the transitions between them, with their times and weights.
 
         Example:
             >>> shown = Switching(20e-3).timeline(torch.zeros(3, 5, 5))
@@ -117,35 +119,35 @@ class Switching(Modulator):
                 f"make it and Switching two parts of a SpatialLightModulator"
             )
         masks, shares = dwell.states, dwell.durations
-        swaps = len(masks) if self.cyclic and len(masks) > 1 else len(masks) - 1
-        swap = self.switching_time / self.exposure
-        if swaps * swap > 1 + 1e-9:
+        count = len(masks) if self.cyclic and len(masks) > 1 else len(masks) - 1
+        duration = self.switching_time / self.exposure
+        if count * duration > 1 + 1e-9:
             raise ValueError(
-                f"{swaps} swaps of {self.switching_time * 1e3:g} ms must fit into the exposure of "
-                f"{self.exposure * 1e3:g} ms, got {swaps * self.switching_time * 1e3:g} ms"
+                f"{count} transitions of {self.switching_time * 1e3:g} ms must fit into the exposure of "
+                f"{self.exposure * 1e3:g} ms, got {count * self.switching_time * 1e3:g} ms"
             )
-        if swaps * swap == 0:
+        if count * duration == 0:
             return dwell
         if self.between == "random":
-            between, times = random_phases(self.seed, swaps, *phase.shape[-2:]).to(phase), phase.new_ones(1)
+            between, weights = random_phases(self.seed, count, *phase.shape[-2:]).to(phase), phase.new_ones(1)
             inside = phase.new_full((1,), 0.5)
         else:
-            response, times = (values.to(phase) for values in sampled_response(self.between, self.samples))
-            before, after = masks[:swaps], masks.roll(-1, 0)[:swaps]
+            response, weights = (values.to(phase) for values in sampled_response(self.between, self.samples))
+            before, after = masks[:count], masks.roll(-1, 0)[:count]
             between = torch.lerp(before, after, response[:, None, None, None]).flatten(0, 1)
             inside = (gauss_legendre(self.samples)[0] + 0.5).to(phase)
-        shown = shares * max(0.0, 1 - swaps * swap)
-        ends = shown.cumsum(0) + swap * torch.arange(len(masks), device=shown.device, dtype=shown.dtype)
-        middles = torch.cat([ends - shown / 2, (ends[:swaps] + swap * inside[:, None]).flatten()])
-        durations = torch.cat([shown, (times[:, None] * swap).expand(-1, swaps).flatten()])
+        shown = shares * max(0.0, 1 - count * duration)
+        ends = shown.cumsum(0) + duration * torch.arange(len(masks), device=shown.device, dtype=shown.dtype)
+        middles = torch.cat([ends - shown / 2, (ends[:count] + duration * inside[:, None]).flatten()])
+        durations = torch.cat([shown, (weights[:, None] * duration).expand(-1, count).flatten()])
         return Timeline(torch.cat([masks, between]), durations, middles=middles)
 
     def extra_repr(self) -> str:
-        """Describe the swaps in a person's words."""
+        """Return a one-line description of the transitions."""
         between = self.between if isinstance(self.between, str) else f"measured ({len(self.between)} samples)"
         return (
-            f"{self.switching_time * 1e3:g} ms a swap in an exposure of {self.exposure * 1e3:g} ms, {between} between"
-            f"{', cyclic' if self.cyclic else ''}"
+            f"{self.switching_time * 1e3:g} ms a transition in an exposure of {self.exposure * 1e3:g} ms, "
+            f"{between} between{', cyclic' if self.cyclic else ''}"
         )
 
 
@@ -158,7 +160,10 @@ def settling_time(rise_time: float) -> float:
         rise_time: from 10 to 90 % of a step, in seconds, as data sheets quote it.
 
     Returns:
-        Seconds until 99 % of the step are done.
+        Seconds until the step is 99 % complete.
+
+    Raises:
+        ValueError: if the rise time is not positive and finite.
 
     Example:
         >>> round(settling_time(5e-3), 5)
@@ -169,14 +174,14 @@ def settling_time(rise_time: float) -> float:
 
 
 def sampled_response(between: str | Sequence[float], samples: int) -> tuple[Tensor, Tensor]:
-    """Return how far a swap has come at the points of a Gauss-Legendre rule in time, and the rule's weights.
+    """Return the response of a transition at the points of a Gauss-Legendre rule in time, and the rule's weights.
 
     Args:
         between: ``"linear"``, ``"exponential"`` or evenly spaced samples of a measured response.
-        samples: points of the rule.
+        samples: number of points of the rule.
 
     Returns:
-        Response and weights, (samples,) float64 each; the weights sum to one.
+        Response (0 at the first mask, 1 at the next) and weights, (samples,) float64 each; the weights sum to one.
 
     Example:
         >>> sampled_response((0.0, 1.2, 1.0), 1)
@@ -189,13 +194,15 @@ def sampled_response(between: str | Sequence[float], samples: int) -> tuple[Tens
     if between == "exponential":
         return 1 - (1 - SETTLED) ** time, weights
     curve = torch.tensor(cast("Sequence[float]", between), dtype=torch.float64)
-    place = time * (len(curve) - 1)
-    lower = place.long().clamp(max=len(curve) - 2)
-    return torch.lerp(curve[lower], curve[lower + 1], place - lower), weights
+    position = time * (len(curve) - 1)
+    lower = position.long().clamp(max=len(curve) - 2)
+    return torch.lerp(curve[lower], curve[lower + 1], position - lower), weights
 
 
 def random_phases(seed: int, count: int, rows: int, columns: int) -> Tensor:
-    """Return random patterns, uniform in [0, 2π): the same for the same arguments, (count, rows, columns) float64.
+    """Return random phase patterns, uniform in [0, 2π), (count, rows, columns) float64.
+
+    The same arguments give the same patterns; NumPy's generator is seeded at each call.
 
     Example:
         >>> torch.equal(random_phases(3, 2, 23, 23), random_phases(3, 2, 23, 23))
@@ -204,5 +211,5 @@ def random_phases(seed: int, count: int, rows: int, columns: int) -> Tensor:
     return torch.from_numpy(np.random.default_rng(seed).uniform(0, 2 * math.pi, (count, rows, columns)))
 
 
-# Constants to the compiler, which cannot trace NumPy's generator; see propagation.py.
+# torch.compile cannot trace NumPy's generator, so the result is marked as a constant, as in optics/quadrature.py.
 setattr(random_phases, "_dynamo_marked_constant", True)  # noqa: B010

@@ -1,7 +1,8 @@
 """Lens and light: thin lens and defocus, aperture, materials, spectrum.
 
-Distances, wavelengths and colours come in; defocus in radians, apertures, refractive indices and weights of wavelengths
-go out. Read ``thin_lens.py`` first.
+Distances, wavelengths and names of materials and cameras come in. Defocus in radians, aperture amplitudes, refractive
+indices and channel weights of wavelengths go out. ``quadrature.py`` integrates over pupil cells; ``units.py`` warns of
+inputs in a wrong unit. Read ``thin_lens.py`` first.
 """
 
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture

@@ -1,8 +1,8 @@
-r"""Aperture shapes: the amplitude of the pupil, cell by cell.
+r"""Aperture shapes: pupil amplitude on a grid of square cells.
 
 All maps share one grid: ``size`` x ``size`` square cells around the optical axis, with centres at
 (i - (size - 1)/2) * pitch. Lengths are in pupil radii, so ρ = 1 is the edge of the standard aperture. Row i is y,
-column j is x, and y grows downwards as in an image. What reaches beyond the grid is cut off.
+column j is x, and y grows downwards as in an image. A shape larger than the grid is cropped.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from kornia_tidy.checks import check_choice, check_positive
 
 Edges = Literal["binary", "area"]
 
-TOLERANCE = 1e-9  # a cell centre on the rim is inside, whatever the rounding: 0.6² + 0.8² must not exceed 1
-ROUND_OFF = 1e-12  # covered fractions closer than this to 0 or 1 are 0 or 1
+TOLERANCE = 1e-9  # pupil radii; keeps cells open if their centre is on the rim, such as (0.6, 0.8), despite rounding
+ROUND_OFF = 1e-12  # covered fractions closer to 0 or 1 than this are set to 0 or 1
 
 
 def circular_aperture(size: int, pitch: float = 0.1, radius: float = 1.0, *, edges: Edges = "binary") -> Tensor:
@@ -29,8 +29,8 @@ def circular_aperture(size: int, pitch: float = 0.1, radius: float = 1.0, *, edg
         size: cells along a side of the grid.
         pitch: side of a cell in pupil radii.
         radius: radius of the disc in pupil radii.
-        edges: "binary" opens a cell when its centre lies within the disc (a modulator whose cells are open or shut);
-            "area" gives each cell the exact fraction of its area that the disc covers (a smooth iris).
+        edges: "binary" opens each cell whose centre lies within the disc (for a modulator whose cells are open or
+            shut); "area" gives each cell the exact fraction of its area that the disc covers (for a smooth iris).
 
     Returns:
         Amplitude in [0, 1], float64.
@@ -133,7 +133,7 @@ def polygon_aperture(
 
 
 def check_aperture(aperture: Any, size: int) -> Tensor:
-    """Return a user's own aperture as float64, or raise when it cannot be the amplitude of a pupil.
+    """Check a custom aperture and return it as float64.
 
     Args:
         aperture: amplitude in [0, 1], a real or boolean tensor, or anything that :func:`torch.as_tensor` reads.
@@ -174,7 +174,7 @@ def _check_grid(size: int, pitch: float, edges: str) -> None:
 
 
 def _require_light(amplitude: Tensor) -> Tensor:
-    """Return the amplitude, or raise: a closed pupil has no point spread function."""
+    """Return the amplitude, or raise if every cell is closed: such a pupil has no point spread function."""
     if not bool((amplitude > 0).any()):
         raise ValueError("aperture must let some light through, got 0 open cells")
     return amplitude
@@ -185,7 +185,7 @@ def _cell_centres(size: int, pitch: float) -> Tensor:
 
 
 def _grid_lines(size: int, pitch: float) -> Tensor:
-    """Return the size + 1 coordinates of the lines between cells."""
+    """Return the size + 1 coordinates of the cell boundaries."""
     return (torch.arange(size + 1, dtype=torch.float64) - size / 2) * pitch
 
 
@@ -195,7 +195,7 @@ def _disc(size: int, pitch: float, radius: float, edges: str) -> Tensor:
         return (torch.hypot(centres[:, None], centres) <= radius + TOLERANCE).double()
     corner_areas = _disc_area_up_to(_grid_lines(size, pitch), radius)
     cover = corner_areas.diff(dim=0).diff(dim=1) / pitch**2
-    # The differences leave round-off of 1e-16 / pitch²: cells wholly inside or outside are exactly 1 or 0.
+    # The differences leave round-off of 1e-16 / pitch², so cells wholly inside or outside are set to 1 or 0.
     nearest, farthest = (centres.abs() - pitch / 2).clamp(min=0), centres.abs() + pitch / 2
     cover[torch.hypot(farthest[:, None], farthest) <= radius] = 1
     cover[torch.hypot(nearest[:, None], nearest) >= radius] = 0
@@ -203,10 +203,11 @@ def _disc(size: int, pitch: float, radius: float, edges: str) -> Tensor:
 
 
 def _disc_area_up_to(lines: Tensor, radius: float) -> Tensor:
-    """Return the area of the disc between the axes and each pair of lines (y, x), odd in both.
+    """Return the area of the disc within the rectangle from the centre to each crossing (y, x) of two lines.
 
-    In the first quadrant this is x y while the corner (x, y) lies within the disc. Beyond, it is the integral of
-    min(y, sqrt(r² - x²)): (x sqrt(r² - x²) + y sqrt(r² - y²) + r² (asin(x/r) + asin(y/r) - π/2)) / 2.
+    The area changes sign with y and with x. In the first quadrant it is x y while the corner (x, y) lies within the
+    disc. For a corner outside, it is the integral of min(y, sqrt(r² - x²)):
+    (x sqrt(r² - x²) + y sqrt(r² - y²) + r² (asin(x/r) + asin(y/r) - π/2)) / 2.
     """
     distance = lines.abs().clamp(max=radius)
     half_sector = distance * (radius**2 - distance**2).sqrt() + radius**2 * (distance / radius).asin()
@@ -225,11 +226,11 @@ def _polygon_contains_centres(size: int, pitch: float, sides: int, rotation: flo
 
 
 def _polygon_cover(lines: Tensor, corners: list[tuple[float, float]]) -> Tensor:
-    """Return the area of a simple polygon, corners in order of rising angle, in each cell between the lines.
+    """Return the area that a simple polygon covers in each cell; its corners come in order of increasing angle.
 
-    Green's theorem, cell by cell: the area is minus the integral of y dx around the polygon, with x and y clipped to
+    By Green's theorem the area in a cell is minus the integral of y dx around the polygon, with x and y clipped to
     the cell. A side is straight, so its clipped height is linear between the points where it crosses the cell's
-    lower and upper line, and the trapezoid rule over these points is exact.
+    lower and upper boundary, and the trapezoid rule over these points is exact.
     """
     left, right = lines[:-1], lines[1:]
     bottom, top = left[:, None], right[:, None]
@@ -237,12 +238,12 @@ def _polygon_cover(lines: Tensor, corners: list[tuple[float, float]]) -> Tensor:
     for (x0, y0), (x1, y1) in pairwise([*corners, corners[0]]):
         if x0 == x1:  # a vertical side has no dx
             continue
-        slope = (y1 - y0) / (x1 - x0)
+        gradient = (y1 - y0) / (x1 - x0)
         start, end = left.clamp(min=min(x0, x1)), right.clamp(max=max(x0, x1))
         end = torch.maximum(start, end)
-        crossings = [(x0 + (y - y0) / slope).clamp(start, end) for y in (bottom, top)] if slope else []
-        nodes = torch.broadcast_tensors(cover, start, *crossings, end)[1:]  # cover only lends its shape
+        crossings = [(x0 + (y - y0) / gradient).clamp(start, end) for y in (bottom, top)] if gradient else []
+        nodes = torch.broadcast_tensors(cover, start, *crossings, end)[1:]  # cover gives the shape only
         x = torch.stack(nodes).sort(dim=0).values
-        height = (y0 + slope * (x - x0)).clamp(bottom, top) - bottom
+        height = (y0 + gradient * (x - x0)).clamp(bottom, top) - bottom
         cover -= math.copysign(1, x1 - x0) * torch.trapezoid(height, x, dim=0)
     return cover

@@ -1,4 +1,4 @@
-"""Refractive indices n(λ): how much a phase mask's material delays light of each wavelength."""
+"""Materials of phase masks and lenses: refractive index n(λ) from published dispersion formulas."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ Terms = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Material:
-    """A transparent material with a published dispersion formula; plain data that can be hashed and pickled.
+    """A transparent material with a published dispersion formula. It is plain data that can be hashed and pickled.
 
     Args:
-        name: what the material is called.
-        source: who published the formula.
-        dispersion: index from a wavelength in micrometres, the unit of all published formulas, and ``terms``.
-        terms: the coefficients, in pairs as ``dispersion`` reads them.
-        valid: shortest and longest wavelength in metres that the source vouches for.
+        name: name of the material.
+        source: publication of the formula.
+        dispersion: function of a wavelength in micrometres (the unit of all published formulas) and ``terms`` that
+            returns the index.
+        terms: coefficients of the formula, in the pairs that ``dispersion`` expects.
+        valid: shortest and longest wavelength in metres for which the formula was published.
 
     Example:
         >>> round(FUSED_SILICA.index(530e-9), 5)
@@ -45,14 +46,14 @@ class Material:
             wavelength: in metres.
 
         Returns:
-            The index, no unit.
+            The index, without unit.
 
         Raises:
             ValueError: if the wavelength is not positive or outside the published range.
         """
         check_positive("wavelength", wavelength, "metres")
         shortest, longest = self.valid
-        slack = 1e-9  # 0.45 * 1e-6 and 450e-9 differ in the last place
+        slack = 1e-9  # 0.45 * 1e-6 and 450e-9 differ in the last digit
         if not shortest * (1 - slack) <= wavelength <= longest * (1 + slack):
             allowed = f"{shortest * 1e9:g} to {longest * 1e9:g} nm"
             raise ValueError(f"the index of {self.name} is published for {allowed}, got {wavelength * 1e9:g} nm")
@@ -63,15 +64,15 @@ def constant_index(index: float) -> Material:
     """Return a material without dispersion, the same index at every wavelength.
 
     Args:
-        index: refractive index, above 1 (at 1 no height of the material delays light).
+        index: refractive index, above 1 (material of index 1 does not delay light).
 
     Returns:
-        The material.
+        A material that is valid at every wavelength.
 
     Raises:
         ValueError: if the index is not finite and above 1.
 
-    Source: 1.5 for all colours is what Wu et al., PhaseCam3D, ICCP 2019, use.
+    Source: Wu et al., PhaseCam3D, ICCP 2019, take 1.5 for all colours.
 
     Example:
         >>> constant_index(1.5).index(470e-9)
@@ -83,19 +84,22 @@ def constant_index(index: float) -> Material:
 
 
 def cauchy_through(name: str, source: str, indices: tuple[tuple[float, float], ...]) -> Material:
-    r"""Return the material whose dispersion is Cauchy's equation through known indices.
+    r"""Return a material by interpolating known indices with Cauchy's dispersion equation.
 
     .. math:: n(\lambda) = \sum_j c_j \, \lambda^{-2j}, \qquad \text{as many terms as there are indices}
 
     Args:
-        name: what the material is called.
-        source: who measured or used the indices.
-        indices: pairs of a wavelength in metres and the index there; the material is known between the outer ones.
+        name: name of the material.
+        source: publication or data sheet of the indices.
+        indices: pairs of a wavelength in metres and the index there.
+
+    Returns:
+        A material that is valid between the shortest and the longest of these wavelengths.
 
     Raises:
-        ValueError: if there are fewer than two, or a wavelength comes twice.
+        ValueError: if there are fewer than two indices, or a wavelength is repeated.
 
-    Source: Cauchy (1836), the oldest formula of dispersion; Born and Wolf, Principles of Optics, section 2.3.4.
+    Source: Cauchy (1836); Born and Wolf, Principles of Optics, section 2.3.4.
 
     Example:
         >>> glass = cauchy_through("glass", "a data sheet", ((450e-9, 1.53), (650e-9, 1.51)))
@@ -133,7 +137,7 @@ FUSED_SILICA = Material(
     ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
     (210e-9, 3710e-9),
 )
-"""Fused silica (Malitson 1965): 1.46080 at 530 nm. Refuses what is beyond Malitson's own 0.21-3.71 µm."""
+"""Fused silica (Malitson 1965): 1.46080 at 530 nm. Valid over Malitson's own range, 0.21 to 3.71 µm."""
 
 PMMA = Material(
     "PMMA",
@@ -170,6 +174,6 @@ NOA61 = Material(
 )
 """Cured Norland Optical Adhesive 61 by its maker's equation: 1.56434 at 530 nm.
 
-Sources disagree: S. Joseph et al., ACS Applied Materials & Interfaces 12, 46519 (2020), give 1.498 at 530 nm for a
-film 1 µm thick. Ikoma et al., ICCP 2021, take the maker's.
+Sources disagree: S. Joseph et al., ACS Applied Materials & Interfaces 12, 46519 (2020), measured 1.498 at 530 nm in a
+film 1 µm thick. Ikoma et al., ICCP 2021, use the maker's equation.
 """

@@ -1,4 +1,4 @@
-"""Gauss-Legendre quadrature: points and weights for integrals over one cell, and how many of them are needed."""
+"""Gauss-Legendre quadrature: nodes and weights for integrals over one pupil cell, and the order that a phase needs."""
 
 from __future__ import annotations
 
@@ -10,17 +10,27 @@ from torch import Tensor
 
 
 def gauss_legendre_order(half_range: float, tolerance: float) -> int:
-    r"""Return how many Gauss-Legendre points integrate :math:`e^{i b t}` over [-1, 1] for every |b| <= half_range.
+    r"""Return the number of Gauss-Legendre points that integrate a linear phase over an interval within a tolerance.
+
+    The integrand is :math:`e^{i b t}` over t in [-1, 1], for every |b| <= half_range.
 
     Args:
-        half_range: largest phase b in radians from the middle of the interval to its edge.
-        tolerance: largest error allowed to the mean over the interval.
+        half_range: largest phase b in radians, from the middle of the interval to its edge.
+        tolerance: largest error allowed in the mean over the interval.
+
+    Returns:
+        The order of the quadrature. Above 32 it grows in steps of an eighth, so it may exceed the least sufficient one.
+
+    Raises:
+        ValueError: if ``half_range`` is NaN or infinite.
+
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, section 25.4.29.
 
     Example:
         >>> gauss_legendre_order(1.2, 1e-3), gauss_legendre_order(6.0, 1e-7)
         (3, 9)
     """
-    if not math.isfinite(half_range):  # no order is enough
+    if not math.isfinite(half_range):  # the search below would never end
         raise ValueError(f"a phase across an interval must be finite radians, got {half_range}")
     b = np.linspace(0, half_range, 33)
     exact = np.sinc(b / np.pi)
@@ -33,7 +43,14 @@ def gauss_legendre_order(half_range: float, tolerance: float) -> int:
 
 
 def gauss_legendre(order: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """Return nodes on [-1/2, 1/2] and weights that sum to one, (order,) float64 each.
+    """Return the Gauss-Legendre nodes on [-1/2, 1/2] and their weights, which sum to one.
+
+    Args:
+        order: number of nodes.
+        device: device of the result.
+
+    Returns:
+        Nodes and weights, (order,) float64 each.
 
     Example:
         >>> gauss_legendre(1)
@@ -48,6 +65,7 @@ def _gauss_legendre(order: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple((nodes / 2).tolist()), tuple((weights / 2).tolist())
 
 
-# What torch.compiler.assume_constant_result does, without the compiler it imports (2 s): NumPy is not traced through.
+# torch.compile cannot trace NumPy, so the results are marked as constants. torch.compiler.assume_constant_result sets
+# the same mark but imports the compiler, which takes 2 s.
 for _function in (gauss_legendre_order, _gauss_legendre):
     setattr(_function, "_dynamo_marked_constant", True)  # noqa: B010 (a function has no such attribute to a checker)

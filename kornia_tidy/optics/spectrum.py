@@ -1,4 +1,4 @@
-"""Wavelengths and channels: at which wavelengths PSFs are computed, and how much each counts in each colour channel."""
+"""Spectral sampling: the wavelengths at which PSFs are computed, and their weights in each colour channel."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ from kornia_tidy.checks import check_choice
 REFERENCE_WAVELENGTH = 530e-9  # m; defocus and mask phase are quoted at this wavelength throughout
 
 SHORTEST, LONGEST = 100e-9, 20e-6  # m; from vacuum ultraviolet to thermal infrared
-VISIBLE = (400e-9, 700e-9)  # m; what a camera's filters let through
+VISIBLE = (400e-9, 700e-9)  # m; passband of a camera's filters
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    r"""Wavelength samples shared by all channels, and their weights; plain data that can be hashed and pickled.
+    r"""Wavelength samples shared by all channels, and their weights. It is plain data that can be hashed and pickled.
+
+    The PSF of channel c is the weighted mean of the PSFs at the wavelengths:
 
     .. math:: h_c = \sum_\lambda w_{c\lambda} h_\lambda \Big/ \sum_\lambda w_{c\lambda}
 
     Args:
         wavelengths: the W samples in metres.
-        weights: C rows of W numbers, each the response of channel c at a wavelength, in any common unit.
-        basis: C rows of W numbers, the reflectance that stands for a scene's colour in each channel, or None for
-            scenes whose colours all reflect flatly within a channel. See :func:`smoothest_reflectances`.
+        weights: C rows of W numbers, the response of channel c at each wavelength, in any common unit.
+        basis: C rows of W numbers, the reflectance spectrum of a scene point with the value 1 in one channel and 0 in
+            the others. None: every scene point reflects all wavelengths of a channel equally. See
+            :func:`smoothest_reflectances`.
 
     Raises:
-        ValueError: if a wavelength is not between 100 nm and 20 µm, a weight is negative or not finite, a row has
-            another length than ``wavelengths``, a channel sees no light, or the basis does not give each channel its
-            own colour.
+        ValueError: if a wavelength is not between 100 nm and 20 µm, a weight is negative or not finite, a row is not
+            as long as ``wavelengths``, all weights of a channel are zero, or a basis spectrum does not have the value
+            1 in its own channel and 0 in the others.
 
     Example:
         >>> Spectrum((500e-9, 600e-9), ((1, 3),)).channel_weights
@@ -72,9 +75,9 @@ class Spectrum:
             shape = (len(self.weights), len(self.wavelengths))
             if (len(self.basis), *{len(row) for row in self.basis}) != shape:
                 raise ValueError(f"basis must have shape {shape} as the weights have, got {np.shape(self.basis)}")
-            seen = np.array(self.channel_weights) @ np.array(self.basis).T
-            if not np.allclose(seen, np.eye(shape[0]), rtol=0, atol=1e-6):
-                raise ValueError(f"basis must be seen as 1 by its own channel and as 0 by others, got {seen.tolist()}")
+            values = np.array(self.channel_weights) @ np.array(self.basis).T
+            if not np.allclose(values, np.eye(shape[0]), rtol=0, atol=1e-6):
+                raise ValueError(f"basis must give 1 in its own channel and 0 in the others, got {values.tolist()}")
 
     @property
     def channel_weights(self) -> tuple[tuple[float, ...], ...]:
@@ -83,22 +86,23 @@ class Spectrum:
 
     @property
     def plane_weights(self) -> tuple[tuple[float, ...], ...]:
-        r"""Weights of the PSFs that a scene needs: :math:`h_{cb} = \sum_\lambda w_{c\lambda} R_{b\lambda} h_\lambda`.
+        r"""Wavelength weights of the PSF planes that rendering needs, (C B, W), ordered by channel, then by basis.
 
-        (C B, W), ordered by channel, then by basis; without a basis those of the channels, (C, W).
+        The PSF of channel c and basis spectrum b is :math:`h_{cb} = \sum_\lambda w_{c\lambda} R_{b\lambda} h_\lambda`.
+        Without a basis these are the channel weights, (C, W).
         """
         rows = self.channel_weights
         if self.basis is None:
             return rows
-        return tuple(tuple(w * r for w, r in zip(row, own, strict=True)) for row in rows for own in self.basis)
+        return tuple(tuple(w * r for w, r in zip(row, basis, strict=True)) for row in rows for basis in self.basis)
 
     def flat(self) -> Spectrum:
-        """Return the spectrum for a scene that reflects all wavelengths alike: the same without a basis."""
+        """Return this spectrum without its reflectance basis, for scenes that reflect all wavelengths equally."""
         return Spectrum(self.wavelengths, self.weights)
 
     @classmethod
     def rgb(cls) -> Spectrum:
-        """Return one wavelength a channel: 610, 530 and 470 nm for red, green and blue.
+        """Return the spectrum of the papers, one wavelength a channel: 610, 530 and 470 nm for red, green and blue.
 
         Source: Wu et al., PhaseCam3D, ICCP 2019; Shah et al., TiDy-PSFs, ICCV 2023.
 
@@ -117,35 +121,36 @@ class Spectrum:
 def camera_spectrum(
     camera: str = "Nikon 5100 (NPL)", illuminant: str = "D65", samples: int = 7, reflectance: bool = False
 ) -> Spectrum:
-    r"""Return the channels of a real camera under a light, sampled over 400-700 nm.
+    r"""Return the spectral weights of a real camera under an illuminant, sampled over 400-700 nm.
 
-    The range is cut into equal slices S. Each sample is the middle of a slice and stands for all light in it:
+    The range is cut into equal slices S. Each sample lies in the middle of a slice and carries the mean over it:
 
     .. math:: w_{ci} = \frac{1}{|S_i|} \int_{S_i} s_c(\lambda)\, E(\lambda)\, d\lambda
 
-    with the measured sensitivity s and the illuminant E. Narrow lamp lines count wherever they fall.
+    with the measured sensitivity s and the illuminant E. So narrow lamp lines between the samples are counted too.
 
     Args:
         camera: name of a camera in colour-science, "Nikon 5100 (NPL)" or "Sigma SDMerill (NPL)".
         illuminant: name of an illuminant in colour-science, such as "D65", "A" or "FL2".
         samples: number of wavelengths W. For the Nikon, D65 and a flat mask, 7 give the on-axis PSF to 1.3 % on
-            average over defocus from -20 to 20 rad, 16 to 0.24 %.
-        reflectance: let each colour of a scene have a reflectance spectrum, see :func:`smoothest_reflectances`, and so
-            PSFs of its own. On a real scene (Aloe, five random masks, captures with values in [0, 1]) it changes the
-            capture by 3.5e-4 root mean square with windows of 23 px and by 7.6e-4 with 65 px, as much as these
-            wavelengths do against ``Spectrum.rgb()``; rendering, of nine planes for three, takes 2.3 to 3.1 times.
+            average over defocus from -20 to 20 rad, and 16 give it to 0.24 %.
+        reflectance: give each colour of a scene a reflectance spectrum (:func:`smoothest_reflectances`), and so PSFs
+            of its own. On a real scene (Aloe, five random masks, captures with values in [0, 1]) this changes the
+            capture by 3.5e-4 root mean square with windows of 23 px and by 7.6e-4 with 65 px. The change from
+            ``Spectrum.rgb()`` to these wavelengths is as large. Rendering takes 2.3 to 3.1 times as long, because it
+            has nine PSF planes instead of three.
 
     Returns:
         W wavelengths shared by the channels red, green and blue; weights in the illuminant's unit.
 
     Raises:
-        ValueError: if the camera or illuminant is unknown (the message lists those there are), or ``samples`` < 1, or
-            < 3 with ``reflectance``.
+        ValueError: if the camera or illuminant is unknown (the message lists the known ones), or ``samples`` is below
+            1, or below 3 with ``reflectance``.
 
     Convention:
-        A sensitivity counts as zero beyond the range in which it was measured (Sigma: 400-680 nm).
+        - A sensitivity is zero beyond the range in which it was measured (Sigma: 400-680 nm).
 
-    Source: Darrodi et al., J. Opt. Soc. Am. A 32, 381 (2015), and CIE illuminants, as carried by colour-science.
+    Source: Darrodi et al., J. Opt. Soc. Am. A 32, 381 (2015), and CIE illuminants, from the tables of colour-science.
 
     Example:
         >>> spectrum = camera_spectrum(samples=3)
@@ -161,7 +166,7 @@ def camera_spectrum(
     grid = _slice_middles(int(samples) * steps)
     with warnings.catch_warnings(), np.printoptions():  # importing colour warns, and sets NumPy's print options
         warnings.simplefilter("ignore")
-        import colour  # noqa: PLC0415  (two seconds: only who asks for a camera waits for it)
+        import colour  # noqa: PLC0415  (takes two seconds, which only this function needs)
 
         check_choice("camera", camera, list(colour.MSDS_CAMERA_SENSITIVITIES))
         check_choice("illuminant", illuminant, list(colour.SDS_ILLUMINANTS))
@@ -177,20 +182,20 @@ def camera_spectrum(
 
 
 def smoothest_reflectances(channel_weights: np.ndarray) -> np.ndarray:
-    r"""Return the smoothest reflectance spectra that a camera sees as pure red, green and blue.
+    r"""Return the smoothest reflectance spectra that a camera records as pure red, green and blue.
 
     .. math:: R_b = \arg\min_R \sum_i (R_{i+1} - R_i)^2 \quad \text{with} \quad \sum_i w_{ci} R_i = \delta_{cb}
 
-    The colour (r, g, b) then stands for the reflectance r R_r + g R_g + b R_b, the smoothest one of that colour; grey
-    is flat. Channels overlap, so no surface is as saturated as a pure one: R dips below zero. In the Aloe scene, with
-    its sRGB taken for the camera's colours, 3 % of the pixels' values over wavelengths do. Colours come back whatever
-    they are.
+    A scene point of colour (r, g, b) is given the reflectance r R_r + g R_g + b R_b, the smoothest one of that colour.
+    Grey gets a flat spectrum. The channels overlap, so no real surface is as saturated as a pure channel, and R is
+    negative at some wavelengths. In the Aloe scene, with its sRGB taken for the camera's colours, 3 % of all values
+    over pixels and wavelengths are negative. The camera's colours are reproduced exactly all the same.
 
     Args:
         channel_weights: w, (C, W), rows that add up to one, on an even grid of wavelengths.
 
     Returns:
-        (C, W), which adds up to one at each wavelength.
+        C reflectance spectra, (C, W). They add up to one at each wavelength.
 
     Raises:
         ValueError: if there are fewer wavelengths than channels.
@@ -206,15 +211,16 @@ def smoothest_reflectances(channel_weights: np.ndarray) -> np.ndarray:
     channels, samples = channel_weights.shape
     if samples < channels:
         raise ValueError(f"samples must be at least {channels} for reflectances of {channels} channels, got {samples}")
-    slope = np.diff(np.eye(samples), axis=0)
-    # The least square under equality constraints, by Lagrange's multipliers.
-    system = np.block([[slope.T @ slope, channel_weights.T], [channel_weights, np.zeros((channels, channels))]])
+    difference = np.diff(np.eye(samples), axis=0)
+    # Least squares under equality constraints, by Lagrange multipliers.
+    smoothness = difference.T @ difference
+    system = np.block([[smoothness, channel_weights.T], [channel_weights, np.zeros((channels, channels))]])
     target = np.concatenate([np.zeros((samples, channels)), np.eye(channels)])
     return np.linalg.solve(system, target)[:samples].T
 
 
 def _slice_middles(count: int) -> np.ndarray:
-    """Return the middles, in metres, of equal slices of the visible range."""
+    """Return the middles of equal slices of the visible range, in metres."""
     shortest, longest = VISIBLE
     return shortest + (np.arange(count) + 0.5) * (longest - shortest) / count
 

@@ -1,4 +1,4 @@
-"""Depth to defocus: where a scene point comes to focus, written as phase at the edge of the pupil."""
+"""Thin-lens camera: depth to defocus, the quadratic phase of a scene point at the edge of the pupil."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from kornia_tidy.checks import check_depth, check_metres, check_number, check_pa
 from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
-FASTEST = 0.5  # f-number of a numerical aperture of 1: no lens in air opens wider
-# Lengths in metres, from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
+FASTEST = 0.5  # f-number at a numerical aperture of 1, the limit of a lens in air
+# Limits in metres: from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
 FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
 
 
@@ -25,7 +25,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     Args:
         depth: distance to the scene in metres, any shape; ``inf`` is allowed and exact.
         aperture_radius: pupil radius R in metres.
-        focus_distance: distance z_f in metres that is imaged sharply; may be ``inf``.
+        focus_distance: distance z_f in metres that is in focus; may be ``inf``.
 
     Returns:
         Defocus in radians at 530 nm, same shape and dtype as ``depth``.
@@ -33,7 +33,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     Convention:
         - Positive is nearer than focus. At another wavelength multiply by 530 nm / wavelength.
         - The phase over the pupil is defocus * rho**2, with rho = 1 at the edge.
-        - Depths are not checked here: :meth:`ThinLensCamera.defocus` does.
+        - Depths are not checked here. :meth:`ThinLensCamera.defocus` checks them.
 
     Source: Goodman, Introduction to Fourier Optics, section 6.4.
 
@@ -43,7 +43,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
         tensor([ 20.0200, -20.0200])
     """
     scale = math.pi * aperture_radius**2 / REFERENCE_WAVELENGTH
-    # Inverse depth: infinity is a plain zero.
+    # Infinite depth has an inverse of exactly zero.
     return (scale * (_at_least_float32(depth).reciprocal() - 1 / _at_least_float32(focus_distance))).to(depth.dtype)
 
 
@@ -66,30 +66,32 @@ def _at_least_float32(value: Tensor) -> Tensor: ...
 @overload
 def _at_least_float32(value: float | Tensor) -> float | Tensor: ...
 def _at_least_float32(value: float | Tensor) -> float | Tensor:
-    """Half precision would move the focus by a thousandth, which is up to a twentieth of a radian."""
+    """Cast half precision to float32: its rounding would shift the defocus by up to a twentieth of a radian."""
     return value.to(torch.promote_types(value.dtype, torch.float32)) if isinstance(value, Tensor) else value
 
 
 class ThinLensCamera(nn.Module):
-    r"""A thin lens in front of a sensor: turns metric depth into defocus, and says how finely the sensor samples.
+    r"""A thin lens in front of a sensor: converts metric depth to defocus and sets the sampling of the PSFs.
 
     Args:
         focal_length: in metres.
         aperture_diameter: diameter of the pupil in metres.
-        focus_distance: distance imaged sharply, in metres; ``inf`` is allowed. A float stays fixed; a tensor becomes
-            a learnable parameter (and a capture no longer compiles to a single graph, as its sampling follows it).
+        focus_distance: distance in focus, in metres; ``inf`` is allowed. A float stays fixed. A tensor becomes a
+            learnable parameter; then the PSF sampling changes with it, and a capture no longer compiles to a single
+            graph.
         pixel_pitch: distance between the sensor's pixels in metres.
-        depth_range: nearest and farthest depth in metres that the PSFs are prepared for. Default: from half the focus
-            distance to infinity, which is symmetric in defocus.
-        lens_material: glass of a lens of a single element, whose focus then differs from colour to colour; the focal
-            length is that at 530 nm. Default: a lens corrected for colour.
+        depth_range: nearest and farthest depth in metres that the PSFs cover. Default: from half the focus distance to
+            infinity, which is symmetric in defocus.
+        lens_material: glass of a single-element lens, which has chromatic aberration; ``focal_length`` is then the one
+            at 530 nm. Default: a lens corrected for colour.
 
     Shape:
         - ``defocus(depth)``: any shape to the same shape.
 
     Raises:
-        ValueError: if a length is not one in metres (focal length 0.01 mm to 10 m, pixels 0.1 um to 1 mm), the lens is
-            faster than f/0.5, or the focus distance is not beyond the focal length.
+        ValueError: if a length is out of range (focal length 0.01 mm to 10 m, aperture 1 um to 10 m, pixels 0.1 um to
+            1 mm), the lens is faster than f/0.5, the focus distance is not beyond the focal length, ``depth_range`` is
+            empty, or it is missing for a focus at infinity.
         TypeError: if an argument is of another type.
 
     Convention:
@@ -145,7 +147,7 @@ class ThinLensCamera(nn.Module):
         near, far = _depth_range(depth_range) if depth_range is not None else (focus / 2, math.inf)
         self.depth_range = (near, far)
         scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
-        # Kept as numbers: the nodes of a PSF bank stay where they are while a learnable focus moves.
+        # Plain numbers, so that the defocus nodes of a PSF bank do not move with a learnable focus.
         self.defocus_range = (scale * (1 / far - 1 / focus), scale * (1 / near - 1 / focus))
 
     @property
@@ -160,13 +162,13 @@ class ThinLensCamera(nn.Module):
 
     @property
     def image_distance(self) -> float | Tensor:
-        """Distance from the lens to the sensor in metres, at which the focus distance is sharp."""
+        """Distance s' from the lens to the sensor in metres, 1 / (1/f - 1/z_f)."""
         return 1 / (1 / self.focal_length - 1 / _at_least_float32(self.focus_distance))
 
     def chromatic_defocus(self, wavelength: float) -> float:
-        r"""Return the defocus that a wavelength has more than 530 nm has, whatever the depth.
+        r"""Return the chromatic focal shift: defocus at a wavelength minus defocus at 530 nm, the same at every depth.
 
-        The power of a single element goes as its index less one, so
+        The optical power of a single element is proportional to its index minus one, so
 
         .. math:: \Delta\psi(\lambda) = \frac{\pi R^2}{\lambda_0} \left( \frac{1}{f} - \frac{1}{f(\lambda)} \right),
             \qquad f(\lambda) = f \, \frac{n(\lambda_0) - 1}{n(\lambda) - 1}
@@ -175,11 +177,11 @@ class ThinLensCamera(nn.Module):
             wavelength: in metres.
 
         Returns:
-            Radians at 530 nm, like all defocus; 0 for a lens corrected for colour. Blue, focused nearer to the lens,
-            has less.
+            Radians at 530 nm, as all defocus; 0 for a lens corrected for colour. It is negative for blue, which
+            focuses nearer to the lens.
 
         Source: Goodman, Introduction to Fourier Optics, section 5.1 (lensmaker's equation); Chang and Wetzstein, ICCV
-        2019, for chromatic aberration as a code of depth.
+        2019, for chromatic aberration as a depth cue.
 
         Example:
             >>> from kornia_tidy.optics.materials import PMMA
@@ -197,7 +199,10 @@ class ThinLensCamera(nn.Module):
 
         Args:
             depth: metres, any shape; ``inf`` is allowed.
-            check_inputs: look at the values first and refuse NaN, zero and negative depths.
+            check_inputs: refuse NaN, zero and negative depths.
+
+        Returns:
+            Radians, same shape and dtype.
 
         Raises:
             ValueError: if a depth is NaN or not positive.
@@ -207,17 +212,17 @@ class ThinLensCamera(nn.Module):
         return thin_lens_defocus(depth, self.aperture_radius, self.focus_distance)
 
     def depth(self, defocus: Tensor) -> Tensor:
-        r"""Return the depth that has a defocus: the inverse of :meth:`defocus`.
+        r"""Return the depth map of a defocus map, the inverse of :meth:`defocus`.
 
         .. math:: 1 / z = 1 / z_{far} + (\psi - \psi_{far}) \, \lambda_0 / (\pi R^2)
 
-        Counted from the far end of the range, so that the defocus of infinity is exactly infinitely far.
+        The formula starts at the far end of the range, so that the defocus of infinity gives ``inf`` exactly.
 
         Args:
             defocus: radians, any shape.
 
         Returns:
-            Metres, same shape and dtype; ``inf`` for the defocus of infinity, and for less, which no depth has.
+            Metres, same shape and dtype; ``inf`` for the defocus of infinity and for any lower value.
 
         Example:
             >>> import torch
@@ -227,13 +232,16 @@ class ThinLensCamera(nn.Module):
         """
         scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
         inverse = 1 / self.depth_range[1] + (_at_least_float32(defocus) - self.defocus_range[0]) / scale
-        if isinstance(self.focus_distance, Tensor):  # it may have moved since the range was chosen
-            here = thin_lens_defocus(inverse.new_tensor(self.depth_range[1]), self.aperture_radius, self.focus_distance)
-            inverse = inverse + (self.defocus_range[0] - here) / scale
+        if isinstance(self.focus_distance, Tensor):  # a learnable focus may have moved since the range was computed
+            far = inverse.new_tensor(self.depth_range[1])
+            inverse = inverse + (self.defocus_range[0] - self.defocus(far, check_inputs=False)) / scale
         return inverse.clamp(min=0).reciprocal().to(defocus.dtype)
 
     def resized(self, scale: float) -> ThinLensCamera:
-        """Return this camera for images resized by ``scale`` (0.5 halves their sides), so that PSFs keep their size.
+        """Return this camera for images resized by ``scale``: the pixel pitch changes, so PSFs keep their metric size.
+
+        Args:
+            scale: new image side over old, positive; 0.5 halves the sides and doubles the pitch.
 
         Example:
             >>> ThinLensCamera(pixel_pitch=8e-6).resized(0.5).pixel_pitch
@@ -259,9 +267,9 @@ class ThinLensCamera(nn.Module):
         pixel_pitch: float = 8e-6,
         lens_material: Material | None = None,
     ) -> ThinLensCamera:
-        r"""Choose focus and aperture so that a range of depths fills a range of defocus.
+        r"""Return the camera whose focus and aperture map a range of depths onto a range of defocus.
 
-        Two equations, :math:`\psi(z_{far}) = \psi_{lo}` and :math:`\psi(z_{near}) = \psi_{hi}`, give R and z_f.
+        Two equations, :math:`\psi(z_{far}) = \psi_{lo}` and :math:`\psi(z_{near}) = \psi_{hi}`, determine R and z_f.
 
         Args:
             depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
@@ -271,7 +279,7 @@ class ThinLensCamera(nn.Module):
             lens_material: glass of a single element. Default: a lens corrected for colour.
 
         Raises:
-            ValueError: if a range is empty, or no lens of this focal length can do it.
+            ValueError: if a range is empty, or the lens would be faster than f/0.5.
 
         Example:
             >>> import torch
@@ -296,7 +304,7 @@ class ThinLensCamera(nn.Module):
         return cls(focal_length, 2 * radius, focus, pixel_pitch, depth_range, lens_material)
 
     def extra_repr(self) -> str:
-        """Describe the lens in a person's words."""
+        """Return a one-line description of the lens."""
         near, far = self.depth_range
         lo, hi = self.defocus_range
         return (
@@ -307,14 +315,14 @@ class ThinLensCamera(nn.Module):
 
 
 class DefocusRange(nn.Module):
-    r"""Depth that already is a normalised disparity: maps [0, 1] linearly to a range of defocus.
+    r"""A camera for depth maps that hold normalised disparity: maps [0, 1] linearly to a range of defocus.
 
-    The data of the paper come so. The lens behind it is only needed for the size of the PSF on the sensor.
+    The paper's data set has such maps. The lens only sets the size of the PSF on the sensor.
 
     Args:
-        lo: defocus in radians that a value of 0 means.
-        hi: defocus in radians that a value of 1 means.
-        lens: aperture, image distance and pixel pitch for the PSFs. Default: :class:`ThinLensCamera`.
+        lo: defocus in radians at a disparity of 0.
+        hi: defocus in radians at a disparity of 1.
+        lens: aperture, image distance and pixel pitch of the PSFs. Default: :class:`ThinLensCamera`.
 
     Raises:
         ValueError: if ``lo`` is not below ``hi``.
@@ -355,11 +363,15 @@ class DefocusRange(nn.Module):
         return self.lens.pixel_pitch
 
     def chromatic_defocus(self, wavelength: float) -> float:
-        """Return the defocus that a wavelength has more than 530 nm has. See :class:`ThinLensCamera`."""
+        """Return the chromatic focal shift of the lens. See :meth:`ThinLensCamera.chromatic_defocus`."""
         return self.lens.chromatic_defocus(wavelength)
 
     def defocus(self, depth: Tensor, check_inputs: bool = True) -> Tensor:
         """Return the defocus map of a normalised disparity map.
+
+        Args:
+            depth: normalised disparity in [0, 1], any shape; the result has the same shape and dtype.
+            check_inputs: refuse NaN and values outside [0, 1].
 
         Raises:
             ValueError: if a value is NaN or outside [0, 1].
@@ -369,17 +381,17 @@ class DefocusRange(nn.Module):
             if not bool((lowest >= 0) & (highest <= 1)):  # False for NaN too
                 bad = depth[~((depth >= 0) & (depth <= 1))][0].item()
                 raise ValueError(
-                    f"depth of a DefocusRange is a normalised disparity in [0, 1], got {bad}: metres need a "
+                    f"depth of a DefocusRange must be a normalised disparity in [0, 1], got {bad}: metres need a "
                     f"ThinLensCamera"
                 )
         lo, hi = self.defocus_range
         return (lo + (hi - lo) * _at_least_float32(depth)).to(depth.dtype)
 
     def resized(self, scale: float) -> DefocusRange:
-        """Return this camera for images resized by ``scale``, so that PSFs keep their size in the scene."""
+        """Return this camera for images resized by ``scale``. See :meth:`ThinLensCamera.resized`."""
         return DefocusRange(*self.defocus_range, lens=self.lens.resized(scale))
 
     def extra_repr(self) -> str:
-        """Describe the range in a person's words."""
+        """Return a one-line description of the range."""
         lo, hi = self.defocus_range
         return f"normalised disparity 0 to 1 means psi {lo:+.4g} to {hi:+.4g} rad"

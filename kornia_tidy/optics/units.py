@@ -1,4 +1,4 @@
-"""Values in a wrong unit: what was probably meant, and the remedy in the same sentence."""
+"""Checks of units and value ranges: a message names the unit that was probably meant and the conversion."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ from kornia_tidy.runtime.threads import CaptureNotes
 if TYPE_CHECKING:
     from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 
-# Noise and interpolation go a little beyond [0, 1], and no encoding of light beyond white goes above 2.39 (scRGB).
-# An image normalised by ImageNet's statistics reaches -2.12 and 2.64, one in 8 bits 255.
+# Noise and interpolation go a little beyond [0, 1], and no encoding of highlights goes above 2.39 (scRGB).
+# An image normalised by ImageNet's statistics spans -2.12 to 2.64, and an 8-bit image reaches 255.
 BRIGHTEST_CODE, NONSENSE_CODE, DARKEST_CODE = 2.5, 16.0, -0.5
-DARKEST_LIGHT = -1.0  # colours that no display has are below zero in linear light
+DARKEST_LIGHT = -1.0  # out-of-gamut colours are negative in linear light
 LARGEST_LIGHT = 1e30  # sums over a PSF and over a tile stay finite in float32
-SAME_FOCUS = 0.5  # radians at the pupil's edge, which take 2 % of the peak of a point (1 - psi^2 / 12): not to be seen
-FARTHEST = 1e5  # m; beyond, a pixel is sky, which no map in millimetres holds
+SAME_FOCUS = 0.5  # rad; lowers the peak of a PSF by only 2 % (1 - psi^2 / 12), so two depths look equally sharp
+FARTHEST = 1e5  # m; a farther pixel is sky, whose value no depth map in millimetres reaches
 UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"))
 
-_NOTES = CaptureNotes()  # of what is told once a process
+_NOTES = CaptureNotes()  # warnings that were given in this process
 
 
 def tell_once(notes: CaptureNotes | None, key: Hashable, sentence: str, stacklevel: int = 3) -> None:
-    """Warn, unless the same was warned of before; threads that ask at once hear it once.
+    """Give a warning the first time that its key occurs. It is safe to call from several threads.
 
     Args:
-        notes: of the camera that warns; None for what is told once a process.
-        key: what the warning is about.
-        sentence: the warning.
-        stacklevel: of the caller to blame, as for ``warnings.warn``.
+        notes: keys that were warned of before, kept by a camera. None: those of the whole process.
+        key: identifies the warning.
+        sentence: text of the warning.
+        stacklevel: as for ``warnings.warn``.
     """
     if (_NOTES if notes is None else notes).first_time(key):
         warnings.warn(sentence, stacklevel=stacklevel)
 
 
 def check_image(image: Tensor, encoded: bool) -> str | None:
-    """Refuse images without sense and return a sentence on those that probably are in another unit. One pass.
+    """Check an image's range of values: raise for impossible ones and return a warning for improbable ones.
 
     Args:
-        image: of any shape.
-        encoded: whether 1 is white (sRGB codes), or light that may go beyond 1.
+        image: of any shape. Its values are read once.
+        encoded: whether the values are sRGB codes, with white at 1, or linear light, which may exceed 1.
 
     Returns:
-        What is to be told, or None.
+        A warning for values that probably are in another unit or normalised, or None.
 
     Raises:
-        ValueError: if a value is NaN or infinite, a code is above 16, or light beyond 1e30.
+        ValueError: if a value is NaN or infinite, a code is above 16, or light is beyond 1e30.
 
     Example:
         >>> check_image(torch.tensor([0.0, 1.0]), encoded=True) is None
@@ -80,12 +80,15 @@ or give linear light with color_space='linear'
 
 
 def normalised(lowest: float, highest: float, darkest: float) -> str | None:
-    """Return a sentence on an image whose extremes are those of a normalised one, else None, for NaN too.
+    """Return a warning if the extremes of an image are those of one normalised by mean and deviation.
 
     Args:
         lowest: least value.
         highest: greatest value.
-        darkest: how far below zero values may be, and a tenth of the greatest in any case.
+        darkest: least value that raises no warning. Nor does any value above minus a tenth of ``highest``.
+
+    Returns:
+        The warning, or None. A NaN gives None.
     """
     if not lowest < darkest or -lowest < 0.1 * highest:
         return None
@@ -96,7 +99,7 @@ def normalised(lowest: float, highest: float, darkest: float) -> str | None:
 
 
 def check_head_image(image: Tensor) -> str | None:
-    """Return a sentence on a network's input that is in 0..255 or normalised, else None."""
+    """Return a warning if a network's input is in 0..255 or normalised by mean and deviation, else None."""
     if not image.numel():
         return None
     lowest, highest = (float(end) for end in torch.aminmax(image.detach()))
@@ -106,15 +109,19 @@ def check_head_image(image: Tensor) -> str | None:
 
 
 def misread_depth(camera: ThinLensCamera | DefocusRange, lowest: Tensor, highest: Tensor) -> str | None:
-    """Return a sentence on depths that look like millimetres or centimetres taken for metres, else None.
+    """Return a warning if depths are probably in millimetres or centimetres instead of metres.
 
-    Told where the nearest pixel is too far for the camera to tell it from infinity or from the far end of its range,
-    where no pixel is at infinity, as sky is, and where the nearest depth would suit the camera in the other unit.
+    Three conditions must hold. The nearest pixel is so far that its focus equals that of infinity or of the far end of
+    the camera's range. No pixel is at infinity, as sky is. In the other unit the nearest depth lies in the camera's
+    range.
 
     Args:
-        camera: turns depth into defocus.
+        camera: converts depth to defocus.
         lowest: defocus of the farthest pixel in radians.
-        highest: defocus of the nearest pixel.
+        highest: defocus of the nearest pixel in radians.
+
+    Returns:
+        The warning, or None.
 
     Example:
         >>> from kornia_tidy import ThinLensCamera
@@ -130,27 +137,30 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
     lens = cast("ThinLensCamera", camera)
     nearest, farthest = (float(lens.depth(psi).detach()) for psi in (highest, lowest))
     first, last = lens.depth_range
-    alike = math.pi * lens.aperture_radius**2 / 530e-9 / SAME_FOCUS  # from here on all is as at infinity
-    last = min(last, alike)
+    like_infinity = math.pi * lens.aperture_radius**2 / 530e-9 / SAME_FOCUS  # m; beyond, all depths have one focus
+    last = min(last, like_infinity)
     if nearest <= last or farthest > FARTHEST:
         return None
     for factor, unit in UNITS:
         if first <= nearest * factor <= last:
+            limit = "infinity" if last == like_infinity else f"{last:.3g} m"
             return (
-                f"the nearest pixel is {nearest:.4g} m away, where this camera sees no difference from "
-                f"{'infinity' if last == alike else f'{last:.3g} m'}: are these {unit}? Multiply depth by {factor:g} "
-                f"(on the command line: --depth-scale {factor:g})"
+                f"the nearest pixel is {nearest:.4g} m away, where this camera sees no difference from {limit}: are "
+                f"these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"
             )
     return None
 
 
 def layout_remedy(shape: tuple[int, ...], channels: int, name: str = "image") -> str:
-    """Return how to lay out a tensor whose channels are wrong, to be put behind a message; empty where nobody knows.
+    """Return the indexing or permutation that gives a tensor the expected channels, as the end of an error message.
 
     Args:
-        shape: (B, C, H, W) or (C, H, W), as it was given.
-        channels: that are wanted.
-        name: of the tensor.
+        shape: (B, C, H, W) or (C, H, W), the shape that was given.
+        channels: the expected number of channels.
+        name: name of the tensor in the message.
+
+    Returns:
+        The remedy, or an empty string if none is known.
 
     Example:
         >>> layout_remedy((1, 4, 8, 8), 3)

@@ -1,7 +1,7 @@
-"""The cheapest fidelity that captures a scene within an error, found without capturing it.
+"""Planning: choice of the cheapest fidelity within an error tolerance, predicted without rendering.
 
 A camera, a scene and a tolerance come in; a plan with its predicted error, time and memory goes out. Read
-``planner.py`` first; the error model stands in ``error_model.py``.
+``planner.py`` first; the error model is in ``error_model.py``.
 """
 
 from kornia_tidy.planning.planner import Planner

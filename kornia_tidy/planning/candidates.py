@@ -1,4 +1,4 @@
-"""What a plan chooses from: the reference, and every economy that may be made on it."""
+"""Candidates of a plan: the reference, and its cheaper variants in layers, windows, wavelengths and precision."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ LAYER_SPACINGS = {
     "bandlimited": (2.0, 1.0),
 }
 PIXEL_TOLERANCES = (1e-1, 2e-2, 1e-3, 1e-6)
-WINDOW_STRAY_LIGHT = ("veil", "renormalize")  # the veil is nearer unless the window is narrow, or one side bright
-RATIO = 1.2  # between a window or a number of wavelengths that is tried and the next
+WINDOW_STRAY_LIGHT = (
+    "veil",
+    "renormalize",
+)  # the better one depends on window and image
+RATIO = 1.2  # between successive candidates of the window and of the number of wavelengths
 
 
 def layer_kinds() -> Iterator[Fidelity]:
@@ -27,7 +30,7 @@ def layer_kinds() -> Iterator[Fidelity]:
 
 
 def window_ladder(largest: int) -> tuple[int, ...]:
-    """Return the windows that are tried, ascending: each about a fifth narrower than the next.
+    """Return the candidate window sides, ascending, each about a fifth narrower than the next.
 
     Example:
         >>> window_ladder(41)
@@ -40,7 +43,7 @@ def window_ladder(largest: int) -> tuple[int, ...]:
 
 
 def wavelength_ladder(fewest: int, all_of_them: int) -> tuple[int, ...]:
-    """Return the numbers of wavelengths that are tried where there may be fewer than all, ascending.
+    """Return the candidate numbers of wavelengths, ascending, below the number of the spectrum.
 
     Example:
         >>> wavelength_ladder(1, 31)

@@ -1,13 +1,14 @@
-r"""Where in depth the light of a scene varies, octave by octave.
+r"""Distribution of a scene's power over depth and spatial frequency, in bins of defocus and octaves.
 
-A texture and the dark around it may lie at different depths, so the power of an image says little of what one PSF makes
-of it. Here it is told apart twice. Box averages over cells of :math:`2^j` pixels split it into octaves: what is lost
-from one level to the next, :math:`m_j^2 - m_{j+1}^2` summed over cells, is the power that passes
+A texture and the dark area around it may lie at different depths, so the power of the whole image does not determine
+the power blurred by one PSF. The power is therefore split by octave and by depth. Box averages over cells of
+:math:`2^j` pixels split it into octaves: the difference between two levels, :math:`m_j^2 - m_{j+1}^2` summed over
+cells, is the power after the filter
 
 .. math:: K_j(f) = B_j(f) - B_{j+1}(f), \qquad B_j(f) = \prod_{x, y} \frac{\sin^2(\pi 2^j f)}{4^j \sin^2(\pi f)}
 
-on average over where the cells begin; :math:`K_j \ge 0`, and with the last average they sum to one. And as the averages
-stay in place, the power of each octave is given to the depths where it is.
+averaged over the positions of the cells. All :math:`K_j \ge 0`, and together with the last average they sum to one. The
+averages are local, so the power of each octave can be assigned to the depths of the cells.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-LEVELS = 5  # octaves told apart: from 2 px to 32; slower ones stand together
-REACHES = (1, 3, 9)  # cells around, over which light is taken to spread: the largest sum counts
-_REACH_CELL = 8  # px; of octaves finer than this
-_STRIP = 1 << 18  # px; larger images are taken some rows at a time
-_OFFSET = 21  # px from a corner of a cell to the image's: edges at round pixels then lie inside cells of every level
+LEVELS = 5  # octaves from 2 px to 32; lower frequencies share one more
+REACHES = (1, 3, 9)  # candidate spreads of a PSF, in cells; the one with the largest power counts
+_REACH_CELL = 8  # px, the least size of these cells
+_STRIP = 1 << 18  # px; larger images are processed in strips of rows
+_OFFSET = 21  # px from a corner of a cell to that of the image: edges at round pixels then lie inside cells
 
 
 def octave_filters(size: int, levels: int = LEVELS) -> Tensor:
-    """Return how much of the power at each frequency belongs to each octave, the finest first; they sum to one.
+    """Return the power responses of the octave filters, the finest first; they sum to one at each frequency.
 
     Args:
         size: side N of the frequency grid.
-        levels: octaves told apart; one more holds all that is slower.
+        levels: number of octaves; one more filter passes all lower frequencies.
 
     Returns:
         (levels + 1, N, N // 2 + 1) float64.
@@ -51,12 +52,12 @@ def octave_filters(size: int, levels: int = LEVELS) -> Tensor:
 
 
 class Depths:
-    """The depths of a scene in bins, and its pixels laid out in cells.
+    """Depths of a scene in bins of defocus, with its padded pixels in cells.
 
     Args:
         defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-        lo: least defocus of the camera, and
-        hi: largest: what lies beyond is clamped.
+        lo: least defocus of the camera; values below are clamped.
+        hi: largest defocus of the camera; values above are clamped.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
         margin: pixels at each side of the image that the capture does not show.
         bins: how many there may be.
@@ -83,7 +84,7 @@ class Depths:
         self._rows, self._columns = (_cells(side, border) for side in defocus.shape[-2:])
 
     def _laid_out(self, plane: Tensor, outside: float | Tensor) -> Tensor:
-        """Return (B, C, H, W) planes with what the border puts around them, in whole cells of the largest size."""
+        """Return planes (B, C, H, W) padded by the border mode to whole cells of the largest size."""
         rows, columns = self._rows, self._columns
         laid = plane[..., rows.clamp(min=0)[:, None], columns.clamp(min=0)]
         if self._border != "zero":
@@ -91,7 +92,7 @@ class Depths:
         return torch.where((rows[:, None] >= 0) & (columns >= 0), laid, outside)
 
     def _once(self, margin: int) -> Tensor:
-        """Return 1 where each pixel of the image lies as laid out but for a margin, 0 elsewhere, (1, 1, H', W')."""
+        """Return the mask of the padded planes, (1, 1, H', W'): 1 on the image less a margin, 0 elsewhere."""
         inside = torch.zeros(1, 1, len(self._rows), len(self._columns))
         height, width = self._shape
         top, left = _OFFSET + margin, _OFFSET + margin
@@ -99,16 +100,16 @@ class Depths:
         return inside
 
     def _labels(self, batch: int) -> Tensor:
-        """Return the bin of each pixel as laid out, the number of bins where there is none, (B, 1, H', W')."""
+        """Return the bin of each pixel of the padded planes, (B, 1, H', W'); outside, the number of bins."""
         outside = torch.tensor(len(self.psi))
         return self._laid_out(self._index, outside).expand(batch, -1, -1, -1)
 
     def shares(self, light: Tensor) -> Tensor:
-        r"""Return which share of each octave's power depths take in that blur the light around them, as gather does.
+        r"""Return the share of each octave's power within reach of the pixels at each depth, for gather.
 
-        A pixel takes light in from as far as its PSF reaches. So the power is spread over several reaches, from none
-        to some tens of pixels, and of what they give to a depth the most counts: shares of an octave sum to one or
-        more. No share is larger than one.
+        A pixel collects light within the reach of its PSF. The power is therefore spread over several distances, from
+        none to some tens of pixels, and for each depth the largest result counts. The shares of an octave sum to one or
+        more, and no share is larger than one.
 
         Args:
             light: (B, C, H, W).
@@ -122,7 +123,7 @@ class Depths:
         labels = self._labels(len(light))
         labels = torch.where(self._once(self._margin) > 0, labels, len(self.psi))
         labels = labels.flatten()
-        alone = self._largest(averages.square(), 1, labels, (1,))  # a single light stands in all octaves at once
+        alone = self._largest(averages.square(), 1, labels, (1,))  # a single point of light is part of all octaves
         octaves = []
         for level in range(LEVELS + 1):
             squares = averages.square()
@@ -134,7 +135,7 @@ class Depths:
         return torch.stack(octaves, 1)
 
     def _largest(self, squares: Tensor, side: int, labels: Tensor, reaches: Sequence[int] = REACHES) -> Tensor:
-        """Return the largest share of each bin over all reaches, (C, b), of the power in cells of so many pixels."""
+        """Return the largest share of each bin in the power over all reaches, (C, b), for cells of a given side."""
         inside = avg_pool2d(self._once(0), side)
         total = (squares * inside).sum((0, 2, 3)).double()[:, None]
         count = len(self.psi)
@@ -151,16 +152,16 @@ class Depths:
         return torch.where(total > 0, largest.clamp(max=1), self.share)
 
     def means(self, light: Tensor) -> Tensor:
-        """Return the mean over the image of the light at each depth, (C, b) float64."""
+        """Return the sum of the light at each depth divided by the number of pixels, (C, b) float64."""
         planes = light.detach().cpu().transpose(0, 1).flatten(1).double()
         labels = self._index.expand(len(light), -1, -1, -1).flatten()
         return planes.new_zeros(len(planes), len(self.psi)).index_add_(1, labels, planes) / planes.shape[1]
 
     def products(self, light: Tensor) -> Tensor:
-        """Return the products of the light at two depths in each octave, as scatter adds it up.
+        """Return the inner products of the light at two depths in each octave, for scatter.
 
-        Light at each depth alone, black elsewhere, has outlines that the image has not; where depths are alike, those
-        of one cancel those of the next. The sum over both depths is the power of the image.
+        The light of one depth, black elsewhere, has outlines that the image lacks. For depths with similar PSFs they
+        cancel those of the next depth. The sum over both depths is the power of the image.
 
         Args:
             light: (B, C, H, W).
@@ -174,7 +175,7 @@ class Depths:
         labels = self._labels(len(light))[:, 0]
         inside = (labels[:1, None] < count).float()
         covered = avg_pool2d(inside, 2**LEVELS)[0]
-        drawn_out = self._border == "replicate"  # streaks from the border add to the light of the image
+        drawn_out = self._border == "replicate"  # the replicated border adds to the light of the image
         pixels = len(light) * (self._shape[0] * self._shape[1] if drawn_out else float(inside.sum()))
         rows = 2**LEVELS * max(1, _STRIP // (2**LEVELS * labels.shape[0] * labels.shape[-1]))
         products = []
@@ -192,7 +193,7 @@ class Depths:
 
 
 def brightest_around(light: Tensor) -> Tensor:
-    """Return the brightest light about each pixel, averaged over cells of eight pixels a side; (B, C, H, W).
+    """Return the brightest mean over cells of 8 x 8 pixels near each pixel, (B, C, H, W).
 
     Example:
         >>> star = torch.zeros(1, 1, 64, 64)
@@ -207,7 +208,7 @@ def brightest_around(light: Tensor) -> Tensor:
 
 
 def _cells(side: int, border: str) -> Tensor:
-    """Return which row of the image each row of whole cells is, -1 for none."""
+    """Return the image row of each row of the padded planes, -1 for none."""
     whole = 2**LEVELS * math.ceil((side + _OFFSET) / 2**LEVELS)
     at = torch.arange(whole) - _OFFSET
     if border == "zero":
@@ -222,7 +223,7 @@ def _cells(side: int, border: str) -> Tensor:
 
 
 def _products_of_cells(plane: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the products of the sums over cells of each level, (levels + 1, b, b), and the sums over the largest."""
+    """Return the inner products of cell sums at each level, (levels + 1, b, b), and the sums over the largest cells."""
     levels = [_products_at(plane, labels, level, count) for level in range(2)]
     cells = _cell_sums(plane, labels, 2, count)
     for level in range(2, LEVELS + 1):
@@ -233,7 +234,7 @@ def _products_of_cells(plane: Tensor, labels: Tensor, count: int) -> tuple[Tenso
 
 
 def _products_at(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
-    """Return the products of the sums over cells of a fine level, pair by pair."""
+    """Return the inner products of cell sums at a fine level, accumulated over pairs of pixels in a cell."""
     side = 2**level
     light, own = (_in_cells(each, side) for each in (plane, labels))
     pairs = own[:, :, None] * (count + 1) + own[:, None]

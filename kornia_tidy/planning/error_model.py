@@ -1,30 +1,30 @@
-r"""How far one capture of a scene is from another at a different fidelity, told without taking either.
+r"""Error model: prediction of the mean square difference between captures at two fidelities, without rendering.
 
-Two captures differ, at a pixel whose defocus is :math:`\psi`, by the image convolved with the difference
-:math:`\Delta_\psi` of two PSFs. How much that is depends on where in depth the image has its light. So the light is
-told apart by octave j and by bin of defocus b, see :mod:`kornia_tidy.planning.depth_energy`, and within an octave all
-of it is taken to have the spectrum :math:`\hat S_j` of the image as a whole, of sum one. Where pixels take light in
-(gather)
+At a pixel with defocus :math:`\psi`, two captures differ by the image convolved with the difference
+:math:`\Delta_\psi` of two PSFs. The size of this difference depends on the depths of the image's light. The light is
+therefore split by octave j and by bin of defocus b, see :mod:`kornia_tidy.planning.depth_energy`. Within an octave it
+is assumed to have the spectrum :math:`\hat S_j` of the whole image, normalised to a sum of one. For gather, where each
+pixel collects light,
 
 .. math::
     \mathrm{MSE} = \sum_{j, b} E_{jb} \sum_f \hat S_j(f) \, |\Delta_b(f)|^2
 
-with the power :math:`E_{jb}` of the light within reach of the pixels at b. Where pixels spread their light (scatter),
-what those at b and b' spread adds up, or cancels:
+with the power :math:`E_{jb}` of the light within reach of the pixels at b. For scatter, where each pixel spreads its
+light, the contributions of bins b and b' add up or cancel:
 
 .. math::
     \mathrm{MSE} = \sum_{j, b, b'} C_{jbb'} \sum_f \hat S_j(f) \, \mathrm{Re} \, \Delta_b(f) \overline{\Delta_{b'}(f)}
 
 with the products :math:`C_{jbb'}` of the light at b and at b'.
 
-Of layers, every :math:`\Delta_b` is a linear combination of a few PSFs: they are band-limited in :math:`\psi`, so those
-at some sixty Chebyshev nodes carry all others, and layers and spacing only change the coefficients. What is left of the
-images is the matrix of the products of these with each other, one for each channel and octave. What window, points a
-pixel and wavelengths change is known in size, at some depths: differences at two depths are then taken as alike or as
-unlike, whichever makes more.
+For a change of layers, every :math:`\Delta_b` is a linear combination of a few PSFs. PSFs are band-limited in
+:math:`\psi`, so those at some sixty Chebyshev nodes give all others by interpolation, and the kind and spacing of the
+layers only change the coefficients. The sums over f then reduce to a matrix of inner products of these PSFs, one for
+each channel and octave. For a change of window, quadrature points per pixel or wavelengths, :math:`\Delta` is computed
+at some depths. Differences at two depths are then assumed equal or independent, whichever gives the larger error.
 
-This is an estimate: an octave's light is taken to lie at random within it. The safety factors of
-:mod:`kornia_tidy.planning.planner` stand for what that leaves out.
+This is an estimate, which assumes that the light of an octave has random phases. The safety factors of
+:mod:`kornia_tidy.planning.planner` cover the deviation of real scenes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from kornia_tidy.planning.scene_light import SceneLight, interpolation
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
 from kornia_tidy.render.layers import assign_layers
 
-_NEGLIGIBLE = 1e-3  # of an octave's power: the frequencies that have least of it do not count
+_NEGLIGIBLE = 1e-3  # of an octave's power; the weakest frequencies are left out
 
 
 def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
@@ -54,10 +54,10 @@ def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
 
 
 def chebyshev_weights(at: Tensor, nodes: Tensor) -> Tensor:
-    r"""Return the weights that take values at Chebyshev nodes to other places: rows of Lagrange polynomials.
+    r"""Return the weights of polynomial interpolation from Chebyshev nodes to other positions.
 
     Args:
-        at: (A,) places within the nodes' range, float64.
+        at: (A,) positions within the nodes' range, float64.
         nodes: (n,) from :func:`chebyshev_nodes`.
 
     Returns:
@@ -81,7 +81,7 @@ def chebyshev_weights(at: Tensor, nodes: Tensor) -> Tensor:
 
 
 def nodes_needed(half_range: float, bandwidth: float) -> int:
-    r"""Return how many Chebyshev nodes carry a function of defocus with a given bandwidth to about 1e-6.
+    r"""Return the number of Chebyshev nodes that interpolate a band-limited function of defocus to about 1e-6.
 
     The Chebyshev coefficients of :math:`e^{i b L t}` are Bessel functions :math:`J_n(b L)`, which vanish beyond
     :math:`n = b L` faster than any exponential.
@@ -99,7 +99,7 @@ def nodes_needed(half_range: float, bandwidth: float) -> int:
 
 
 def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: float) -> tuple[Tensor, Sequence[float]]:
-    """Return which PSFs a pixel at some defocus is blurred with, by the layers between which it lies.
+    """Return the interpolation weights of the layers' PSFs for pixels at some defocus.
 
     Args:
         psi: (b,) defocus in radians.
@@ -133,10 +133,10 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
 
 
 class LayerErrors:
-    """Root mean square differences, on one scene, between captures that differ in their layers.
+    """Prediction of root mean square differences between captures of one scene with different layers.
 
     Args:
-        nodes: Chebyshev nodes that carry the PSFs of the masks, see :func:`nodes_needed`.
+        nodes: Chebyshev nodes from which the PSFs of the masks are interpolated, see :func:`nodes_needed`.
         psfs: (n, C, P, P) PSFs there, not normalised.
         light: of the scene.
     """
@@ -147,16 +147,16 @@ class LayerErrors:
         self._products = torch.stack([_products(own, shape) for own, shape in zip(psfs.unbind(1), shapes, strict=True)])
 
     def rows(self, nodes: Sequence[float], layers: str, band: float) -> Tensor:
-        """Return the coefficients of what the scene's pixels are blurred with, (b, n)."""
+        """Return the interpolation coefficients of the layered PSF of each bin of defocus, (b, n)."""
         weights, at = layer_coefficients(self._light.psi, nodes, layers, band)
         return weights @ chebyshev_weights(torch.tensor(at, dtype=torch.float64), self._nodes)
 
     def own_rows(self) -> Tensor:
-        """Return the coefficients of a PSF of its own for each depth, (b, n)."""
+        """Return the interpolation coefficients of the exact PSF of each bin of defocus, (b, n)."""
         return chebyshev_weights(self._light.psi, self._nodes)
 
     def __call__(self, ours: Tensor, theirs: Tensor) -> float:
-        """Return the difference between captures of these coefficients, full scale 1."""
+        """Return the root mean square difference between captures with two sets of coefficients, full scale 1."""
         difference = ours - theirs
         responses = difference @ self._products  # (C, octaves, b, n)
         alone = (responses * difference).sum(-1)
@@ -168,7 +168,7 @@ class LayerErrors:
 
 
 def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
-    """Return the products of PSFs of one channel with each other in each octave, (octaves, n, n).
+    """Return the inner products of the PSFs of one channel in each octave, (octaves, n, n).
 
     In float64: of layers close to each other all but a millionth cancels.
     """
@@ -184,10 +184,10 @@ def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
 
 
 def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> float:
-    """Return the root mean square difference that changes of PSFs make on a scene.
+    """Return the root mean square error on a scene from changes of the PSFs.
 
     Args:
-        nodes: ascending defocus in radians where the changes are known; in between they are as large as there.
+        nodes: ascending defocus in radians at which the changes are given. In between, their power is interpolated.
         changes: (len(nodes), C, P, P).
         light: of the scene.
     """

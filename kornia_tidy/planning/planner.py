@@ -1,20 +1,20 @@
-"""Planning: the cheapest fidelity that captures a scene within an error, found without capturing it.
+"""Planner: choice of the cheapest fidelity within an error tolerance, predicted without rendering.
 
-The error meant is the root mean square difference of the noise-free capture, in linear light and full scale 1, from
-the one that the preset ``reference`` would give. Light beyond full scale counts as it is: a highlight of 1000 makes
-errors a thousand times those of white. The error is predicted from where in depth each octave of the scene's light
-lies, see :mod:`kornia_tidy.planning.error_model`; the cost by formula, see :mod:`kornia_tidy.render.cost_model`. The
-candidates are all combinations of layers, spacing, window, points a pixel and precision below, with the light outside
-the window spread over the image or given back to the window, whichever is nearer to the truth.
+The error is the root mean square difference between the noise-free capture and that of the preset ``reference``, in
+linear light with full scale 1. Light beyond full scale is not clipped: a highlight of 1000 gives errors a thousand
+times those of white. The error is predicted from the power of the scene in each octave and at each depth, see
+:mod:`kornia_tidy.planning.error_model`, and the cost by formula, see :mod:`kornia_tidy.render.cost_model`. The
+candidates are all combinations of layers, spacing, window, quadrature points per pixel and precision. The light outside
+the window is spread over the image or renormalised into the window, whichever is more accurate.
 
-The prediction adds up what each economy makes by itself, times a safety factor: an estimate from above, which holds on
-the scenes of ``tests/planning/adversarial_scenes.py``. It is no proof: the light of one octave is taken to lie at
-random.
+The prediction is the sum of the errors of all single changes, each times a safety factor. It is an upper estimate,
+which holds on the scenes of ``tests/planning/adversarial_scenes.py``. It is not a strict bound, since the light of one
+octave is assumed to have random phases.
 
-Occlusion is no sum over layers, but what changes of PSFs make of it is near what they make of scatter, of two kinds of
-light: the light itself, and what it lacks to the brightest around, as what is dark hides what is bright. To this comes
-what scatter does not know: where one thing hides another, it matters where the layers lie; outlines are as sharp as a
-PSF that is whole in its window; and what is seen by little of a PSF is a little too dark.
+Occlusion is not a sum over layers. Its error from changes of PSFs is estimated as that of scatter, for two images: the
+light itself, and its difference to the brightest light nearby, since dark objects occlude bright ones. Three errors are
+added that scatter does not have: the position of layers at occluding edges, the sharpness of outlines with a PSF cut to
+its window, and the darkening of pixels that are reached by a small part of a PSF.
 """
 
 from __future__ import annotations
@@ -55,26 +55,26 @@ from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.occlusion_cost import Windows, count_windows, windows_bytes, windows_seconds
 from kornia_tidy.render.stray_light import share_in_frame
 
-SAFETY = 1.4  # on photographs and adversarial scenes measured errors were up to 1.2 times what the formula says
-WINDOW_SAFETY = 1.7  # here up to 1.5 times: tails are looked at a few depths only
-FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; that of PSFs by mutual intensity is up to 3.3e-7
-POINT_SAFETY = 1.6  # up to 1.5 times: they are looked at a few depths only too, and change fast about focus
-OCCLUSION = 1.3  # of what is predicted for scatter; on adversarial scenes measured up to 1.1 before SAFETY
-OCCLUSION_WINDOW = 1.3  # of a window likewise
-ORDER_ERROR = 4e-3  # of occlusion: of the contrast, for a radian between linear layers; on photographs up to 1.9e-3
-OUTLINE_ERROR = 2e-2  # the same for the square root of the share of pixels on outlines; on checkerboards up to 1.9e-2
-_OUTLINE = 1.0  # rad between neighbours: an outline, not a slope
-_ENOUGH = 0.05  # of the tolerance: more wavelengths than leave this gain nothing
+SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.2 times the formula
+WINDOW_SAFETY = 1.7  # factor for windows; measured up to 1.5, as tails are sampled at a few depths only
+FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; measured with mutual intensity up to 3.3e-7
+POINT_SAFETY = 1.6  # factor for quadrature points; measured up to 1.5, as they are sampled at a few depths only
+OCCLUSION = 1.3  # ratio of occlusion's error to the prediction for scatter; measured up to 1.1, before SAFETY
+OCCLUSION_WINDOW = 1.3  # the same ratio for windows
+ORDER_ERROR = 4e-3  # of occlusion, relative to the contrast, per radian between linear layers; measured up to 1.9e-3
+OUTLINE_ERROR = 2e-2  # the same, times the square root of the share of outline pixels; measured up to 1.9e-2
+_OUTLINE = 1.0  # rad between neighbouring pixels; larger steps are outlines of objects
+_ENOUGH = 0.05  # of the tolerance: with errors below it, more wavelengths bring nothing
 
 
 class Planner:
-    """Plans scenes for one camera, whose masks it surveys once, as they are when it is made.
+    """Planner of scenes for one camera; PSF samples of the masks are computed once and shared by all scenes.
 
-    ``optics.plan`` is this for one scene and one tolerance.
+    The samples belong to the masks at the time of construction. ``optics.plan`` plans one scene for one tolerance.
 
     Args:
         optics: the camera.
-        channels: of the images: as many as its spectrum has, or 1.
+        channels: number of channels of the images: that of the spectrum, or 1.
 
     Example:
         >>> from kornia_tidy import PixelwiseMask, TiDyOptics
@@ -98,7 +98,7 @@ class Planner:
 
 
 class PlannedScene:
-    """A scene whose errors are predicted, for one plan or many. Made by :meth:`Planner.scene`."""
+    """Error prediction and plans for one scene, made by :meth:`Planner.scene`."""
 
     @torch.no_grad()
     def __init__(self, survey: CameraSurvey, defocus: Tensor, light: Tensor | None) -> None:
@@ -114,7 +114,7 @@ class PlannedScene:
         margin = window_side(self.reference) // 2 if survey.border == "valid" else 0
         bins = 256 if survey.compositing == "gather" else 128
         self._depths = Depths(defocus, *survey.defocus_range, survey.border, margin, bins)
-        if light is None:  # whose colours, if they matter, may differ as much as its pixels
+        if light is None:  # differences between channels are assumed as large as between pixels
             self._light, self._level = SceneLight.unseen(self._depths, survey.channels, size), 0.5
             self._contrast = CONTRAST
             self._apart = torch.full((survey.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
@@ -122,7 +122,7 @@ class PlannedScene:
         else:
             self._light, self._level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
             self._contrast = float(light.double().std(correction=0))
-            means = self._depths.means(light)  # of the light at each depth, less that of all
+            means = self._depths.means(light)  # mean light of each depth less that of the image
             self._apart = means / self._depths.share - means.sum(1, keepdim=True)
             self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
         self._layers = LayerErrors(*survey.layer_survey(window_side(self.reference)), self._light)
@@ -132,7 +132,7 @@ class PlannedScene:
         return SceneLight.seen(light, self._depths, self._survey.border, size, self._survey.compositing)
 
     def error(self, fidelity: Fidelity) -> float:
-        """Return the predicted error of a fidelity, full scale 1: at most its window is that of the reference.
+        """Return the predicted error of a fidelity, full scale 1; its window is at most that of the reference.
 
         Raises:
             ValueError: if the fidelity is not one whose error is known.
@@ -152,7 +152,10 @@ class PlannedScene:
         return sum(error for _, error in self._parts(fidelity))
 
     def seconds(self, fidelity: Fidelity) -> float:
-        """Return the seconds of a capture with its PSFs on one core, see :mod:`kornia_tidy.render.cost_model`."""
+        """Return the predicted time in seconds of a capture with its PSFs on one core.
+
+        See :mod:`kornia_tidy.render.cost_model`.
+        """
         survey, cut = self._survey, self._cut(fidelity)
         bank = bank_seconds(survey.geometry(fidelity), fidelity, self._computed(fidelity))
         if isinstance(cut, Windows):
@@ -162,7 +165,7 @@ class PlannedScene:
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
 
-        Where none is, that is the reference, whose error is zero by definition; the plan then says so.
+        If no candidate is, the plan is the reference, which has no error by definition.
         """
         check_positive("tolerance", tolerance)
         chosen = min(self._within(tolerance), key=self.seconds, default=self.reference)
@@ -171,7 +174,7 @@ class PlannedScene:
         return self._described(replace(chosen, name=f"planned, tolerance {tolerance:g}"), tolerance)
 
     def _within(self, tolerance: float) -> Iterator[Fidelity]:
-        """Yield, for each way to save elsewhere, the narrowest window that stays within a tolerance."""
+        """Yield the narrowest window within a tolerance for each combination of the other settings."""
         windows, counts = window_ladder(window_side(self.reference)), tuple(self._wavelength_counts(tolerance))
         for layers, double, points, count in product(layer_kinds(), (False, True), PIXEL_TOLERANCES, counts):
             full = replace(layers, window=windows[-1], double=double, pixel_tolerance=points, wavelengths=count)
@@ -183,7 +186,7 @@ class PlannedScene:
                 yield (*each, full)[first]
 
     def _wavelength_counts(self, tolerance: float) -> Iterator[int | None]:
-        """Yield the numbers of wavelengths worth a try, up to one whose error is small beside the tolerance."""
+        """Yield candidate numbers of wavelengths, up to the first with an error small against the tolerance."""
         for count in self._survey.wavelength_counts():
             error = SAFETY * self._wavelength_error(count)
             if error <= tolerance:
@@ -230,16 +233,16 @@ class PlannedScene:
 
     @cached_property
     def _outlines(self) -> float:
-        """Return the share of the pixels that have a neighbour at another depth."""
+        """Share of the pixels that have a neighbour at another depth."""
         nearest, farthest = (max_pool2d(sign * self._defocus, 3, 1, 1) for sign in (1, -1))
         return float((nearest + farthest > _OUTLINE).double().mean())
 
     @cached_property
     def _share_in_frame(self) -> float:
-        """Return the least share of a PSF that falls into the image, averaged over its pixels, where that matters.
+        """Least share of a PSF inside the image, averaged over pixels; 1 unless occlusion has the border ``"zero"``.
 
-        Occlusion divides by what a pixel sees. With the border ``"zero"`` that is the image alone: the PSFs of a tiny
-        image are renormalised to what little of them lies within it, and so are their errors.
+        Occlusion divides by the cumulative alpha. With the border ``"zero"`` it covers the image alone: in a tiny image
+        PSFs are renormalised by the small share inside it, and their errors grow likewise.
         """
         if not self._occlusion or self._survey.border != "zero":
             return 1.0
@@ -257,9 +260,9 @@ class PlannedScene:
         return self._known[key]
 
     def _order_error(self, fidelity: Fidelity) -> float:
-        """What it changes where things hide one another that layers lie elsewhere than the reference's do."""
+        """Return the error at occluding edges from layers at other positions than the reference's."""
         if not self._occlusion or fidelity.layers == "nearest":
-            return 0.0  # nearest layers are much further off anyway
+            return 0.0  # nearest layers have much larger errors, which dominate
         own, theirs = self._rendered(fidelity), self._rendered(self.reference)
         if own == theirs:
             return 0.0
@@ -267,9 +270,9 @@ class PlannedScene:
         return each * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
 
     def _dark_error(self, fidelity: Fidelity) -> float:
-        """Return the error of white that does not stay white, where things hide others.
+        """Return the error of occlusion from the regularised division by the cumulative alpha.
 
-        A layer seen by a share E of its PSF loses EPSILON / E of its light, and other layers are seen by other shares.
+        A layer with the share E of its PSF inside the window loses EPSILON / E of its light, so that white is not kept.
         """
         if not self._occlusion or self._is_reference(fidelity):
             return 0.0
@@ -282,9 +285,9 @@ class PlannedScene:
         return self._known[key]
 
     def _spread_error(self, fidelity: Fidelity) -> float:
-        """Return the error of stray light that takes on the image's mean, where things hide others.
+        """Return the error of occlusion from stray light with the mean of the image.
 
-        A layer's own light is renormalised to what is seen of it, so its stray light should have the layer's mean.
+        Occlusion normalises each layer by its alpha, so the layer's stray light should have the mean of the layer.
         """
         if not self._occlusion or fidelity.stray_light != "veil":
             return 0.0
@@ -309,7 +312,7 @@ class PlannedScene:
                 bisect_left(nodes, float(self._depths.psi[-1])) + 1,
             )
             nodes, psfs = nodes[around], psfs[around]
-            if stray_light == "outlines":  # their PSFs are normalised in either window, veil or not
+            if stray_light == "outlines":  # PSFs are normalised in both windows, with and without stray light
                 psfs = psfs / psfs.sum((-2, -1), keepdim=True)
             kept = _cropped(psfs, window)
             if stray_light != "veil":
@@ -342,7 +345,7 @@ class PlannedScene:
         return guarded(nodes, TAPS[fidelity.layers] // 2) if fidelity.layers in TAPS else nodes
 
     def _computed(self, fidelity: Fidelity) -> int:
-        """How many PSFs are computed for the scene: all from the first that it takes light from to the last."""
+        """Return the number of PSFs computed for the scene: all layers from its farthest to its nearest."""
         key = ("computed", fidelity.layers, fidelity.layer_spacing)
         if key not in self._known:
             ends = torch.stack([self._depths.psi[0], self._depths.psi[-1]])
@@ -361,17 +364,21 @@ class PlannedScene:
         return memory_bytes(survey.geometry(fidelity), survey.planes, fidelity, held, rendering)
 
     def _rendered(self, fidelity: Fidelity) -> Sequence[float]:
-        """Defocus of the layers that are rendered."""
+        """Return the defocus of the rendered layers."""
         nodes = self._survey.nodes(fidelity)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
     def _cut(self, fidelity: Fidelity) -> Tiles | Windows:
-        """The scene in tiles, as the renderer will cut it."""
+        """Return the renderer's tiles for the scene."""
         nodes, window = self._rendered(fidelity), window_side(fidelity)
         mode = "nearest" if fidelity.layers == "nearest" else "linear"
         if (mode, nodes, window) not in self._tiles:
             margin = 0 if self._survey.compositing == "gather" and self._survey.border != "valid" else window // 2
-            if self._labelled is None or self._labelled[0] != (mode, nodes, margin):  # one at a time: they are large
+            if self._labelled is None or self._labelled[0] != (
+                mode,
+                nodes,
+                margin,
+            ):  # only one is cached: it is large
                 seen = self._seen(margin)
                 self._labelled = (mode, nodes, margin), label_pixels(seen, self._batch, nodes, mode)
             scene = self._labelled[1], len(nodes), window
@@ -381,7 +388,7 @@ class PlannedScene:
         return self._tiles[mode, nodes, window]
 
     def _seen(self, margin: int) -> Tensor:
-        """Defocus of the pixels that have a layer: with ``valid`` fewer than the image's, unless it is gather, more."""
+        """Return the defocus of the rendered pixels: cropped for the border ``valid``, else padded by the margin."""
         border = self._survey.border
         if border == "valid" and not self._occlusion:
             height, width = self._defocus.shape[-2:]

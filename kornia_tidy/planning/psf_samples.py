@@ -1,4 +1,4 @@
-"""Survey: what the PSFs of one camera's masks are like, looked at once for all scenes that are planned with them."""
+"""PSF samples of one camera's masks, computed once for all scenes that are planned with them."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from kornia_tidy.psf.spectral_binning import fewer_wavelengths
 from kornia_tidy.render.borders import largest_window
 from kornia_tidy.render.cost_model import BankGeometry
 
-_TOLERANCE = 0.3  # of pixels: differences of PSFs need not be known better than to some per cent
-_WAVELENGTHS = 7  # nor better than at so many: PSFs are off by half a per cent
-_LAYERS_WINDOW = 65  # where layers are compared: beyond it lies a fifth of the light, and a few per cent of its square
-_WINDOW_SPACING = 4.0  # radians between PSFs whose tails are compared
-_INTERVALS = 8  # between the PSFs in which points a pixel and wavelengths are compared
-_PIXEL_WINDOW = 65  # where points a pixel are compared; 33 show 0.9 of it, 129 show 1.05 (random mask, 9 wavelengths)
-_COLOUR_WINDOW = 65  # where wavelengths are
+_TOLERANCE = 0.3  # pixel tolerance of the samples: some per cent suffice for differences of PSFs
+_WAVELENGTHS = 7  # at most, in the samples: PSFs then have errors of half a per cent
+_LAYERS_WINDOW = 65  # px, to compare layers: a fifth of the light lies outside, but only a few per cent of its square
+_WINDOW_SPACING = 4.0  # radians between the PSFs with which windows are compared
+_INTERVALS = 8  # of defocus between the PSFs with which quadrature points and wavelengths are compared
+_PIXEL_WINDOW = 65  # px, to compare quadrature points: 33 give 0.9 of the error and 129 give 1.05 (random mask)
+_COLOUR_WINDOW = 65  # px, to compare wavelengths
 
 
 class PlannableCamera(Protocol):
-    """What planning asks of a camera; :class:`kornia_tidy.TiDyOptics` is one."""
+    """Protocol of a camera that can be planned, such as :class:`kornia_tidy.TiDyOptics`."""
 
     masks: Any
     modulator: Any
@@ -65,7 +65,7 @@ class PlannableCamera(Protocol):
 
 
 class CameraSurvey:
-    """What is looked at of a camera's masks, as they are when it is made; each thing once.
+    """PSF samples of a camera's masks at the time of construction, each computed once on first use.
 
     Args:
         optics: the camera.
@@ -77,7 +77,7 @@ class CameraSurvey:
         self.spectrum = optics.spectrum if channels == len(optics.spectrum.weights) else Spectrum.monochrome()
         step = float(camera.pixel_pitch * camera.aperture_radius / camera.image_distance)
         states = len(optics.modulator(optics.masks.phase)[1])
-        # Where layers hide one another each state is a capture of its own, see Fidelity.occlusion_states.
+        # For occlusion each state is rendered separately, see Fidelity.occlusion_states.
         self.captures = states if optics.compositing == "occlusion" else 1
         self._geometry = BankGeometry(states // self.captures, optics.pupil, self.spectrum.wavelengths, step)
         self.band = defocus_band(optics.pupil.max_rho2, min(optics.spectrum.wavelengths), REFERENCE_WAVELENGTH)
@@ -94,17 +94,17 @@ class CameraSurvey:
         self._colours: dict[tuple[int | None, int], Tensor] = {}
 
     def geometry(self, fidelity: Fidelity) -> BankGeometry:
-        """Return what the cost of the PSFs depends on."""
+        """Return the pupil and spectrum parameters that determine the cost of the PSFs."""
         return replace(self._geometry, wavelengths=self.merged(fidelity.wavelengths).wavelengths)
 
     def merged(self, count: int | None) -> Spectrum:
-        """Return the spectrum at so many wavelengths."""
+        """Return the spectrum binned to a number of wavelengths."""
         return self.spectrum if count is None else fewer_wavelengths(self.spectrum, count)
 
     def wavelength_counts(self) -> tuple[int, ...]:
-        """Return how many wavelengths may stand for all, ascending; none where each channel has a single one anyway.
+        """Return the candidate numbers of binned wavelengths, ascending; none with one wavelength per channel.
 
-        One wavelength a channel is a model by itself, not a sample of a broader one.
+        One wavelength per channel is a model of its own, not a sample of a broader spectrum.
         """
         single = all(sum(weight > 0 for weight in row) == 1 for row in self.spectrum.weights)
         return () if single else wavelength_ladder(self._fewest, len(self.spectrum.wavelengths))
@@ -121,13 +121,13 @@ class CameraSurvey:
         limit = min(REFERENCE.max_window, largest_window(self.border, height, width))
         if limit not in self._references:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that the widest window allowed holds less than it should
+                warnings.simplefilter("ignore")  # that the widest allowed window misses the encircled energy
                 window = self._optics.with_fidelity(REFERENCE.replace(max_window=limit)).window
             self._references[limit] = replace(REFERENCE, window=window)
         return self._references[limit]
 
     def layer_survey(self, window: int) -> tuple[Tensor, Tensor]:
-        """Return the Chebyshev nodes that carry the PSFs of every defocus, and those PSFs, in no wider a window."""
+        """Return Chebyshev nodes for interpolation over defocus and the PSFs there, in a window of bounded size."""
         window = min(window, _LAYERS_WINDOW)
         if window not in self._layers:
             spans = [
@@ -141,16 +141,16 @@ class CameraSurvey:
         return self._layers[window]
 
     def window_survey(self, window: int) -> tuple[tuple[float, ...], Tensor]:
-        """Return some defocus over the range, and the PSFs there."""
+        """Return sample values of defocus over the range, and the PSFs there in a window."""
         nodes = self._spread(max(1, round((self.defocus_range[1] - self.defocus_range[0]) / _WINDOW_SPACING)))
         if window not in self._wide:
             self._wide[window] = self._bank(nodes, window, _TOLERANCE, torch.float32).psfs.cpu()
         return nodes, self._wide[window]
 
     def pixel_changes(self, tolerance: float, window: int) -> tuple[tuple[float, ...], Tensor]:
-        """Return some defocus, and what fewer points a pixel change in PSFs there, where most of their light is.
+        """Return sample values of defocus, and the change of the PSFs' centres with fewer quadrature points per pixel.
 
-        PSFs in focus change most, and those of the shortest wavelength: none is left out.
+        PSFs in focus and those of the shortest wavelength change most, and both are included.
         """
         nodes, window = self._spread_and_focus(), min(window, _PIXEL_WINDOW)
         for each in (tolerance, REFERENCE.pixel_tolerance):
@@ -160,10 +160,10 @@ class CameraSurvey:
         return nodes, self._pixels[tolerance, window] - self._pixels[REFERENCE.pixel_tolerance, window]
 
     def wavelength_changes(self, count: int, window: int) -> tuple[tuple[float, ...], list[Tensor]]:
-        r"""Return some defocus, and what fewer wavelengths change in PSFs there, where most of their light is.
+        r"""Return sample values of defocus, and the change of the PSFs' centres with binned wavelengths.
 
-        With a basis, channel c captures :math:`h_c * L_c + \sum_b h_{cb} * (L_b - L_c)`, where the PSF of what is white
-        is :math:`h_c = \sum_b h_{cb}`.
+        With a reflectance basis, channel c captures :math:`h_c * L_c + \sum_b h_{cb} * (L_b - L_c)` with the PSF
+        :math:`h_c = \sum_b h_{cb}` of white.
 
         Returns:
             The nodes, and a list of (D, C, P, P): the changes of :math:`h_c`, and with a basis those of
@@ -180,7 +180,7 @@ class CameraSurvey:
 
     @torch.no_grad()
     def _planes(self, spectrum: Spectrum, window: int) -> Tensor:
-        """Return PSFs of each channel and reflectance, (D, C, B, P, P), wavelength by wavelength."""
+        """Return the PSFs of each channel and basis reflectance, (D, C, B, P, P), wavelength by wavelength."""
         raw = REFERENCE.replace(window=window, pixel_tolerance=1e-3, stray_light="discard")
         lens, nodes = self._optics.with_fidelity(raw), self._spread_and_focus()
         planes = torch.zeros((), dtype=torch.float64)

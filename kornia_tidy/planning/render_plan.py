@@ -1,4 +1,4 @@
-"""RenderPlan: how a scene is to be captured, what that costs and how far it is from the reference."""
+"""Plan of a capture: the chosen fidelity with its predicted error, time and memory."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from kornia_tidy.fidelity import Fidelity
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """How to capture a scene, and what is known of it before. ``print`` it for a person.
+    """Chosen fidelity of a capture with its predicted error and cost; ``print`` shows it in words.
 
     Args:
-        fidelity: the setting, for ``optics.with_fidelity(plan.fidelity)``. Its window is fixed.
-        reference: what the error is against: the preset, with the window of the masks as they are now.
-        tolerance: error asked for.
-        predicted_error: root mean square of the noise-free linear capture against ``reference``, full scale 1: an
-            estimate from above, see :mod:`kornia_tidy.planning.planner` for what it rests on.
+        fidelity: the settings, for ``optics.with_fidelity(plan.fidelity)``. The window is fixed.
+        reference: the preset that the error refers to, with the window of the current masks.
+        tolerance: largest error allowed.
+        predicted_error: root mean square difference of the noise-free linear capture to ``reference``, full scale 1:
+            an upper estimate, see :mod:`kornia_tidy.planning.planner` for its assumptions.
         seconds: of one capture with its PSFs on one core, see :mod:`kornia_tidy.render.cost_model`.
         memory_bytes: peak of one capture without gradients, beyond the image.
-        reference_seconds: what the reference would take.
+        reference_seconds: predicted time of the reference.
         layers_present: PSFs computed for the scene.
         layers_total: those of the camera's whole range.
-        states: of the exposure, rendered one by one: 1 where their mean does, as it does unless layers hide others.
-        wavelengths: PSFs computed for each layer.
-        wavelengths_total: those that the camera's spectrum has, at all of which the reference is.
+        states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
+        wavelengths: number of wavelengths computed for each layer.
+        wavelengths_total: number of wavelengths of the camera's spectrum, all of which the reference uses.
         light_held: least and largest share of the light in the window over the range.
-        reference_error: of the reference, against a PSF of its own for each pixel's depth.
-        error_parts: what each economy adds to ``predicted_error``, by name.
+        reference_error: error of the reference from its layers, against the exact PSF of each pixel's depth.
+        error_parts: contributions to ``predicted_error``, by name of the setting.
     """
 
     fidelity: Fidelity
@@ -47,7 +47,7 @@ class RenderPlan:
     error_parts: tuple[tuple[str, float], ...]
 
     def __str__(self) -> str:
-        """Tell what is computed, what is skipped and why, and what it costs."""
+        """Describe in words the computed and the skipped parts of the capture, and their cost."""
         knobs, full = self.fidelity, self.reference
         held = " to ".join(dict.fromkeys(f"{share:.0%}" for share in self.light_held))
         skipped = [f"{self.layers_total - self.layers_present} of the layers, at depths that the scene does not have"]

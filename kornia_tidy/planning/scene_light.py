@@ -1,6 +1,7 @@
-"""The power of an image: of its spectrum, by octave, and by depth.
+"""Power spectrum of a scene's light by channel, octave and depth.
 
-Spectra are taken such that their sum times a filter's power is the mean square that the filter leaves of the image.
+Spectra are normalised such that the sum of their product with a filter's power response is the mean square of the
+filtered image.
 """
 
 from __future__ import annotations
@@ -15,21 +16,24 @@ from torch import Tensor
 from kornia_tidy.planning.depth_energy import LEVELS, Depths, brightest_around, octave_filters
 from kornia_tidy.render.borders import next_fast_size, pad_border
 
-CONTRAST = 0.3  # standard deviation of the light of an image not given, full scale 1: photographs have 0.13 to 0.35
-GRID_RATIO = 2.0  # side of the grid of frequencies over the window: no shift of a PSF against itself reaches round
-_BLOCK = 1024  # px; larger images are looked at block by block
+CONTRAST = 0.3  # standard deviation of light assumed without an image, full scale 1; photographs have 0.13 to 0.35
+GRID_RATIO = 2.0  # side of the frequency grid over the window: the autocorrelation of a PSF then does not wrap around
+_BLOCK = 1024  # px; larger images are processed in blocks
 _GRID = 33  # depths at which changes of PSFs are compared
-ALIKE = 2.0  # rad; how far apart in defocus changes of PSFs are still alike
-_USUAL = 0.1  # of the spectrum's shape is that of a photograph
+ALIKE = 2.0  # rad; correlation length of changes of PSFs over defocus
+_USUAL = 0.1  # weight of a photograph's spectrum in that of the scene
 
 
 def spectrum_size(window: int) -> int:
-    """Return the side of the grid that PSFs of a window are compared on: at least such that it tells octaves apart."""
+    """Return the side of the frequency grid on which PSFs of a window are compared.
+
+    It is large enough to resolve the octaves.
+    """
     return next_fast_size(max(2 ** (LEVELS + 1), math.ceil(GRID_RATIO * window)))
 
 
 def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
-    r"""Return the power spectrum of images, such that its sum times a filter's power is the mean square it leaves.
+    r"""Return the power spectrum of images; its sum times a filter's power is the mean square of the filtered image.
 
     Args:
         light: (B, C, H, W).
@@ -52,7 +56,7 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
         drawn_out = pad_border(varying, int(size / GRID_RATIO) // 2, "replicate")
         return torch.maximum(*(_power_of_blocks(plane, "reflect", size) for plane in (varying, drawn_out)))
     power = _power_of_blocks(light if border == "zero" else varying, border, size)
-    if border == "zero":  # with the veil the mean is kept, but for what is missed in the dark around
+    if border == "zero":  # stray light conserves the mean, except for the part spread beyond the image
         mean_square = light.mean((-2, -1)).square().mean(0).cpu()
         missed = mean_square * _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
         power[:, 0, 0] = _power_of_blocks(varying, "reflect", size)[:, 0, 0] + missed
@@ -60,7 +64,7 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
 
 
 def _dark_square(shape: Sequence[int], radius: int) -> float:
-    """Return the mean square of the share of a pixel's surroundings that lies beyond the image."""
+    """Return the mean square, over pixels, of the share of the surrounding window that lies beyond the image."""
     inside = []
     for side in shape:
         at = torch.arange(side, dtype=torch.float64)
@@ -79,7 +83,7 @@ def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
 
 
 def coarser(power: Tensor, size: int) -> Tensor:
-    """Return a power spectrum on a smaller grid: its covariance at the shifts that the grid has.
+    """Resample a power spectrum to a smaller grid by cropping its covariance.
 
     Example:
         >>> power = power_spectrum(torch.rand(1, 1, 40, 40, dtype=torch.float64), "circular", 20)
@@ -99,7 +103,7 @@ def coarser(power: Tensor, size: int) -> Tensor:
 def natural_power(channels: int, size: int) -> Tensor:
     """Return the power spectrum of a typical photograph: 1 / f**2, with the standard deviation ``CONTRAST``.
 
-    At frequency zero stands that of half the lowest frequency of the grid.
+    The value at frequency zero is that at half the lowest frequency of the grid.
 
     Source: Field, Relations between the statistics of natural images and the response properties of cortical cells,
     J. Opt. Soc. Am. A 4(12), 2379 (1987).
@@ -116,20 +120,20 @@ def natural_power(channels: int, size: int) -> Tensor:
 
 
 class SceneLight:
-    """The power of a scene's light by channel, octave and depth, and the shape of its spectrum within each octave.
+    """Power of a scene's light by channel, octave and depth, and its spectrum within each octave.
 
     Args:
-        power: of the light, (C, N, N // 2 + 1), see :func:`power_spectrum`.
+        power: spectrum of the light, (C, N, N // 2 + 1), see :func:`power_spectrum`.
         psi: (b,) defocus in the scene, ascending.
-        energies: of one kind of light or of several, of which the one that makes most of a difference counts: each
-            (C, octaves, b) where depths add up by themselves, (C, octaves, b, b) where they add up to light.
+        energies: one or more distributions of power, of which the one with the largest error counts. Each has shape
+            (C, octaves, b) if the errors of depths add in power (gather), (C, octaves, b, b) if they add in amplitude.
     """
 
     def __init__(self, power: Tensor, psi: Tensor, *energies: Tensor) -> None:
         self.psi, self.energies = psi, [each if each.ndim == 3 else each.float() for each in energies]
         self._power = power
         self._shapes: dict[int, Tensor] = {}
-        # What changes slowly with defocus need not be known at each of them.
+        # PSF changes vary slowly with defocus, so a coarse grid suffices for them.
         self.grid = torch.linspace(float(psi[0]), float(psi[-1]), _GRID, dtype=torch.float64)
         spread = interpolation(psi, self.grid.tolist()) if psi[-1] > psi[0] else torch.ones(1, _GRID).double() / _GRID
         self._on_grid = [
@@ -138,13 +142,13 @@ class SceneLight:
 
     @classmethod
     def seen(cls, light: Tensor, depths: Depths, border: str, size: int, compositing: str) -> SceneLight:
-        """Return that of an image, as it is composed."""
+        """Return the power distribution of an image for its compositing."""
         power = power_spectrum(light, border, size)
         if compositing == "gather":
             octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
             return cls(power, depths.psi, octaves[..., None] * depths.shares(light) / depths.seen)
         lights = [light]
-        if compositing == "occlusion":  # what is dark hides what is bright
+        if compositing == "occlusion":  # dark objects occlude bright ones
             lights.append(brightest_around(light) - light)
         energies = [depths.products(each) / depths.seen for each in lights]
         if border == "zero":
@@ -156,18 +160,19 @@ class SceneLight:
 
     @classmethod
     def unseen(cls, depths: Depths, channels: int, size: int) -> SceneLight:
-        """Return that of a typical photograph, alike at all depths."""
+        """Return the power distribution of a typical photograph, the same at all depths."""
         power = natural_power(channels, size)
         octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
         return cls(power, depths.psi, octaves[..., None] * depths.share)
 
     def mean_square(self, squares: Tensor) -> Iterator[float]:
-        """Yield the mean square error that a change of PSFs makes, for each kind of light.
+        """Yield the mean square error from a change of PSFs, for each distribution of power.
 
-        Changes at two depths are alike, or as unlike as those farther than ``ALIKE`` apart: whichever makes more.
+        Changes at two depths are assumed fully correlated, or correlated within ``ALIKE`` radians of defocus, whichever
+        gives the larger error.
 
         Args:
-            squares: (C, octaves, grid) of what the change leaves of light of power one, at the depths of ``grid``.
+            squares: (C, octaves, grid) mean square of the error for light of power one, at the depths of ``grid``.
         """
         sizes = squares.clamp(min=0).sqrt()
         alike = torch.exp(-0.5 * ((self.grid[:, None] - self.grid) / ALIKE).square())
@@ -179,9 +184,9 @@ class SceneLight:
                 yield float(torch.maximum(*sums).clamp(min=0).sum(1).mean())
 
     def shapes(self, window: int) -> Tensor:
-        """Return the shapes of the spectrum, each with a sum of one, on a grid for PSFs of a window.
+        """Return the normalised spectrum within each octave, of sum one, on the frequency grid for a window.
 
-        Of an octave that the image as a whole does not have, that of a photograph.
+        An octave without power in the image has the spectrum of a photograph.
 
         Returns:
             (C, octaves, M, M // 2 + 1) float64.
@@ -209,7 +214,7 @@ def interpolation(at: Tensor, nodes: Sequence[float]) -> Tensor:
 
 
 def _endless(block: Tensor, border: str, size: int) -> Tensor:
-    """Make a block periodic the way its border continues it: mirrored, repeated, or alone in the dark."""
+    """Extend a block to a periodic one by its border mode: mirrored, repeated, or padded with zeros."""
     height, width = block.shape[-2:]
     if border == "zero":
         return torch.nn.functional.pad(block, (0, size, 0, size)) * math.sqrt(
@@ -221,7 +226,7 @@ def _endless(block: Tensor, border: str, size: int) -> Tensor:
 
 
 def _covariance(plane: Tensor, size: int) -> Tensor:
-    """Return the covariance of a periodic plane with itself at shifts up to half of ``size``, (C, size, size)."""
+    """Return the autocovariance of a periodic plane at shifts up to half of ``size``, (C, size, size)."""
     height, width = plane.shape[-2:]
     power = _power(torch.fft.rfft2(plane)).mean(0) / (height * width)
     lags = torch.fft.fftfreq(size, 1 / size).round().long()
@@ -234,7 +239,7 @@ def _power(spectrum: Tensor) -> Tensor:
 
 
 def _half_plane(power: Tensor, size: int) -> Tensor:
-    """Let columns that stand for two frequencies count twice."""
+    """Double the columns of a half spectrum that represent two frequencies."""
     twice = torch.full((size // 2 + 1,), 2.0, dtype=torch.float64)
     twice[0] = 1
     if size % 2 == 0:

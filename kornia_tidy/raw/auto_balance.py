@@ -9,16 +9,16 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kornia_tidy.raw.capture import RawCapture
 
-NORM = 6  # between 1, grey world, and infinity, where the brightest pixel is white
+NORM = 6  # of the Minkowski mean: 1 assumes a grey world, infinity that the brightest pixel is white
 SATURATED = 0.98  # of white
-ENOUGH = 1_000_000  # tiles; of larger captures every second, third, ... row and column
+ENOUGH = 1_000_000  # tiles; larger captures are subsampled to about this many
 
 
 def auto_balance(raw: RawCapture) -> Tensor:
     r"""Return white balance factors that make a capture grey on average, bright parts counting most (shades of grey).
 
-    A channel's level is :math:`(\frac{1}{N} \sum x^6)^{1/6}` over the tiles of the filter array of which nothing is
-    saturated; its factor is green's level over its own.
+    The level of a channel is :math:`(\frac{1}{N} \sum x^6)^{1/6}` over all tiles of the filter array without a
+    saturated pixel. The factor of a channel is the level of green divided by its own level.
 
     Args:
         raw: a capture with colours.
@@ -30,7 +30,7 @@ def auto_balance(raw: RawCapture) -> Tensor:
         ValueError: if a channel sees no light, or something is saturated in every tile.
 
     Assumes:
-        What is bright in the scene is grey on average. A meadow is not: it turns out too pink.
+        The bright parts of the scene are grey on average. For a meadow this is wrong: it turns out too pink.
 
     Source: Finlayson and Trezzi, Shades of gray and colour constancy, CIC 2004, whose best norm is 6.
 
@@ -45,7 +45,7 @@ def auto_balance(raw: RawCapture) -> Tensor:
     planes = planes[:, ::step, ::step]
     kept = planes[:, (planes < SATURATED).all(0)].clamp(min=0).double()
     if kept.shape[1] == 0:
-        raise ValueError("the capture is saturated everywhere, so nothing tells its white balance: give factors")
+        raise ValueError("the capture is saturated everywhere, so its white balance cannot be estimated: give factors")
     letters = raw.pattern_letters or raw.colors
     powers = kept.pow(NORM).mean(1)
     levels = powers.new_tensor(
@@ -55,5 +55,5 @@ def auto_balance(raw: RawCapture) -> Tensor:
         ]
     ).pow(1 / NORM)
     if not bool((levels > 0).all()):
-        raise ValueError("a channel of the capture sees no light, so nothing tells its white balance: give factors")
+        raise ValueError("a channel of the capture is dark, so its white balance cannot be estimated: give factors")
     return (levels[max(raw.colors.find("G"), 0)] / levels).float()

@@ -1,4 +1,4 @@
-"""Camera raw files: the counts of a sensor as it wrote them, and what is needed to read them as linear light."""
+"""Raw captures: the digital counts of a sensor, with its black and white levels, filter array and colours."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.raw.decoding import Source, decode_raw, source_bytes, source_name
 from kornia_tidy.raw.filter_array import filter_tile, tile_planes, tiled
-from kornia_tidy.raw.plausible import check_plausible, plausible_white
+from kornia_tidy.raw.validation import check_counts, validated_white
 
 
 @dataclass(frozen=True)
 class RawInfo:
-    """What a raw file says about the camera and the exposure; None where it says nothing.
+    """Camera and exposure data of a raw file; None where the file lacks the value.
 
     Attributes:
-        make: who built the camera.
-        model: its name.
-        lens: the lens's name.
+        make: manufacturer of the camera.
+        model: model of the camera.
+        lens: model of the lens.
         iso: sensitivity.
-        exposure: time in seconds.
+        exposure: exposure time in seconds.
         aperture: f-number.
         focal_length: in metres.
-        timestamp: when the picture was taken, by the camera's clock.
+        timestamp: time of the exposure by the camera's clock.
     """
 
     make: str | None = None
@@ -44,7 +44,7 @@ class RawInfo:
 
     @property
     def camera(self) -> str:
-        """Make and model, the make once where the model repeats it; empty if unknown.
+        """Make and model of the camera, without the make if the model begins with it; empty if unknown.
 
         Example:
             >>> RawInfo("NIKON CORPORATION", "NIKON D5100").camera, RawInfo("Sony", "ILCE-7").camera
@@ -57,7 +57,7 @@ class RawInfo:
 
 @dataclass(frozen=True, eq=False)
 class RawCapture:
-    """The visible area of a sensor, as counts, with its levels, colours and orientation.
+    """Counts of the visible area of a sensor, with levels, colours and orientation.
 
     Attributes:
         counts: (C, H, W) int32, in the sensor's orientation; C is 1 behind a filter array or for a monochrome
@@ -67,11 +67,11 @@ class RawCapture:
         colors: names of the channels by index, ``"RGBG"`` for a Bayer array (the second green is that of blue's
             rows), ``"GMCY"``, ``"RGB"`` for X-Trans and linear RGB, ``""`` for monochrome.
         black: count without light, float32: one for each place of the tile, or (C,) without a filter array.
-        white: saturation count, black not yet taken off.
-        xyz_to_camera: from CIE XYZ under D65 to the camera's colours, (3 or 4 different letters of ``colors``, 3), or
-            None if unknown.
-        camera_to_srgb: from the camera's white-balanced colours to linear sRGB, (3, 3 or 4), as a DNG's colour
-            matrices give it, or None.
+        white: saturation count, with the black level included.
+        xyz_to_camera: matrix from CIE XYZ under D65 to the camera's colours, (n, 3) for the n = 3 or 4 different
+            letters of ``colors``, or None if unknown.
+        camera_to_srgb: matrix from white-balanced camera colours to linear sRGB, (3, 3 or 4), computed from the
+            colour matrices of a DNG, or None.
         white_balance: factors as shot, (len(colors),), 1 for the first green; None if unknown.
         daylight_balance: factors for daylight, likewise.
         flip: how to turn the picture upright: 1 mirrors columns, 2 rows, then 4 swaps the two (LibRaw's code).
@@ -96,14 +96,14 @@ class RawCapture:
     def open(
         cls, source: Source, *, white: float | None = None, timeout: float = 60.0, memory_limit: int = 2**31
     ) -> RawCapture:
-        """Read a camera raw file, whatever is in it: a picture comes back, or one sentence.
+        """Read a camera raw file.
 
-        LibRaw decodes it in a process of its own, within these limits, so that a file that makes it crash, hang or
-        ask for all memory does no harm here. What it decodes is checked to be a picture.
+        LibRaw decodes the file in a separate process with limits of time and memory. A damaged file that makes LibRaw
+        crash or hang therefore raises an error and does no other harm. The decoded counts are validated.
 
         Args:
             source: a path, the bytes of a file, or a binary file.
-            white: saturation count. Default: the file's or, where its counts show that it lies, their largest.
+            white: saturation count. Default: that of the file or, if many counts lie far above it, the largest count.
             timeout: seconds that decoding may take.
             memory_limit: bytes of memory that decoding may use.
 
@@ -113,11 +113,11 @@ class RawCapture:
                 without a picture, or too much for the limits.
 
         Warns:
-            UserWarning: if the file's white level lies, or more than one count in a thousand lies above white; and
-                if the length of a file without a header alone says that it is a Kodak C330's.
+            UserWarning: if the white level of the file is too low, if more than one count in a thousand lies above
+                white, or if a file without a header is recognised as a Kodak C330's by its length.
 
         Convention:
-            The visible area only, without masked borders; a JPEG-like tone curve, if the file has one, is undone.
+            The counts cover the visible area without the masked borders. A tone curve of the file is inverted.
         """
         if white is not None:
             check_positive("white", white, "counts")
@@ -126,9 +126,9 @@ class RawCapture:
         try:
             raw = _from_header(header if white is None else {**header, "white": white}, counts)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"cannot read {name}: what it says of its sensor makes no sense ({error})") from None
-        check_plausible(name, raw.counts, raw.black, raw.white, length)
-        return replace(raw, white=plausible_white(name, raw.counts, raw.white, given=white is not None))
+            raise ValueError(f"cannot read {name}: its description of the sensor is invalid ({error})") from None
+        check_counts(name, raw.counts, raw.black, raw.white, length)
+        return replace(raw, white=validated_white(name, raw.counts, raw.white, given=white is not None))
 
     @classmethod
     def open_dump(
@@ -141,7 +141,7 @@ class RawCapture:
         dtype: str = "uint16",
         byte_order: str = "little",
     ) -> RawCapture:
-        """Read a bare dump of a sensor's counts, row by row: a file without a header says nothing of itself.
+        """Read a headerless dump of a sensor's counts, stored row by row.
 
         Args:
             source: a path, the bytes of a file, or a binary file.
@@ -179,8 +179,8 @@ class RawCapture:
             raise ValueError(f"white must be at most {np.iinfo(dtype).max}, the largest {dtype}, got {white}")
         counts = torch.from_numpy(np.frombuffer(data, layout).astype(np.int32).reshape(1, height, width))
         raw = cls.from_counts(counts, pattern, black, white)
-        check_plausible(name, raw.counts, raw.black, raw.white, len(data))
-        plausible_white(name, raw.counts, raw.white, given=True)
+        check_counts(name, raw.counts, raw.black, raw.white, len(data))
+        validated_white(name, raw.counts, raw.white, given=True)
         return raw
 
     @classmethod
@@ -192,7 +192,7 @@ class RawCapture:
         white: float,
         info: RawInfo | None = None,
     ) -> RawCapture:
-        """Return a capture of counts that did not come from a camera's file.
+        """Return a raw capture made from a tensor of counts.
 
         Args:
             counts: (C, H, W), whole numbers; C is 1, or 3 for linear RGB.
@@ -203,7 +203,7 @@ class RawCapture:
             info: camera and exposure, if known.
 
         Raises:
-            ValueError: if these do not belong together.
+            ValueError: if the shape of the counts, the pattern and the levels contradict each other.
 
         Example:
             >>> raw = RawCapture.from_counts(torch.tensor([[[64, 164], [264, 1064]]]), "GBRG", black=64, white=1064)
@@ -233,7 +233,7 @@ class RawCapture:
 
     @property
     def tile(self) -> tuple[int, int]:
-        """Rows and columns after which the filter array repeats; (1, 1) without one."""
+        """Period of the filter array in rows and columns; (1, 1) without one."""
         return (1, 1) if self.pattern is None else (len(self.pattern), len(self.pattern[0]))
 
     @property
@@ -245,26 +245,27 @@ class RawCapture:
         r"""Return linear light, :math:`(n - n_{black}) / (n_{white} - n_{black})`, (C, H, W) float32.
 
         Convention:
-            Noise around black stays below 0 and counts above white stay above 1: nothing is clamped.
+            Values are not clamped: noise around black stays negative, and counts above white stay above 1.
         """
         light = self.counts.float()
         if self.pattern is None:
             black = self.black[:, None, None]
             return light.sub_(black).div_(self.white - black)
         rows = self.tile[0]
-        for row, black in enumerate(tiled(self.black, rows, light.shape[-1])):  # whole rows: their pixels lie together
+        for row, black in enumerate(tiled(self.black, rows, light.shape[-1])):  # whole rows are contiguous in memory
             light[:, row::rows].sub_(black).div_(self.white - black)
         return light
 
     def planes(self) -> Tensor:
-        """Return the mosaic taken apart by places of the tile, not interpolated: (places, H // rows, W // columns).
+        """Return one plane of samples for each place of the filter tile, (places, H // rows, W // columns).
 
-        Without a filter array that is :meth:`mosaic`. Incomplete tiles at the right and the bottom are left out.
+        Nothing is interpolated. Without a filter array the planes are :meth:`mosaic`. Incomplete tiles at the right
+        and the bottom are left out.
         """
         return tile_planes(self.mosaic(), self.tile)
 
     def upright(self, image: Tensor) -> Tensor:
-        """Return a picture of this capture, (..., H, W), turned as the camera was held."""
+        """Return a picture of this capture, (..., H, W), rotated and mirrored upright."""
         if self.flip & 2:
             image = image.flip(-2)
         if self.flip & 1:
@@ -273,7 +274,7 @@ class RawCapture:
 
 
 def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
-    """Return the capture that the decoding process describes; a damaged file can make it say anything."""
+    """Return the capture described by the decoder's header, with checks against values of damaged files."""
     pattern, colors, info = header["pattern"], header["colors"], dict(header["info"])
     if pattern is not None:
         pattern = tuple(map(tuple, pattern))
@@ -303,13 +304,13 @@ def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
 
 
 def _matrix(rows: list[list[float]]) -> Tensor | None:
-    """Return a matrix, or None where the file has none: LibRaw then says zeros."""
+    """Return a colour matrix, or None if the file has none, for which LibRaw returns zeros."""
     matrix = torch.tensor(rows)
     return matrix if matrix.numel() and bool(matrix.isfinite().all() & (matrix != 0).any()) else None
 
 
 def _balance(factors: list[float], colors: str) -> Tensor | None:
-    """Return factors with that of the first green as 1, or None if one is unknown."""
+    """Return white balance factors scaled to 1 for the first green, or None if one is unknown."""
     if "G" not in colors:
         return None
     known = [factors[i] or factors[colors.index(letter)] for i, letter in enumerate(colors)]

@@ -1,4 +1,4 @@
-"""Colours of a camera: white balance, and from what its filters pass to linear sRGB."""
+"""Colour conversion from a camera's channels to linear sRGB, and white balance for daylight."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 
-# Linear sRGB from CIE XYZ, white (D65) at Y = 1: IEC 61966-2-1's primaries, and the same on the way back.
+# Linear sRGB from CIE XYZ with white (D65) at Y = 1, from the primaries of IEC 61966-2-1. XYZ from sRGB is its inverse.
 SRGB_FROM_XYZ = (
     (3.2404542, -1.5371385, -0.4985314),
     (-0.9692660, 1.8760108, 0.0415560),
@@ -24,19 +24,20 @@ ASSUMED_CAMERA = "Nikon 5100 (NPL)"  # as colour-science names its measured sens
 
 
 def camera_to_srgb(xyz_to_camera: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return how a camera's balanced colours become linear sRGB, and its white balance for daylight.
+    r"""Return a camera's matrix from balanced colours to linear sRGB, and its white balance factors for daylight.
 
-    With B the camera's colours of the sRGB primaries, its rows divided by their sums so that sRGB's white gives every
-    channel 1, colours are :math:`B^+ c`: the inverse, or for four filters the least squares.
+    The columns of a matrix B are the camera's responses to the sRGB primaries. Each row is divided by its sum, so that
+    sRGB's white gives 1 in every channel. Linear sRGB is then :math:`B^+ c`, with the inverse of B for three filters
+    and the least-squares inverse for four.
 
     Args:
         xyz_to_camera: (n, 3) for n = 3 or 4 filters.
 
     Returns:
-        (3, n), whose rows add up to 1, and (n,), the factors that make sRGB's white (D65) equal in all channels.
+        The matrix (3, n), whose rows sum to 1, and the factors (n,) that make sRGB's white (D65) equal in all channels.
 
     Convention:
-        LibRaw's and dcraw's: white balance scales the camera's own channels.
+        White balance scales the channels of the camera, as in LibRaw and dcraw.
 
     Example:
         >>> matrix, daylight = camera_to_srgb(torch.tensor([[0.9, -0.3, -0.1], [-0.8, 1.6, 0.3], [-0.3, 0.3, 0.8]]))
@@ -46,16 +47,18 @@ def camera_to_srgb(xyz_to_camera: Tensor) -> tuple[Tensor, Tensor]:
     srgb_to_camera = xyz_to_camera.double() @ srgb_from_xyz().inverse()
     sums = srgb_to_camera.sum(1, keepdim=True)
     if not bool((sums > 0).all()):
-        raise ValueError(f"xyz_to_camera must see white in every channel, it gives {sums.flatten().tolist()}")
+        raise ValueError(f"xyz_to_camera must respond to white in every channel, got {sums.flatten().tolist()}")
     return (srgb_to_camera / sums).pinverse().to(xyz_to_camera), sums.reciprocal().flatten().to(xyz_to_camera)
 
 
 def assumed_camera_to_srgb() -> tuple[Tensor, Tensor]:
-    """Return what :func:`camera_to_srgb` does, for a camera of which only is known that it has R, G and B filters.
+    """Return the colour matrix and daylight factors of a typical RGB camera, for cameras without a known matrix.
+
+    The results have the form of :func:`camera_to_srgb`.
 
     Assumes:
-        The spectral sensitivities of a Nikon D5100 (measured at NPL), and colours like those of the training set of
-        the ACES input transforms in daylight (D65), fitted by colour-science. Cameras differ: colours are plausible.
+        The spectral sensitivities of a Nikon D5100 (measured at NPL). The matrix is fitted by colour-science to the
+        training colours of the ACES input transforms in daylight (D65). Colours of other cameras are approximate.
 
     Source: Darrodi et al., Reference data set for camera spectral sensitivity estimation, JOSA A 2015, for the
         sensitivities; AMPAS P-2013-001 for the fit.
@@ -71,19 +74,20 @@ def assumed_camera_to_srgb() -> tuple[Tensor, Tensor]:
 
 
 def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptation: str) -> Tensor:
-    """Return the matrix (3, n) for colours that were balanced for a light other than daylight.
+    """Return the colour matrix with chromatic adaptation from the scene's illuminant to D65, (3, n).
 
-    White balance alone divides the light out in the camera's channels, which no eye has. Here its factors are taken
-    back to those of daylight, colours are converted, and the light's white is then moved to sRGB's in cone responses.
+    White balance scales the channels of the camera, while the eye adapts by its cone responses. The matrix therefore
+    replaces the factors by those of daylight, converts to XYZ, and adapts the white of the illuminant to D65 in cone
+    responses.
 
     Args:
-        matrix: for daylight, (3, n), and
-        daylight: its factors (n,), both as :func:`camera_to_srgb` returns them.
-        balance: factors (n,) that the colours were multiplied by; that they make white is taken for true.
+        matrix: colour matrix for daylight, (3, n), from :func:`camera_to_srgb`.
+        daylight: white balance factors for daylight, (n,), from :func:`camera_to_srgb`.
+        balance: factors (n,) by which the colours were multiplied, assumed to map the illuminant to white.
         adaptation: a transform of colour-science: ``"Bradford"``, ``"CAT02"``, ``"CAT16"`` or ``"Von Kries"``.
 
     Raises:
-        ValueError: if there is no such transform, or the factors belong to no light.
+        ValueError: if there is no such transform, or the factors give an illuminant with a negative XYZ.
 
     Example:
         >>> matrix, daylight = torch.eye(3), torch.ones(3)
@@ -95,7 +99,7 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
     undone = matrix.double() * (daylight.double() / balance.double())
     light = from_xyz.inverse() @ undone.sum(1)
     if not bool((light > 0).all()):
-        raise ValueError(f"white balance {balance.tolist()} belongs to no light: its XYZ is {light.tolist()}")
+        raise ValueError(f"white balance {balance.tolist()} belongs to no illuminant: its XYZ is {light.tolist()}")
     white = from_xyz.inverse().sum(1)
     with _colour_science() as colour:
         moved = colour.adaptation.matrix_chromatic_adaptation_VonKries(
@@ -106,13 +110,13 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
 
 
 def srgb_from_xyz() -> Tensor:
-    """Return the matrix from CIE XYZ to linear sRGB, (3, 3) float64; both have daylight (D65) for white."""
+    """Return the matrix from CIE XYZ to linear sRGB, (3, 3) float64, for the white point D65."""
     return torch.tensor(SRGB_FROM_XYZ, dtype=torch.float64)
 
 
 @contextmanager
 def _colour_science() -> Generator[Any]:
-    """Give the module; importing it takes seconds, warns and sets NumPy's print options, and its tables' steps warn."""
+    """Import colour-science with its warnings off and NumPy's print options restored; it takes seconds."""
     with warnings.catch_warnings(), np.printoptions():
         warnings.simplefilter("ignore")
         import colour  # noqa: PLC0415

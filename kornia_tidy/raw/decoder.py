@@ -1,8 +1,8 @@
-"""The process in which LibRaw decodes: a file on standard input, its counts and what LibRaw knows on standard output.
+"""Decoder process: a raw file on standard input, a JSON header and the counts on standard output.
 
-LibRaw is C++ that parses what anybody may have written: a file can crash it, keep it busy or ask it for all memory.
-It does so here, within limits of its own, and the process that asked reads a header of JSON and plain numbers.
-:mod:`kornia_tidy.raw.decoding` runs this file by its path, so that no package is imported but NumPy and rawpy.
+LibRaw is C++ code that parses untrusted files: a file can crash it, keep it busy or exhaust the memory. It runs in
+this process with limits of time and memory, and the parent process reads a JSON header and plain numbers.
+:mod:`kornia_tidy.raw.decoding` runs this file by its path, so that only NumPy and rawpy are imported.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ import types
 from typing import Any
 
 LARGEST_TILE = 6  # X-Trans
-LOADED = "loaded"  # printed as soon as NumPy and LibRaw are: a crash before is not the file's doing
-C330_LENGTHS = (2247168, 3370752)  # by which LibRaw tells the pictures of a Kodak C330, which have no header
+LOADED = "loaded"  # printed once NumPy and LibRaw are imported: an earlier crash is not caused by the file
+C330_LENGTHS = (2247168, 3370752)  # bytes; LibRaw recognises the headerless files of a Kodak C330 by their length
 
 
 def main() -> None:
-    """Decode: arguments are sys.path, as JSON, seconds of processor time and bytes of memory that may be used."""
+    """Decode standard input; arguments are sys.path as JSON, and the limits in processor seconds and bytes."""
     paths, seconds, memory = sys.argv[1:]
     limit(int(seconds), int(memory))
     sys.path[:] = json.loads(paths)
     with os.fdopen(os.dup(1), "wb") as output:
-        os.dup2(2, 1)  # LibRaw prints here and there
+        os.dup2(2, 1)  # LibRaw prints to standard output too
         try:
             header, counts = decode(sys.stdin.buffer.read())
-        except Exception as error:  # whatever it is, the file cannot be read
+        except Exception as error:  # any error means that the file cannot be read
             header, counts = {"error": type(error).__name__, "text": _words(error)}, b""
         output.write(json.dumps(header).encode() + b"\n")
         output.write(counts)
 
 
 def limit(seconds: int, memory: int) -> None:
-    """Bound the processor time and the memory of this process, and leave no core file, where the system can."""
+    """Limit processor time and memory of this process and disable core files, where the system supports it."""
     try:
         import resource  # noqa: PLC0415 (not on Windows)
     except ImportError:
@@ -50,7 +50,7 @@ def limit(seconds: int, memory: int) -> None:
 
 
 def _beside(name: str) -> Any:
-    """Return a module of this folder, by its file: importing the package would take longer than decoding."""
+    """Import a module of this folder by its path, since importing the package would take longer than decoding."""
     path = os.path.join(os.path.dirname(os.path.abspath(__file__)), f"{name}.py")
     loader = importlib.machinery.SourceFileLoader(name, path)
     module = types.ModuleType(name)
@@ -59,13 +59,13 @@ def _beside(name: str) -> Any:
 
 
 def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
-    """Return a header and the counts of the visible area, row by row, channels last, unsigned 16 bits."""
+    """Decode a raw file into a header and uint16 counts of the visible area, by rows with channels last."""
     import numpy as np  # noqa: PLC0415 (after the limits)
     import rawpy  # noqa: PLC0415
 
     tags = _beside("tags")
 
-    sys.stderr.write(LOADED + "\n")  # not buffered
+    sys.stderr.write(LOADED + "\n")  # standard error is not buffered
     if missing := tags.missing_bytes(data):
         raise ValueError(f"it is cut short, {missing} bytes of its picture are missing")
     if fault := tags.filter_array_fault(data):
@@ -88,9 +88,9 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         counts = np.ascontiguousarray(counts[..., :channels])
     white = raw.white_level
     if counts.ndim == 3 and len(set(levels)) == 1 and white + levels[0] in tags.white_levels(data):
-        white += levels[0]  # LibRaw takes one black level for all channels off white, but not off the counts
+        white += levels[0]  # LibRaw subtracts a common black level from white but not from the counts
     camera_to_srgb = raw.color_matrix.tolist()
-    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw reads the tag too, and keeps it to itself
+    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw does not return this tag
         camera_to_srgb = tags.kodak_matrix(data) or camera_to_srgb
     header = {
         "shape": (*counts.shape[:2], channels),
@@ -112,7 +112,7 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
 
 
 def finished_colors() -> dict[str, Any]:
-    """Return the colours, the balance and the name of a Kodak C330, whose YCbCr is balanced and of sRGB."""
+    """Return header fields of a Kodak C330 file; its YCbCr data are white-balanced sRGB."""
     return {
         "camera_to_srgb": [[float(row == column) for column in range(4)] for row in range(3)],
         "white_balance": [1.0] * 4,
@@ -122,9 +122,10 @@ def finished_colors() -> dict[str, Any]:
 
 
 def filter_pattern(raw: Any) -> list[list[int]]:
-    """Return the smallest tile, as indices of channels, by which the filter array repeats from the visible corner.
+    """Return the smallest repeating tile of the filter array from the visible corner, as channel indices.
 
-    LibRaw is asked for every place: its own tile begins at the corner of the whole sensor, margins included.
+    The channel of each place is queried from LibRaw, whose own tile starts at the corner of the whole sensor with its
+    margins.
     """
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
     span = range(4 * LARGEST_TILE)
@@ -137,7 +138,7 @@ def filter_pattern(raw: Any) -> list[list[int]]:
 
 
 def mean_over_tile(levels: list[list[float]], rows: int, columns: int) -> list[list[float]]:
-    """Return what black levels that repeat in their own way are, on average, at each place of the filter's tile."""
+    """Return black levels averaged onto the filter tile, from levels that repeat with another period."""
     tall, wide = math.lcm(len(levels), rows), math.lcm(len(levels[0]), columns)
 
     def mean(row: int, column: int) -> float:
@@ -152,10 +153,10 @@ def mean_over_tile(levels: list[list[float]], rows: int, columns: int) -> list[l
 
 
 def libraw_info(raw: Any) -> dict[str, Any]:
-    """Return what LibRaw says of the exposure, by the names of RawInfo; older versions of rawpy do not pass it on."""
+    """Return LibRaw's exposure data by the field names of RawInfo; empty with older versions of rawpy."""
     try:
         other, lens = raw.other, raw.lens
-    except (AttributeError, OSError, OverflowError, ValueError):  # an impossible timestamp among them
+    except (AttributeError, OSError, OverflowError, ValueError):  # for example an impossible timestamp
         return {}
     numbers = {
         "iso": other.iso_speed,
@@ -164,7 +165,7 @@ def libraw_info(raw: Any) -> dict[str, Any]:
         "focal_length": other.focal_length * 1e-3,
     }
     found: dict[str, Any] = {
-        name: float(f"{value:.7g}")  # LibRaw's are 32 bits wide: 5.6 and not 5.599999904632568
+        name: float(f"{value:.7g}")  # LibRaw's values are float32: 5.6 and not 5.599999904632568
         for name, value in numbers.items()
         if 0 < value < 1e9
     }
@@ -176,7 +177,7 @@ def libraw_info(raw: Any) -> dict[str, Any]:
 
 
 def _words(error: Exception) -> str:
-    """Return an error's message; LibRaw's come as bytes."""
+    """Return an error's message as text; LibRaw's messages are bytes."""
     cause = error.args[0] if error.args else ""
     return cause.decode("ascii", "replace") if isinstance(cause, bytes) else str(cause)
 

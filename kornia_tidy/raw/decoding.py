@@ -1,4 +1,4 @@
-"""Decoding of camera raw files by LibRaw, in a process of its own: whatever a file does to it ends in one sentence."""
+"""Decoding of camera raw files by LibRaw in a separate process, with one error sentence for every failure."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from torch import Tensor
 from kornia_tidy.checks import check_positive
 from kornia_tidy.files import check_file
 from kornia_tidy.raw.decoder import C330_LENGTHS, LOADED
-from kornia_tidy.raw.plausible import is_c330
+from kornia_tidy.raw.validation import is_c330
 
 Source = str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryIO
 
 DECODER = Path(__file__).with_name("decoder.py")
 LONGEST_HEADER = 1 << 16
-# How raw files begin, by where: TIFF and what is built like it, Canon, Fujifilm, Sigma, Minolta, Apple and others.
-# LibRaw takes a file without any of these for a dump of the counts if its size is that of some camera's.
+# First bytes of raw files, by their offset: TIFF and its relatives, Canon, Fujifilm, Sigma, Minolta, Apple and others.
+# LibRaw guesses the camera of a file without any of these from its size.
 BEGINNINGS = {
     0: (
         b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FUJIFILM", b"FOVb", b"\0MRM",
@@ -45,8 +45,8 @@ SENTENCES = {
     "LibRawRequestForNonexistentImageError": "it holds no raw picture",
     "LibRawTooBigError": "its picture is larger than LibRaw decodes",
 }
-# Where memory ends shows in the kind of an error or in its words: C++'s, the dynamic linker's, which loads NumPy and
-# LibRaw under the limit too, and OpenBLAS's, which ends the process.
+# Signs of exhausted memory: exceptions of Python and LibRaw, and messages of C++, of the dynamic linker, which loads
+# NumPy and LibRaw under the limit too, and of OpenBLAS, which ends the process.
 OUT_OF_MEMORY = ("MemoryError", "LibRawUnsufficientMemoryError", "LibRawMemPoolOverflowError")
 OUT_OF_MEMORY_WORDS = (
     "MemoryError",
@@ -54,24 +54,24 @@ OUT_OF_MEMORY_WORDS = (
     "failed to map segment",
     "Cannot allocate memory",
     "Memory allocation still failed",
-    "returned a result with an exception set",  # NumPy, as it is loaded
+    "returned a result with an exception set",  # NumPy during its import
 )
 
 
 def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[str, Any], Tensor, int]:
-    """Return what LibRaw knows of a raw file, its counts, (C, H, W) int32, and the file's length in bytes.
+    """Decode a raw file into LibRaw's header, the counts, (C, H, W) int32, and the file's length in bytes.
 
     Args:
-        source: a path, the bytes of a file, or a binary file, which is read from where it stands.
+        source: a path, the bytes of a file, or a binary file, which is read from its current position.
         timeout: seconds that decoding may take.
         memory_limit: bytes that the decoding process may use.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it cannot be decoded, for whatever reason, within these limits.
+        ValueError: if the file cannot be decoded within these limits.
 
     Warns:
-        UserWarning: if its length alone says what it is.
+        UserWarning: if a file without a header is recognised by its length.
     """
     check_positive("timeout", timeout, "seconds")
     check_positive("memory_limit", memory_limit, "bytes")
@@ -87,7 +87,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
             )
         else:
             check_beginning(name, beginning)
-        file.seek(0)  # where the process begins to read
+        file.seek(0)  # the process reads from the current position
         try:
             complaint = _complaint(*_run(file, result, timeout, memory_limit), memory_limit)
         except subprocess.TimeoutExpired:
@@ -104,7 +104,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
 
 
 def source_name(source: Source) -> str:
-    """Return what to call a source in a sentence."""
+    """Return the name of a source for messages."""
     if isinstance(source, str | os.PathLike):
         return str(source)
     if isinstance(source, bytes | bytearray | memoryview):
@@ -113,7 +113,7 @@ def source_name(source: Source) -> str:
 
 
 def source_bytes(source: Source) -> bytes:
-    """Return all that a source holds.
+    """Return the bytes of a source.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -127,7 +127,7 @@ def source_bytes(source: Source) -> bytes:
 
 
 def check_beginning(name: str, data: bytes) -> None:
-    """Refuse what does not begin as raw files do, before LibRaw guesses what it is from its size."""
+    """Raise ``ValueError`` unless the first bytes are those of a raw file, before LibRaw guesses from the size."""
     if not data:
         raise ValueError(f"cannot read {name}: the file is empty")
     if begins_as_raw(data):
@@ -141,13 +141,13 @@ def check_beginning(name: str, data: bytes) -> None:
 
 
 def begins_as_raw(data: bytes) -> bool:
-    """Return whether bytes are the beginning of a raw file with a header."""
+    """Return whether a file starts with the header of a known raw format."""
     return any(data.startswith(beginning, place) for place, all_ in BEGINNINGS.items() for beginning in all_)
 
 
 @contextmanager
 def _opened(source: Source) -> Generator[IO[bytes]]:
-    """Give a source as a file of the system, unbuffered as another process will read it; bytes in a temporary one."""
+    """Open a source as an unbuffered file for the decoder process; bytes go into a temporary file."""
     if isinstance(source, str | os.PathLike):
         path = check_file(source)
         if not path.is_file():
@@ -165,10 +165,10 @@ def _opened(source: Source) -> Generator[IO[bytes]]:
 
 
 def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) -> tuple[int, str]:
-    """Let the decoder read one file and write the other; return its exit status and what it printed.
+    """Run the decoder from one file into another; return its exit status and standard error.
 
     Raises:
-        subprocess.TimeoutExpired: if it took too long; it is dead by then.
+        subprocess.TimeoutExpired: if it took too long; the process has been killed.
     """
     arguments = [json.dumps(sys.path), str(int(timeout) + 1), str(int(memory_limit))]
     process = subprocess.run(  # noqa: S603 (our own interpreter and file)
@@ -176,7 +176,7 @@ def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) 
         stdin=file,
         stdout=result,
         stderr=subprocess.PIPE,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # threads that decode nothing, each with its stack
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # idle threads would take memory for their stacks
         timeout=timeout,
         check=False,
     )
@@ -184,7 +184,7 @@ def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) 
 
 
 def _complaint(status: int, printed: str, memory_limit: int) -> str | None:
-    """Return what an exit status and printed words mean; None if all went well."""
+    """Return the failure behind an exit status and standard error, in words; None after success."""
     if status < 0:
         name = Signals(-status).name
         if name == "SIGXCPU":
@@ -196,7 +196,7 @@ def _complaint(status: int, printed: str, memory_limit: int) -> str | None:
 
 
 def _header(result: IO[bytes]) -> dict[str, Any]:
-    """Return the line of JSON that the decoder wrote, and leave the file at the counts behind it."""
+    """Read the decoder's JSON header, and leave the file at the counts after it."""
     result.seek(0)
     try:
         header = json.loads(result.readline(LONGEST_HEADER))
@@ -211,13 +211,13 @@ def _counts(result: IO[bytes], shape: list[int]) -> Tensor:
     if result.seek(0, SEEK_END) - start != 2 * height * width * channels:
         raise ValueError
     mapped = np.memmap(result, dtype=np.uint16, mode="r", offset=start, shape=(height, width, channels))
-    counts = torch.empty(channels, height, width, dtype=torch.int32)  # small pages, see whole_numbers.py
+    counts = torch.empty(channels, height, width, dtype=torch.int32)  # not NumPy: see quantised_demosaicing.py
     counts.numpy()[:] = mapped.transpose(2, 0, 1)
     return counts
 
 
 def _sentence(header: dict[str, Any], memory_limit: int) -> str:
-    """Return what an exception in the decoder means."""
+    """Return the failure behind an exception in the decoder, in words."""
     kind, text = str(header["error"]), str(header.get("text", ""))
     if kind in OUT_OF_MEMORY:
         return _too_much(memory_limit)
@@ -227,7 +227,7 @@ def _sentence(header: dict[str, Any], memory_limit: int) -> str:
 
 
 def _failure(text: str, memory_limit: int) -> str:
-    """Return what the words of a decoder mean that did not come to an answer."""
+    """Return the failure behind the messages of a decoder that ended without a result."""
     text = text.removeprefix(LOADED)
     if any(words in text for words in OUT_OF_MEMORY_WORDS):
         return _too_much(memory_limit)

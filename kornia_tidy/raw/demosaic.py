@@ -1,4 +1,4 @@
-"""Demosaicing: all colours at every pixel, from the one that each saw behind its filter."""
+"""Demosaicing: interpolation of all colours at every pixel from the one colour sampled there."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.raw.color import srgb_from_xyz
 from kornia_tidy.raw.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
 from kornia_tidy.raw.filter_array import Tile
-from kornia_tidy.raw.whole_numbers import ROWS_AT_ONCE, in_whole_numbers
+from kornia_tidy.raw.quantised_demosaicing import ROWS_AT_ONCE, demosaic_quantised
 
-# kornia and OpenCV's older names tell a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
+# kornia and OpenCV's older names denote a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
 BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
 OPENCV = {"bilinear": ("", 16), "edge_aware": ("_EA", 16), "vng": ("_VNG", 8)}  # suffix and bits
-# LibRaw takes its VNG for four colours and Markesteijn's three passes for X-Trans, whatever it is asked for.
+# For other names LibRaw silently falls back on VNG for four colours and on Markesteijn's three passes for X-Trans.
 LIBRAW = {
     "Bayer": ("linear", "vng", "ppg", "ahd", "dcb", "dht"),
     "four-colour": ("linear", "vng"),
     "X-Trans": ("markesteijn",),
 }
-LARGEST_FACTOR = 100.0  # from sRGB to any camera: more is no camera, and would not fit a field
-# DCB and DHT pass over a picture again and again, Markesteijn's squares of 512 pixels are not all alike.
-LIBRAW_LOCAL, LIBRAW_REACH = ("linear", "vng", "ppg", "ahd"), 8  # rows: AHD's 5 at a border are bilinear, and 3 beyond
-LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # pixels of the shorter side that it takes
+LARGEST_FACTOR = 100.0  # of the matrix from sRGB to a camera: larger ones are not plausible and do not fit a DNG field
+# Only methods with a bounded reach are computed in bands. DCB and DHT iterate over the picture, and Markesteijn's
+# method treats its squares of 512 pixels differently.
+LIBRAW_LOCAL, LIBRAW_REACH = ("linear", "vng", "ppg", "ahd"), 8  # rows: 5 bilinear ones at AHD's border, and 3 more
+LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # least shorter side in pixels
 
 METHODS = (
     "bilinear",
@@ -43,36 +44,36 @@ METHODS = (
 def demosaic(
     mosaic: Tensor, pattern: Tile, colors: str, method: str = "bilinear", to_srgb: Tensor | None = None
 ) -> Tensor:
-    """Return all colours of a mosaic.
+    """Demosaic: interpolate all colours at every pixel of a mosaic.
 
     Args:
         mosaic: (..., 1, H, W), linear; white-balanced, for the methods that follow edges.
         pattern: index into ``colors`` at each place of the repeating tile, from the upper left corner.
         colors: names of the channels by index; a letter that comes twice is one colour. Both as
             :func:`~kornia_tidy.raw.filter_array.filter_tile` returns them.
-        method: how, by the name of who computes it.
+        method: the algorithm, named after the library that computes it.
 
-            * ``"bilinear"``: for any tile; differentiable, on any device, nothing rounded. Measured values stay; others
-              are the mean of the same colour nearby, weighted by a tent.
+            * ``"bilinear"``: for any tile; differentiable, on any device, not quantised. Samples are kept; missing
+              values are the mean of the same colour nearby, weighted by a tent.
             * ``"half"``: no interpolation. Each 2x2 tile (3x3 for X-Trans) becomes one pixel, the mean of each colour.
             * ``"kornia"``: bilinear, Bayer of even height and width; differentiable, on any device.
             * ``"opencv_bilinear"``, ``"opencv_edge_aware"``: Bayer. ``"opencv_vng"``: Bayer, and only 8 bits.
             * ``"libraw_linear"``, ``"libraw_vng"``: Bayer and four-colour; ``"libraw_ppg"``, ``"libraw_ahd"``,
               ``"libraw_dcb"``, ``"libraw_dht"``: Bayer; ``"libraw_markesteijn"``: X-Trans.
-        to_srgb: from the balanced colours to linear sRGB, (3, 3). ``"libraw_ahd"`` and ``"libraw_markesteijn"`` compare
-            colours as an eye sees them, and need it for that. Default: they are those of sRGB.
+        to_srgb: matrix from the balanced colours to linear sRGB, (3, 3). ``"libraw_ahd"`` and
+            ``"libraw_markesteijn"`` need it to compare colours in CIELAB. Default: the identity.
 
     Returns:
         (..., C, H, W) with C different colours, in the order of ``colors``; ``"half"``: (..., C, H // 2, W // 2).
 
     Raises:
-        ValueError: if the method is none of these or not for this tile or size, or the mosaic is not as above or, for
-            OpenCV and LibRaw, not finite.
+        ValueError: if the method is unknown or does not support this tile or size, if the mosaic has another shape, or
+            if it is not finite (OpenCV and LibRaw).
 
     Convention:
-        - Nothing is clipped: values below 0 and above 1 come back, as far as interpolation keeps them.
-        - OpenCV and LibRaw compute in whole numbers. The range of the mosaic, which is taken to include 0 and 1, is cut
-          into 65535 steps (``"opencv_vng"``: 255): 1.5e-5 for values in [0, 1]. Gradients end there.
+        - Nothing is clipped: values below 0 and above 1 are interpolated like others.
+        - OpenCV and LibRaw compute with integers. The range of the mosaic, extended to include 0 and 1, is quantised to
+          65535 steps (``"opencv_vng"``: 255), of 1.5e-5 for values in [0, 1]. These methods have no gradient.
 
     Source: VNG: Chang, Cheung and Pang 1999. AHD: Hirakawa and Parks 2005. PPG: Lin 2003. DCB: Góźdź. X-Trans:
         Markesteijn, in dcraw.
@@ -87,10 +88,10 @@ def demosaic(
 
 
 def demosaic_to_srgb(mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor) -> Tensor:
-    """Return a mosaic in linear sRGB, (..., 3, H, W): what :func:`demosaic` returns, multiplied by ``to_srgb``.
+    """Demosaic and convert to linear sRGB, (..., 3, H, W): the result of :func:`demosaic` times ``to_srgb``.
 
-    One pass over the picture where it comes back from whole numbers. The arguments are those of :func:`demosaic`,
-    ``to_srgb`` (3, colours).
+    Quantised methods multiply by the matrix in the pass that restores real values. The arguments are those of
+    :func:`demosaic`, with ``to_srgb`` of shape (3, colours).
 
     Example:
         >>> matrix = torch.tensor([[1.0, 0, 0], [0, 0.5, 0], [0, 0.5, 0.5]])
@@ -102,7 +103,7 @@ def demosaic_to_srgb(mosaic: Tensor, pattern: Tile, colors: str, method: str, to
 
 
 def mixed(image: Tensor, matrix: Tensor) -> Tensor:
-    """Return (..., 3, H, W) of an image (..., colours, H, W), in its own memory where it has room, times a matrix."""
+    """Multiply the colours of an image (..., colours, H, W) by a matrix (3, colours), in place for three colours."""
     result = image if image.shape[-3] == 3 else image.new_empty(*image.shape[:-3], 3, *image.shape[-2:])
     for top in range(0, image.shape[-2], ROWS_AT_ONCE):
         rows = slice(top, top + ROWS_AT_ONCE)
@@ -142,11 +143,10 @@ def _demosaic(
 
 
 def bilinear(mosaic: Tensor, tile: Tile) -> Tensor:
-    """Return (N, C, H, W) of mosaics (N, H, W): each colour's samples, weighted by a tent around each pixel.
+    """Interpolate mosaics (N, H, W) to (N, C, H, W) by normalised convolution with a tent.
 
-    The tent reaches as far as the smallest square that holds every colour wherever it is put: two pixels for Bayer,
-    where this is bilinear interpolation, three for X-Trans. Beyond the picture lies what the next tile inside has at
-    the same place.
+    The reach of the tent is the side of the smallest square that contains every colour at any position: two pixels for
+    Bayer, where this is bilinear interpolation, and three for X-Trans. At the border the nearest tile is repeated.
 
     Source: Knutsson and Westin, Normalized and differential convolution, CVPR 1993.
     """
@@ -165,7 +165,7 @@ def bilinear(mosaic: Tensor, tile: Tile) -> Tensor:
 
 
 def _tent(tile: Tile, y: int, x: int, color: int, reach: int) -> list[tuple[int, int, float]]:
-    """Return rows, columns and weights of a colour's samples around a place of the tile; itself if measured there."""
+    """Return offsets and weights of the samples that give a colour at a place of the tile; (0, 0) if sampled there."""
     if tile[y][x] == color:
         return [(0, 0, 1.0)]
     steps = range(1 - reach, reach)
@@ -179,7 +179,7 @@ def _tent(tile: Tile, y: int, x: int, color: int, reach: int) -> list[tuple[int,
 
 
 def _beyond(length: int, period: int, margin: int) -> Tensor:
-    """Return the indices of a row with a margin at both ends, taken from the same place of the next tile inside."""
+    """Return pixel indices with a margin at both ends, in which the nearest tile is repeated."""
     index = torch.arange(-margin, length + margin)
     last = (length - 1 - index.clamp(min=length - 1)).div(period, rounding_mode="floor") * period
     first = (-index.clamp(max=0)).add(period - 1).div(period, rounding_mode="floor") * period
@@ -187,7 +187,7 @@ def _beyond(length: int, period: int, margin: int) -> Tensor:
 
 
 def binned(mosaic: Tensor, tile: Tile) -> Tensor:
-    """Return (N, C, H // s, W // s): the mean of each colour in squares of s x s pixels that hold all of them.
+    """Bin each colour over squares of s x s pixels that contain all colours, (N, C, H // s, W // s).
 
     s is 2 for a 2x2 tile and 3 for X-Trans. Pixels beyond the last whole square are left out.
     """
@@ -206,7 +206,7 @@ def binned(mosaic: Tensor, tile: Tile) -> Tensor:
 
 
 def _holds_all(tile: Tile, side: int, step: int) -> bool:
-    """Return whether squares of this side hold every colour, put at every ``step`` rows and columns."""
+    """Return whether squares of this side contain every colour at all positions that are multiples of ``step``."""
     number = {index for row in tile for index in row}
     places = range(0, len(tile), step)
     return all(
@@ -228,19 +228,19 @@ def _kornia(mosaic: Tensor, letters: str, colors: str) -> Tensor:
 def _opencv(mosaic: Tensor, letters: str, colors: str, name: str, matrix: Tensor) -> Tensor:
     check_choice("the filter array of demosaicing by OpenCV", letters, tuple(BAYER))
     suffix, bits = OPENCV[name]
-    code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names begin at the corner
+    code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names denote the array from its corner
     matrix = matrix[:, [colors.index(letter) for letter in "RGB"]]
-    return in_whole_numbers(mosaic, lambda counts: cv2.demosaicing(counts, code), bits, matrix)
+    return demosaic_quantised(mosaic, lambda counts: cv2.demosaicing(counts, code), bits, matrix)
 
 
 def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
-    import rawpy  # noqa: PLC0415  (only who asks for it loads a C++ library)
+    import rawpy  # noqa: PLC0415  (a C++ library, loaded only when needed)
 
     kind = "Bayer" if letters in BAYER else "four-colour" if len(colors) == 4 else "X-Trans"
     check_choice(f"LibRaw's demosaicing of a {kind} array", name, LIBRAW[kind])
     side = 6 if kind == "X-Trans" else 2
     lacking = LIBRAW_SMALLEST[kind] - min(mosaic.shape[-2:])
-    tiles = max(-(-lacking // (2 * side)), int(kind == "X-Trans"), 0)  # it leaves the corner of X-Trans black
+    tiles = max(-(-lacking // (2 * side)), int(kind == "X-Trans"), 0)  # LibRaw leaves the corner of X-Trans black
     margin = tiles * side
     height, width = mosaic.shape[-2:]
     algorithm = rawpy.DemosaicAlgorithm["AHD" if name == "markesteijn" else name.upper()]
@@ -260,12 +260,12 @@ def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tenso
             )
 
     wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
-    image = in_whole_numbers(wide, postprocess, 16, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
+    image = demosaic_quantised(wide, postprocess, 16, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 
 
 def _matrix_fields(to_srgb: Tensor | None) -> list[Field]:
-    """Say which colours R, G and B are: those of sRGB where nothing is known, or the matrix is almost singular."""
+    """Return the DNG colour matrix fields; the primaries are sRGB's for an unknown or almost singular matrix."""
     matrix = torch.eye(3, dtype=torch.float64) if to_srgb is None else to_srgb.detach().double().cpu()
     inverse = matrix.pinverse()
     if float(inverse.abs().max()) > LARGEST_FACTOR:

@@ -1,4 +1,4 @@
-"""Developing: a raw capture as an RGB picture."""
+"""Raw development: white balance, demosaicing and colour conversion of a raw capture into an RGB picture."""
 
 from __future__ import annotations
 
@@ -34,42 +34,42 @@ def develop(
     square_pixels: bool = True,
     upright: bool = True,
 ) -> Tensor:
-    """Return the picture of a raw capture.
+    """Develop a raw capture into a picture.
 
-    Levels are taken out and white balance is put in before demosaicing, the camera's matrix after it; nothing else is
-    done: no brightening, no sharpening, no denoising.
+    Black and white levels and the white balance are applied before demosaicing, the colour matrix after it. The
+    picture is not brightened, sharpened or denoised.
 
     Args:
         raw: the capture.
         method: of :func:`~kornia_tidy.raw.demosaic.demosaic`, for captures behind a filter array. Default: that of
             :func:`default_method`.
-        white_balance: ``"as shot"``, ``"daylight"``, ``"auto"``, see
-            :func:`~kornia_tidy.raw.auto_balance.auto_balance`, or ``"none"``, or factors, one a channel of
-            ``raw.colors`` or one a colour. Default: as shot if the file says it, else daylight if it says that, else
-            none.
-        highlights: a channel that is multiplied by more saturates higher. ``"clip"`` takes all to the lowest of these
-            levels, which becomes 1: what is saturated is white. ``"keep"`` leaves what is above 1, in false colours
-            where a channel is saturated.
-        adaptation: chromatic adaptation, see :func:`~kornia_tidy.raw.color.adapted_to_srgb`. Default: none but
-            the white balance in the camera's channels, as LibRaw.
-        matrix: from balanced colours to linear sRGB, (3, colours). Default: the capture's own or, where it has none
-            and its filters are R, G and B, that of
-            :func:`~kornia_tidy.raw.color.assumed_camera_to_srgb`.
-        encoded: sRGB encoding; False is linear.
-        square_pixels: stretch pixels that are not square, linearly, along their shorter side's direction.
-        upright: turn the picture as the camera was held.
+        white_balance: ``"as shot"``, ``"daylight"``, ``"auto"`` (see
+            :func:`~kornia_tidy.raw.auto_balance.auto_balance`), ``"none"``, or factors, one for each channel of
+            ``raw.colors`` or one for each colour. Default: as shot if the file has it, else daylight if the file has
+            that, else none.
+        highlights: white balance raises the saturation level of a channel by its factor. ``"clip"`` clips all channels
+            to the lowest of these levels, which becomes 1, so that saturated pixels are white. ``"keep"`` keeps values
+            above 1; where a channel is saturated, their colours are false.
+        adaptation: chromatic adaptation, see :func:`~kornia_tidy.raw.color.adapted_to_srgb`. Default: only the white
+            balance of the camera's channels, as in LibRaw.
+        matrix: from balanced colours to linear sRGB, (3, colours). Default: the capture's own or, if it has none and
+            its filters are R, G and B, that of :func:`~kornia_tidy.raw.color.assumed_camera_to_srgb`.
+        encoded: apply the sRGB encoding; False returns linear light.
+        square_pixels: resample pictures of non-square pixels, linearly, to more columns or more rows.
+        upright: rotate and mirror the picture upright.
 
     Returns:
-        (3, H, W) float32; (1, H, W) of a monochrome sensor, whose values have neither balance nor matrix.
+        (3, H, W) float32; (1, H, W) for a monochrome sensor, without white balance and colour matrix.
 
     Raises:
-        ValueError: if the capture lacks what is asked for, or an argument is none of the above.
+        ValueError: if the capture lacks the white balance or the matrix asked for, or an argument is invalid.
 
     Warns:
-        UserWarning: if daylight is taken because the file does not say its white balance, and nobody asked for it.
+        UserWarning: if daylight is chosen by default because the file has no white balance as shot.
 
     Convention:
-        Black is 0, noise below it negative; colours that sRGB cannot show lie outside [0, 1]. Neither is clamped.
+        Black is 0 and noise around it may be negative. Colours out of sRGB's gamut lie outside [0, 1]. Nothing but
+        the highlights is clamped.
 
     Example:
         >>> from kornia_tidy.raw.capture import RawCapture
@@ -107,7 +107,7 @@ def develop(
 
 
 def default_method(raw: RawCapture) -> str:
-    """Return how a capture is demosaiced if nobody says: LibRaw's AHD or, for X-Trans, Markesteijn's; else bilinear."""
+    """Return the default demosaicing method: LibRaw's AHD for Bayer, Markesteijn for X-Trans, else bilinear."""
     letters = raw.pattern_letters or ""
     if letters in BAYER:
         return "libraw_ahd"
@@ -122,8 +122,8 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
         white_balance: as for :func:`develop`.
 
     Raises:
-        ValueError: if the file does not say it, nothing in the capture tells it (``"auto"``), or given factors are
-            not positive, or not as many as channels or colours.
+        ValueError: if the file lacks it, if it cannot be estimated (``"auto"``), or if given factors are not positive
+            or not as many as channels or colours.
     """
     none = torch.ones(len(raw.colors))
     if white_balance is None:
@@ -157,7 +157,7 @@ def srgb_matrix(raw: RawCapture, factors: Tensor, adaptation: str | None = None)
         adaptation: as for :func:`develop`.
 
     Raises:
-        ValueError: if the filters are not R, G and B and nothing is known of them.
+        ValueError: if no matrix is known and the filters are not R, G and B.
     """
     names = "".join(dict.fromkeys(raw.colors))
     first = [raw.colors.index(letter) for letter in names]
@@ -170,14 +170,14 @@ def srgb_matrix(raw: RawCapture, factors: Tensor, adaptation: str | None = None)
     elif names == "RGB":
         matrix, daylight = assumed_camera_to_srgb()
     else:
-        raise ValueError(f"nothing is known of the colours of its filters {names}: give a matrix")
+        raise ValueError(f"the capture has no colour matrix for its filters {names}: give a matrix")
     return matrix if adaptation is None else adapted_to_srgb(matrix, daylight, factors[first], adaptation)
 
 
 def matrix_origin(raw: RawCapture) -> str:
-    """Return whose colour matrix develops a capture: ``"file"``, the camera's ``"model"``, or ``"assumed"``.
+    """Return the origin of a capture's colour matrix: ``"file"``, the camera's ``"model"``, or ``"assumed"``.
 
-    A file's own comes first, as with LibRaw: whoever wrote a DNG knew what was done to its colours.
+    The matrix of the file comes first, as in LibRaw, since the writer of a DNG may have processed its colours.
     """
     if raw.camera_to_srgb is not None:
         return "file"
@@ -185,15 +185,15 @@ def matrix_origin(raw: RawCapture) -> str:
 
 
 def encode(image: Tensor) -> Tensor:
-    """Return linear light, (3, H, W) or (1, H, W), in sRGB's encoding; not clamped, negative light stays negative."""
+    """Encode linear light, (3, H, W) or (1, H, W), as sRGB without clamping; negative light stays negative."""
     return linear_rgb_to_rgb(image.expand(3, -1, -1))[: len(image)]
 
 
 def squared(image: Tensor, pixel_aspect: float) -> Tensor:
-    """Return (C, H, W) with square pixels: more columns if a pixel is wider than high, else more rows.
+    """Resample an image (C, H, W) to square pixels: more columns for wide pixels, more rows for tall ones.
 
     Args:
-        image: to be stretched, linearly, about its middle.
+        image: resampled linearly about its centre.
         pixel_aspect: width of a pixel over its height.
     """
     height, width = image.shape[-2:]
@@ -202,7 +202,7 @@ def squared(image: Tensor, pixel_aspect: float) -> Tensor:
 
 
 def _balance(mosaic: Tensor, raw: RawCapture, factors: Tensor) -> None:
-    """Multiply every channel of a mosaic, in place, by its factor."""
+    """Apply white balance factors to a mosaic in place."""
     if raw.pattern is None:
         mosaic *= factors[:, None, None]
         return

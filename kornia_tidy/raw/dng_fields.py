@@ -1,4 +1,4 @@
-"""DNG files by their fields: samples of 16 bits, uncompressed in one strip."""
+"""DNG encoding from TIFF fields, with uncompressed 16-bit samples in one strip."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def dng_bytes(
     fields: Sequence[Field] = (),
     exif: Sequence[Field] = (),
 ) -> bytes:
-    """Return a DNG file.
+    """Encode samples and fields as the bytes of a DNG file.
 
     Args:
         samples: (H, W, C) uint16.
         letters: of the filter array's tile, 4 or 36, by rows; None without one.
-        colors: the letters in the order in which a reader shall name them.
+        colors: the different letters in the order of the colour planes.
         white: saturation count.
-        fields: what else there is to say, and
-        exif: the same, of the Exif directory.
+        fields: further fields of the main directory.
+        exif: fields of the Exif directory.
 
     Source: Adobe, Digital Negative Specification 1.4; TIFF 6.0 for the container.
     """
@@ -52,7 +52,7 @@ def dng_bytes(
         (278, LONG, [height]),  # one strip
         (279, LONG, [samples.nbytes]),
         (284, SHORT, [1]),  # channels of a pixel together
-        (50706, BYTE, [1, 4, 0, 0]),  # DNG version, and that which a reader needs
+        (50706, BYTE, [1, 4, 0, 0]),  # DNG version, and below it the oldest one that a reader must support
         (50707, BYTE, [1, 1, 0, 0]),
         (50717, LONG, [white] * channels),
         *fields,
@@ -69,12 +69,12 @@ def dng_bytes(
 
 
 def _tiff(fields: list[Field], exif: Sequence[Field], data: memoryview) -> tuple[bytes, memoryview]:
-    """A little-endian TIFF: header, directory and Exif directory, and the data of its one strip behind them."""
+    """Encode a little-endian TIFF: header, directory, Exif directory, and the data of its one strip."""
     begin = 8
     if exif:
         fields = [*fields, (34665, LONG, [0])]
     fields = [*fields, (273, LONG, [0])]
-    table = _directory(fields, begin)  # once for its size
+    table = _directory(fields, begin)  # a first pass gives its size
     nested = _directory(exif, begin + len(table)) if exif else b""
     strip = -(-(begin + len(table) + len(nested)) // DATA_ALIGNMENT) * DATA_ALIGNMENT
     places = {34665: begin + len(table), 273: strip}
@@ -84,7 +84,7 @@ def _tiff(fields: list[Field], exif: Sequence[Field], data: memoryview) -> tuple
 
 
 def _directory(fields: Sequence[Field], begin: int) -> bytes:
-    """A directory that starts at a place in the file, and behind it the values longer than four bytes."""
+    """Encode a directory at an offset of the file, followed by the values longer than four bytes."""
     entries, longer = b"", b""
     outside = begin + 2 + 12 * len(fields) + 4
     for tag, kind, values in sorted(fields, key=lambda field: field[0]):
@@ -98,7 +98,7 @@ def _directory(fields: Sequence[Field], begin: int) -> bytes:
 
 
 def _packed(kind: int, values: Sequence[float] | bytes) -> tuple[int, bytes]:
-    """How many values there are, and their bytes."""
+    """Encode values of a TIFF type; return their number and bytes."""
     if isinstance(values, bytes):
         return len(values) + 1, values + b"\0"
     if kind in CODES:

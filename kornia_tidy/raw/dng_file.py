@@ -1,4 +1,4 @@
-"""Raw captures as DNG files: counts uncompressed, exactly as they are, with what it takes to read them as light."""
+"""DNG files of raw captures: lossless counts with levels, filter array, colours and camera data."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}  # LibRaw's flip
 
 
 def write_dng(path: str | os.PathLike[str], raw: RawCapture) -> None:
-    """Write a capture as a DNG file, all or nothing.
+    """Write a capture as a DNG file, atomically.
 
     Args:
-        path: where to, as a rule ``.dng``.
-        raw: the capture; its counts, 0 to 65535, come back equal to the last bit.
+        path: the file, usually ``.dng``.
+        raw: the capture; its counts, 0 to 65535, are stored without loss.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -31,11 +31,11 @@ def write_dng(path: str | os.PathLike[str], raw: RawCapture) -> None:
 
 
 def encode_dng(raw: RawCapture) -> bytes:
-    """Return a capture as the bytes of a DNG file, see :func:`write_dng`.
+    """Encode a capture as the bytes of a DNG file, see :func:`write_dng`.
 
     Convention:
-        - Counts take 16 bits whatever the converter had; ``white`` says how far they go.
-        - A matrix that is known only from balanced colours to sRGB is written as one from XYZ, for LibRaw and others.
+        - Counts take 16 bits for every converter; ``white`` is the saturation count.
+        - A matrix known only from balanced colours to sRGB is converted to one from XYZ, as DNG readers expect.
 
     Source: Adobe, Digital Negative Specification 1.4; Exif 2.3.
 
@@ -68,7 +68,7 @@ def encode_dng(raw: RawCapture) -> bytes:
 
 
 def _colors(raw: RawCapture) -> list[Field]:
-    """Matrix from XYZ and white balance, by the planes of CFAPlaneColor."""
+    """Return the fields of white balance and XYZ matrix, in the order of CFAPlaneColor."""
     if not raw.colors:
         return []
     planes = [raw.colors.index(letter) for letter in dict.fromkeys(raw.colors)]
@@ -99,7 +99,7 @@ def _camera(info: RawInfo) -> list[Field]:
 
 
 def _exposure(info: RawInfo) -> list[Field]:
-    """Fields of the Exif directory."""
+    """Return the fields of the Exif directory."""
     numbers = ((33434, info.exposure), (33437, info.aperture))
     fields: list[Field] = [(tag, RATIONAL, [value]) for tag, value in numbers if value]
     if info.focal_length:

@@ -1,4 +1,4 @@
-"""Filter arrays: the tile of colours that repeats over a sensor."""
+"""Colour filter arrays: the tile of colours that repeats over a sensor."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PATTERN_COLORS = {"RGB": "RGBG", "CGMY": "GMCY"}  # LibRaw's order of the channe
 
 
 def filter_tile(letters: str) -> tuple[Tile, str]:
-    """Return the tile of a filter array as indices, and the names of the channels that they are.
+    """Return the tile of a filter array as channel indices, and the names of the channels.
 
     Args:
         letters: by rows: 4 for a 2x2 tile, 36 for 6x6.
 
     Convention:
-        As LibRaw: in a 2x2 tile of R, G and B the green of blue's row is a fourth channel.
+        As in LibRaw, the green of blue's row is a fourth channel in a 2x2 tile of R, G and B.
 
     Example:
         >>> filter_tile("GRBG")
@@ -41,7 +41,7 @@ def filter_tile(letters: str) -> tuple[Tile, str]:
 
 
 def tile_planes(mosaic: Tensor, tile: tuple[int, int]) -> Tensor:
-    """Return a mosaic (C, H, W) taken apart by places of the tile: (C * rows * columns, H // rows, W // columns).
+    """Split a mosaic (C, H, W) into planes by place of the tile, (C * rows * columns, H // rows, W // columns).
 
     Example:
         >>> import torch
@@ -56,7 +56,7 @@ def tile_planes(mosaic: Tensor, tile: tuple[int, int]) -> Tensor:
 
 
 def tiled(tile: Tensor, height: int, width: int) -> Tensor:
-    """Return what repeats after (rows, columns) over (height, width) pixels.
+    """Repeat a tile (rows, columns) over (height, width) pixels.
 
     Example:
         >>> import torch

@@ -1,6 +1,7 @@
-"""Simulated raw captures: what a given camera's raw file would hold of a scene, to train and test for that camera.
+"""Simulation of raw captures with the filter array, levels, colours and noise of a given camera.
 
-The camera is a :class:`RawCapture` whose counts do not matter: one of its files, or :meth:`RawCapture.from_counts`.
+The camera is described by a :class:`RawCapture`, from one of its files or :meth:`RawCapture.from_counts`. The counts of
+that capture are not used.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ def simulate_raw(
     color: str = "camera",
     generator: torch.Generator | None = None,
 ) -> RawCapture:
-    """Return the raw capture that a camera makes of an image on its sensor.
+    """Simulate the raw capture of an image on the sensor.
 
     Args:
-        light: (3, H, W), or (1, H, W) for a camera without colours, linear; see :func:`sensor_counts`.
-        camera: whose filter array, levels and colours the capture gets; its own counts are not looked at.
-        noise: its noise, :meth:`~kornia_tidy.calibration.noise.photon_transfer.PhotonTransfer.sensor_noise`; None for
-            none.
+        light: (3, H, W), or (1, H, W) for a monochrome camera, linear; see :func:`sensor_counts`.
+        camera: gives the filter array, levels and colours of the capture.
+        noise: of the sensor, see :meth:`~kornia_tidy.calibration.noise.photon_transfer.PhotonTransfer.sensor_noise`;
+            None for no noise.
         color: as for :func:`sensor_counts`.
-        generator: where random numbers come from. Default: the global generator.
+        generator: random number generator. Default: the global generator.
 
     Raises:
         TypeError: if the light is not a floating-point tensor.
-        ValueError: if its shape does not fit, a value is not finite, or the camera's colours are not known.
+        ValueError: if its shape does not fit, a value is not finite, or the camera's colours are unknown.
 
     Example:
         >>> camera = RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", black=64, white=1023)
@@ -65,16 +66,16 @@ def simulate_scene(
     color: str = "camera",
     generator: torch.Generator | None = None,
 ) -> RawCapture:
-    """Return the raw capture that a camera behind given optics makes of a scene with depth.
+    """Simulate the raw capture of a scene with depth through given optics.
 
     Args:
-        image: (3, H, W) or (1, H, W), encoded as the optics take it.
+        image: (3, H, W) or (1, H, W), in the color space of the optics.
         depth: (1, H, W), metres.
         optics: a :class:`~kornia_tidy.camera.tidy_optics.TiDyOptics` with ``sensor=None``, as the camera is the sensor.
-        camera: as for :func:`simulate_raw`, with
-        noise: its noise,
-        color: its colours, and
-        generator: the random numbers.
+        camera: as for :func:`simulate_raw`.
+        noise: as for :func:`simulate_raw`.
+        color: as for :func:`sensor_counts`.
+        generator: random number generator. Default: the global generator.
 
     Raises:
         ValueError: if the optics have a sensor of their own; and as :func:`simulate_raw` and the optics do.
@@ -103,28 +104,28 @@ def sensor_counts(
     color: str = "camera",
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    r"""Return a camera's counts of images on its sensor, as whole numbers with a gradient.
+    r"""Return the digital counts of images on the sensor, quantised with a straight-through gradient.
 
     .. math:: n = \mathrm{round}\left( n_{black} + (n_{white} - n_{black}) \, x \right)
 
-    with x the noisy light behind a pixel's filter, cut to 0 and the white level. Noise around black is kept, as cameras
-    do, and saturated pixels have the white level to the count.
+    with x the noisy light behind the filter of a pixel. Counts are clamped to 0 and the white level. Noise around black
+    is kept, as cameras do, and saturated pixels have exactly the white level.
 
     Args:
-        light: (B, 3, H, W), or (B, 1, H, W) for a camera without colours, linear, 1.0 saturates.
-        camera: whose filter array, levels and colours are meant.
-        noise: shot noise and read noise; its bits and its clipping are not used, the camera's levels are. None: none.
-        color: ``"camera"``: the light is linear sRGB, and is seen through the camera's filters, by its matrix and its
-            white balance, so that white of 1.0 saturates the most sensitive channel, and developing the capture gives
-            the light back. ``"channels"``: red, green and blue of the light are the camera's own, unbalanced.
-        generator: where random numbers come from, eager only. Default: the global generator.
+        light: (B, 3, H, W), or (B, 1, H, W) for a monochrome camera, linear, 1.0 saturates.
+        camera: gives the filter array, levels and colours.
+        noise: shot noise and read noise; the camera's levels replace its bits and clipping. None for no noise.
+        color: ``"camera"``: the light is linear sRGB. The camera's matrix and white balance convert it to the camera's
+            channels, so that white of 1.0 saturates the most sensitive channel, and developing the capture restores
+            the light. ``"channels"``: red, green and blue of the light are the camera's own channels, unbalanced.
+        generator: random number generator, eager only. Default: the global generator.
 
     Returns:
         (B, 1, H, W) behind a filter array, else (B, C, H, W); float32 or wider.
 
     Convention:
-        - Gradient: straight through rounding, zero where a count is cut.
-        - Filters whose response to a colour would be negative, which a matrix can say, see no light.
+        - Gradient: straight through rounding, zero where a count is clamped.
+        - Negative responses of a filter, which a matrix can give for saturated colours, are set to zero.
     """
     check_float_tensor("light", light, 4, "(B, C, H, W)")
     check_choice("color", color, COLORS)
@@ -153,7 +154,7 @@ def sensor_counts(
 
 
 def _responses(camera: RawCapture, color: str) -> Tensor:
-    """What each channel of ``camera.colors`` sees of red, green and blue light, (channels, 3)."""
+    """Return the responses of the channels of ``camera.colors`` to red, green and blue light, (channels, 3)."""
     letters = "".join(dict.fromkeys(camera.colors))
     rows = [letters.index(letter) for letter in camera.colors]
     if color == "channels":
@@ -166,10 +167,10 @@ def _responses(camera: RawCapture, color: str) -> Tensor:
         balanced = camera_to_srgb(camera.xyz_to_camera.double().cpu())[0].pinverse()
     else:
         raise ValueError(
-            "the camera's colors are unknown, it carries no matrix: choose color='channels', or give it one with "
+            "the camera has no colour matrix: choose color='channels', or give it one with "
             "dataclasses.replace(camera, xyz_to_camera=...)"
         )
-    balanced = balanced / balanced.sum(1, keepdim=True)  # white gives 1 in each
+    balanced = balanced / balanced.sum(1, keepdim=True)  # white gives 1 in each channel
     balance = camera.daylight_balance if camera.white_balance is None else camera.white_balance
     if balance is None:
         return balanced[rows]

@@ -1,11 +1,11 @@
-"""Names, exposure, levels, filter array and colours from the tags of a raw file, whatever nonsense these hold.
+"""Reader of the TIFF tags of raw files: names, exposure, levels, filter array and colours.
 
-LibRaw's Python package does not tell who built the camera, nor a black level that differs between places of a large
-tile, nor the colour matrix of Kodak's first cameras. The decoding process runs this file, so it imports nothing but the
-standard library.
+LibRaw's Python package does not return the manufacturer, black levels that differ within a large tile, and the colour
+matrix of Kodak's first cameras. The tags of a damaged file may hold any value. The decoder process runs this file, so
+it imports only the standard library.
 
 Source: TIFF 6.0, section 2; TIFF/EP, CFAPattern; Exif 2.32, 4.6; DNG 1.7, BlackLevel, WhiteLevel, CFAPlaneColor and
-CFALayout; Canon's CRW by P. Harvey's notes on its format; Kodak's matrix by what dcraw takes it for.
+CFALayout; P. Harvey's notes on Canon's CRW format; dcraw for Kodak's matrix.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from typing import Any
 TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 7: "s", 10: "ii", 11: "f", 12: "d", 13: "I"}  # of TIFF's fields
 SUB_DIRECTORIES = (0x014A, 0x8769)  # SubIFDs, Exif
 MOST_DIRECTORIES, MOST_ENTRIES, MOST_BYTES = 32, 512, 1 << 16
-MOST_SHOWN = 8  # numbers in a sentence
+MOST_SHOWN = 8  # numbers in a message
 
 TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
 NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
 TIMES = (0x9003, 0x0132)
 SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL = 0x00FE, 0xC612, 0xC619, 0xC61A
 WHITE_LEVEL, KODAK_MATRIX = 0xC61D, 0x9218
-PHOTOMETRIC, FILTER_ARRAY = 0x0106, 32803  # and its value of a picture behind a filter array
+PHOTOMETRIC, FILTER_ARRAY = 0x0106, 32803  # the tag, and its value for a picture behind a filter array
 FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT = 0x828D, 0x828E, 0xC616, 0xC617
 LARGEST_FILTER_TILE = 8  # rows or columns; DNG names no limit, X-Trans has 6
 COLOR_CODES = range(7)  # red, green, blue, cyan, magenta, yellow, white
-STORED = ((0x0111, 0x0117), (0x0144, 0x0145))  # where strips and tiles begin, and their lengths
+EXTENTS = ((0x0111, 0x0117), (0x0144, 0x0145))  # offsets and lengths of strips and of tiles
 QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
 CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
 
 # Tags that are read; a hostile file may hold 64 KiB behind each of the others.
 WANTED = frozenset(
-    [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, *STORED) for tag in tags]
+    [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, *EXTENTS) for tag in tags]
     + [SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, KODAK_MATRIX, PHOTOMETRIC]
     + [FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT, *SUB_DIRECTORIES]
 )
@@ -45,7 +45,9 @@ Directory = dict[int, tuple[Any, ...]]
 
 
 def camera_tags(data: bytes) -> dict[str, Any]:
-    """Return what the tags of a raw file say, by name: see RawInfo. What is not there, or makes no sense, is left out.
+    """Return camera and exposure data from the tags of a raw file, by the field names of RawInfo.
+
+    Missing and invalid values are left out.
 
     Units: seconds, metres; the timestamp is an ISO 8601 string.
     """
@@ -66,7 +68,7 @@ def camera_tags(data: bytes) -> dict[str, Any]:
 
 
 def black_tile(data: bytes) -> list[list[float]] | None:
-    """Return the black levels of a DNG that repeats them over more than 2x2 pixels, by rows; None if it does not."""
+    """Return the black levels of a DNG by rows if they repeat over more than 2x2 pixels, else None."""
     for directory in tiff_directories(data):
         rows, columns = (*_whole_numbers(directory, BLACK_REPEAT), 1, 1)[:2]
         levels = directory.get(BLACK_LEVEL, ())
@@ -76,16 +78,15 @@ def black_tile(data: bytes) -> list[list[float]] | None:
 
 
 def white_levels(data: bytes) -> set[int]:
-    """Return what white levels a DNG names, those of its previews among them."""
+    """Return all white levels of a DNG, including those of its previews."""
     return {level for directory in tiff_directories(data) for level in _whole_numbers(directory, WHITE_LEVEL)}
 
 
 def filter_array_fault(data: bytes) -> str | None:
-    """Return how the filter array tags of a DNG contradict each other, in words; None if they agree or it is no DNG.
+    """Return the contradiction among the filter array tags of a DNG, in words; None for valid tags and other files.
 
-    LibRaw takes colours from beyond its tables where a pattern speaks of colours that are not there, and takes the
-    array for another one or for none where sizes do not fit. Every directory counts, as LibRaw takes the pattern from
-    whichever it meets.
+    LibRaw reads beyond its tables if a pattern has unknown colours, and assumes another array or none if the sizes do
+    not fit. All directories are tested, as LibRaw takes the pattern from any of them.
 
     Example:
         >>> filter_array_fault(b"no DNG") is None
@@ -103,7 +104,7 @@ def _behind_filters(directory: Directory) -> bool:
 
 
 def _fault(directory: Directory) -> str | None:
-    """Return how the filter array tags of one directory contradict each other."""
+    """Return the contradiction among the filter array tags of one directory, in words, or None."""
     pattern = _codes(directory, FILTER_PATTERN)
     if not pattern:
         return "its CFAPattern is missing or cannot be read"
@@ -125,7 +126,7 @@ def _fault(directory: Directory) -> str | None:
 
 
 def _codes(directory: Directory, tag: int) -> tuple[int, ...]:
-    """Return the values of a tag of bytes, also where they were written as undefined."""
+    """Return the values of a tag of type BYTE or UNDEFINED."""
     values = directory.get(tag, ())
     return tuple(values[0]) if values and isinstance(values[0], bytes) else _whole_numbers(directory, tag)
 
@@ -136,7 +137,7 @@ def _listed(values: Sequence[int]) -> str:
 
 
 def kodak_matrix(data: bytes) -> list[list[float]] | None:
-    """Return the matrix from camera to RGB of a KDC file, by rows, which stand behind an offset each; None if none."""
+    """Return the matrix from camera colours to RGB of a KDC file, by rows, or None; an offset precedes each row."""
     for directory in tiff_directories(data):
         values = directory.get(KODAK_MATRIX, ())
         if len(values) == 12 and not isinstance(values[0], bytes):
@@ -145,7 +146,7 @@ def kodak_matrix(data: bytes) -> list[list[float]] | None:
 
 
 def missing_bytes(data: bytes) -> int:
-    """Return how many bytes of a DNG's picture lie beyond the end of the file; LibRaw may leave lost tiles empty."""
+    """Return the number of bytes of a DNG's picture beyond the end of the file; LibRaw leaves lost tiles empty."""
     directories = list(tiff_directories(data))
     if not directories or DNG_VERSION not in directories[0]:
         return 0
@@ -153,23 +154,23 @@ def missing_bytes(data: bytes) -> int:
     ends = [
         offset + length
         for directory in whole
-        for offsets, lengths in STORED
+        for offsets, lengths in EXTENTS
         for offset, length in zip(_whole_numbers(directory, offsets), _whole_numbers(directory, lengths), strict=False)
     ]
     return max(0, max(ends, default=0) - len(data))
 
 
 def _whole_numbers(directory: Directory, tag: int) -> tuple[int, ...]:
-    """Return the values of a tag; none if it has none or, in a damaged file, of another type."""
+    """Return the integer values of a tag; empty if it is missing or has another type."""
     values = directory.get(tag, ())
     return tuple(values) if all(type(value) is int for value in values) else ()
 
 
 def tiff_directories(data: bytes) -> Iterator[Directory]:
-    """Yield the directories of a TIFF-like file as values by tag: the first, those below it, those that follow.
+    """Yield the directories of a TIFF-like file as values by tag: the first, its subdirectories, and the next ones.
 
-    Also those of the Exif blocks inside a RAF file's preview and a CR3 file's boxes. A hostile file cannot make this
-    slow: each directory is read once, and their number and sizes are bounded.
+    The Exif blocks in the preview of a RAF file and in the boxes of a CR3 file are included. Each directory is read
+    once, and their number and sizes are bounded, so that a hostile file cannot make this slow.
     """
     left = MOST_DIRECTORIES
     for base in _tiff_headers(data):
@@ -187,7 +188,7 @@ def tiff_directories(data: bytes) -> Iterator[Directory]:
 
 
 def _tiff_headers(data: bytes) -> list[int]:
-    """Return where a TIFF header may begin."""
+    """Return the offsets of possible TIFF headers."""
     places = [0] + [data.find(mark, 0, 1 << 16) + 4 for mark in (b"CMT1", b"CMT2")]
     places.append(data.find(b"Exif\0\0", 0, 1 << 12) + 6)
     return [
@@ -196,7 +197,7 @@ def _tiff_headers(data: bytes) -> list[int]:
 
 
 def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directory, tuple[Any, ...]]:
-    """Return a directory, and where the next one begins. What cannot be read, or is said twice, has no values."""
+    """Return a directory and the offset of the next one; unreadable and contradictory tags have no values."""
     start = base + offset
     count = min((_unpack(data, f"{order}H", start) or (0,))[0], MOST_ENTRIES)
     directory: Directory = {}
@@ -204,13 +205,13 @@ def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directo
         tag, kind, number = _unpack(data, f"{order}HHI", entry) or (0, 0, 0)
         if tag in WANTED:
             values = _entry_values(data, base, order, entry + 8, kind, number)
-            # Said twice and differently, LibRaw may believe the other.
+            # Of two different values LibRaw may use the other one.
             directory[tag] = values if directory.get(tag, values) == values else ()
     return directory, _unpack(data, f"{order}I", start + 2 + 12 * count)
 
 
 def _entry_values(data: bytes, base: int, order: str, field: int, kind: int, number: int) -> tuple[Any, ...]:
-    """Return the values of an entry, which lie in its last field or where that points to."""
+    """Return the values of an entry, stored in its last field or at the offset given there."""
     code = TYPES.get(kind, "")
     size = number * struct.calcsize(f"={code}")
     if not 0 < size <= MOST_BYTES:
@@ -224,7 +225,7 @@ def _entry_values(data: bytes, base: int, order: str, field: int, kind: int, num
 
 
 def _unpack(data: bytes, layout: str, offset: int, least: int = 0) -> tuple[Any, ...]:
-    """Return the values that lie at an offset, none where the file ends before."""
+    """Unpack the values at an offset; empty if they reach beyond the end of the file."""
     if offset < least or offset + struct.calcsize(layout) > len(data):
         return ()
     return struct.unpack_from(layout, data, offset)
@@ -235,7 +236,7 @@ def _values(directories: list[Directory], tags: tuple[int, ...]) -> Iterator[tup
 
 
 def _text(values: tuple[Any, ...]) -> str | None:
-    """Return what can be printed of a text, without what follows its first zero."""
+    """Return the printable characters of a text up to its first zero byte."""
     if not values or not isinstance(values[0], bytes):
         return None
     text = values[0].split(b"\0")[0].decode("utf-8", "ignore")
@@ -256,7 +257,7 @@ def _time(text: str | None) -> str | None:
 
 
 def _ciff_names(data: bytes) -> tuple[str | None, str | None]:
-    """Return make and model from the heaps of Canon's CRW: each ends with where its list of records begins."""
+    """Return make and model from the heaps of Canon's CRW, each of which ends with the offset of its record list."""
     waiting = [((_unpack(data, "<I", 2) or (0,))[0], len(data))]
     for _ in range(MOST_DIRECTORIES):
         if not waiting:

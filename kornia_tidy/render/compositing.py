@@ -58,7 +58,7 @@ def render(
         correlate: flip the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
         method: the backend. ``"auto"`` takes the cheapest that supports the scene, see
             :func:`kornia_tidy.render.dispatch.explain`; ``"direct"``, ``"tiled"`` and ``"dense"`` ask for one.
-            ``torch.compile``, ``torch.func`` and forward-mode derivatives are for dense alone.
+            ``torch.func`` and forward-mode derivatives are for dense alone.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or

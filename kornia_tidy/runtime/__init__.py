@@ -1,4 +1,4 @@
-"""What goes on around a computation: threads that share one camera, and what torch makes of it as it runs.
+"""Runtime support: locks for cameras shared by threads, and detection of torch's compiler and function transforms.
 
-Nothing of light is known here. Read ``tracing.py`` for compilers and function transforms, ``threads.py`` for locks.
+It contains no optics. ``tracing.py`` has the compiler and function transforms, ``threads.py`` the locks.
 """

@@ -1,4 +1,4 @@
-"""What threads need that share one camera: a lock that copies, pickles and forks find open, and notes for each."""
+"""Thread safety of shared cameras: a lock that survives copies, pickles and forks, and notes of each thread."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 class SharedLock:
     """A re-entrant lock for objects that are copied, pickled and carried into forked processes.
 
-    A copy has a lock of its own. So has a forked child, in which the thread that held the lock does not exist.
+    A copy has a new lock. So has a forked child, since the thread that held the lock does not exist there.
 
     Example:
         >>> import copy
@@ -35,12 +35,12 @@ class SharedLock:
         self._lock.release()
 
     def __reduce__(self) -> tuple[type[SharedLock], tuple[()]]:
-        """Return how a copy is made: as a new lock."""
+        """Copy and pickle as a new, open lock."""
         return SharedLock, ()
 
 
 class CaptureNotes:
-    """What a camera notes about its captures: the clamped pixels of each thread's last one, and which warnings it gave.
+    """Record of a camera's captures: clamped pixels of each thread's last capture, and warnings already given.
 
     Args:
         told: warnings that were given before.
@@ -56,9 +56,9 @@ class CaptureNotes:
         self._of_thread = threading.local()
 
     def first_time(self, warning: Hashable) -> bool:
-        """Return whether nobody asked for this warning before, in any thread."""
+        """Return True the first time that a warning is requested, in any thread."""
         mine = object()
-        return self._told.setdefault(warning, mine) is mine  # one step of the interpreter
+        return self._told.setdefault(warning, mine) is mine  # atomic in the interpreter
 
     def is_told(self, warning: Hashable) -> bool:
         """Return whether a warning was given."""
@@ -74,5 +74,5 @@ class CaptureNotes:
         self._of_thread.clamped = count
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how a copy is made: it knows which warnings were given, and no capture."""
+        """Copy and pickle with the warnings already given, without the captures."""
         return CaptureNotes, (tuple(self._told),)

@@ -1,7 +1,7 @@
-"""Who follows what torch does: its compiler, the transforms of torch.func, forward-mode derivatives, torch.jit.
+"""Detection of tracing: torch.compile, transforms of torch.func, forward-mode derivatives and torch.jit.
 
-What is written in C, remembered between calls or decided by looking at values is not for those who follow: they need
-plain operations of torch, from start to end.
+Tracing needs plain operations of torch throughout. C kernels, caches and branches on tensor values are disabled under
+tracing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TORCHSCRIPT = (
 
 
 def is_followed() -> bool:
-    """Whether only plain operations of torch will do, of which nothing may be remembered.
+    """Return whether torch traces the computation, so that it must use plain operations and no caches.
 
     Example:
         >>> torch.func.grad(lambda x: x * is_followed())(torch.tensor(0.0)), is_followed()
@@ -49,7 +49,7 @@ def is_transformed() -> bool:
 
 
 def is_value_unknown() -> bool:
-    """Whether values cannot be looked at: while compiling or tracing, and under ``torch.vmap``, which has many at once.
+    """Return whether tensor values are unavailable: under compilation, tracing and ``torch.vmap``.
 
     Example:
         >>> torch.vmap(lambda x: x * is_value_unknown())(torch.ones(2)), is_value_unknown()
@@ -84,5 +84,5 @@ def recording_in_operator() -> Generator[None]:
 
 
 def refuse_torchscript() -> NoReturn:
-    """Raise the error that names what works instead."""
+    """Raise the error of TorchScript compilation, which names the alternatives."""
     raise NotImplementedError(TORCHSCRIPT)

@@ -1,4 +1,8 @@
-"""Electrons: from irradiance to digital numbers."""
+"""Sensor: converts irradiance to the values that a camera records, with shot, dark and read noise.
+
+A linear-light image in units of full scale comes in. The same image with noise, quantised and clipped, goes out. Read
+``noise.py`` first; ``shot.py`` has the Poisson noise and its gradient.
+"""
 
 from kornia_tidy.sensor.noise import SensorNoise, quantize
 from kornia_tidy.sensor.shot import shot_noise

@@ -1,4 +1,4 @@
-"""What a sensor reports of a linear-light image: shot, dark and read noise, and a converter's levels."""
+"""Sensor noise: shot, dark and read noise, full well, and quantisation by the analogue-to-digital converter."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kornia_tidy.sensor.shot import shot_noise
 
 
 def quantize(image: Tensor, bits: int) -> Tensor:
-    r"""Round to the levels of an analogue-to-digital converter.
+    r"""Quantise values to the levels of an analogue-to-digital converter.
 
     .. math:: q(x) = \mathrm{round}\left( x \, (2^b - 1) \right) / (2^b - 1)
 
@@ -21,14 +21,14 @@ def quantize(image: Tensor, bits: int) -> Tensor:
         bits: bits b of the converter, 1 to 16.
 
     Returns:
-        Rounded values, same shape and dtype. [0, 1] holds the levels 0 to 2^b - 1; values outside go on in the same
-        steps and are the caller's to clip.
+        Rounded values, same shape and dtype. [0, 1] has the levels 0 to 2^b - 1. Values outside are rounded in the same
+        steps and not clipped.
 
     Raises:
         ValueError: if ``bits`` is not a whole number from 1 to 16.
 
     Convention:
-        - Gradient: straight through, dq/dx = 1 everywhere.
+        - The gradient is a straight-through estimate: dq/dx = 1 everywhere.
 
     Example:
         >>> quantize(torch.tensor([0.0, 0.2, 0.6, 1.0, 1.2]), bits=2) * 3
@@ -41,31 +41,31 @@ def quantize(image: Tensor, bits: int) -> Tensor:
     return (rounded + (value - value.detach())).to(image.dtype)  # adds 0, and a gradient of 1
 
 
-STRIP = 64  # rows whose noise is drawn at once
+STRIP = 64  # rows of noise drawn in one call
 
 
 class SensorNoise(nn.Module):
-    r"""A sensor: turns a linear-light image into what the camera reports, still in linear light.
+    r"""A sensor: converts a linear-light image to the recorded image, also in linear light.
 
-    In order, with full scale = 1.0 = ``full_well`` electrons:
+    The steps, with full scale = 1.0 = ``full_well`` electrons:
 
-    1. shot noise: N = Poisson(full_well · max(image, 0) + dark), one draw for both, as Poisson draws add up to one;
-    2. full well: N is cut at ``full_well``;
+    1. shot noise: N = Poisson(full_well · max(image, 0) + dark), one draw for signal and dark signal;
+    2. full well: N is limited to ``full_well``;
     3. black level: (N - dark) / full_well;
-    4. read noise: plus a Gaussian of standard deviation ``sigma``;
-    5. converter: rounded to ``bits``, see :func:`quantize`;
-    6. clipped to [0, 1].
+    4. read noise: a Gaussian of standard deviation ``sigma`` is added;
+    5. converter: the value is rounded to ``bits``, see :func:`quantize`;
+    6. the value is clipped to [0, 1].
 
-    Steps 1 to 3 need ``full_well``, step 5 needs ``bits``. A camera is noisy at test time too: ``eval()`` changes
-    nothing.
+    Steps 1 to 3 need ``full_well``, step 5 needs ``bits``. The noise is drawn in training and in ``eval()`` alike, as
+    a real camera has it at test time too.
 
     Args:
         sigma: standard deviation of the read noise, in units of full scale.
-        full_well: electrons a pixel holds, which turns shot noise on. None: no shot noise.
-        dark: mean dark signal over the exposure, in electrons, below ``full_well``. Its shot noise stays in the image;
-            its mean is subtracted as a camera's black level is, so a saturated pixel reads 1 - dark / full_well.
+        full_well: capacity of a pixel in electrons; enables shot noise. None: no shot noise.
+        dark: mean dark signal over the exposure, in electrons, below ``full_well``. Its shot noise stays in the image.
+            Its mean is subtracted as black level, so a saturated pixel has the value 1 - dark / full_well.
         bits: bits of the converter, 1 to 16. None: no rounding.
-        clip: cut at the full well and to [0, 1]. False keeps highlights above 1 (HDR) and negative noise.
+        clip: limit to the full well and to [0, 1]. False keeps highlights above 1 (HDR) and negative noise.
 
     Raises:
         ValueError: if a value is out of its range, or ``dark`` is given without ``full_well``.
@@ -75,7 +75,7 @@ class SensorNoise(nn.Module):
         - Output: the same shape and dtype, computed in float32 (float64 for float64) under autocast too.
 
     Convention:
-        - Gradients: those of :func:`shot_noise` and :func:`quantize`; zero where a value is clipped.
+        - Gradients are those of :func:`shot_noise` and :func:`quantize`, and zero where a value is clipped.
 
     Source: EMVA Standard 1288, 4.0, section 2 (linear camera model); photon transfer, Janesick 2007.
 
@@ -104,7 +104,7 @@ class SensorNoise(nn.Module):
             if dark >= full_well:
                 raise ValueError(f"dark must be below full_well, {full_well} electrons, got {dark}")
         elif dark:
-            raise ValueError(f"dark needs full_well to say how many electrons full scale is, got dark = {dark} alone")
+            raise ValueError(f"dark needs full_well, the number of electrons at full scale, got dark = {dark} alone")
         if bits is not None:
             _check_bits(bits)
         self.sigma, self.full_well, self.dark, self.bits, self.clip = sigma, full_well, dark, bits, clip
@@ -113,13 +113,13 @@ class SensorNoise(nn.Module):
     def physical(
         cls, full_well: float, read_noise_electrons: float, dark_electrons: float = 0.0, bits: int = 12
     ) -> SensorNoise:
-        """Return the sensor of a data sheet, all in electrons but the bits.
+        """Return a sensor from the quantities of a data sheet, in electrons.
 
         Args:
-            full_well: electrons a pixel holds.
+            full_well: capacity of a pixel.
             read_noise_electrons: standard deviation of the read noise.
             dark_electrons: mean dark signal over the exposure.
-            bits: bits of the converter, whose levels span the full well.
+            bits: bits of the converter; its levels span the full well.
 
         Raises:
             ValueError: if a value is out of its range.
@@ -139,9 +139,13 @@ class SensorNoise(nn.Module):
 
         Args:
             image: (B, C, H, W), linear light, 1.0 = full scale. Negative values (FFT round-off) give no electrons.
-            params: fields of an earlier :meth:`draw`, to replay them; the way to go under ``torch.compile``.
-            generator: where random numbers come from, eager only; its device need not be the image's.
-                Without either it is the global generator of the image's device.
+            params: random fields of an earlier :meth:`draw`, to be used again; needed for reproducible noise under
+                ``torch.compile``.
+            generator: source of random numbers, in eager mode only; it may be on another device than the image.
+                Default: the global generator of the image's device.
+
+        Returns:
+            The same shape and dtype.
 
         Raises:
             TypeError: if the image is not a floating-point tensor.
@@ -176,22 +180,24 @@ class SensorNoise(nn.Module):
         generator: torch.Generator | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> dict[str, Tensor]:
-        """Return the random fields an image of this shape needs, and no others.
+        """Draw the random fields for an image of this shape.
 
         Args:
             shape: the image's shape (B, C, H, W).
-            device: where the fields go. They are drawn on the generator's device: a CPU seed gives the same anywhere.
-            generator: where random numbers come from; the global generator of ``device`` without one.
+            device: device of the fields. They are drawn on the generator's device, so a CPU generator gives the same
+                fields for every device.
+            generator: source of random numbers. Default: the global generator of ``device``.
             dtype: float32 or float64.
 
         Returns:
             "read": standard normal, if ``sigma`` is not zero; "shot": uniform in [0, 1), if ``full_well`` is given.
 
         Raises:
-            ValueError: if ``dtype`` is another.
+            ValueError: if ``dtype`` is neither.
 
         Convention:
-            - Drawn in strips of 64 rows from the top, so that a large image taken in bands has the same noise.
+            - Fields are drawn in strips of 64 rows from the top, so that an image rendered in bands has the same noise
+              as the whole.
 
         Example:
             >>> sorted(SensorNoise(0.01, full_well=1e4).draw((1, 3, 4, 4)))
@@ -223,7 +229,7 @@ class SensorNoise(nn.Module):
         return params[name].to(value)
 
     def extra_repr(self) -> str:
-        """Return the sensor in words."""
+        """Return a one-line description of the sensor."""
         words = [f"read noise {self.sigma:g} of full scale" if self.sigma > 0 else "no read noise"]
         words += ["no shot noise" if self.full_well is None else f"full well {self.full_well:g} electrons"]
         words += [f"dark signal {self.dark:g} electrons"] if self.dark else []

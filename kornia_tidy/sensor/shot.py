@@ -1,4 +1,4 @@
-"""Shot noise: how many electrons arrive when so many are expected; replayable from a uniform field, differentiable."""
+"""Shot noise: Poisson draws of electrons from a uniform random field, with a gradient for the mean."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import math
 import torch
 from torch import Tensor
 
-# Expected electrons from which a Gaussian stands for the Poisson law. Its mean and variance are right at any count;
-# what it lacks is the skew. Rounded to whole electrons it is off by 0.025 in total variation here (0.040 at 10, 0.018
-# at 50), and it falls below zero, where it is cut, with probability 3e-7 (8e-4 at 10): a bias of 3e-7 electrons.
+# Expected electrons from which a Gaussian replaces the Poisson distribution. Its mean and variance are exact; its skew
+# is not. Rounded to whole electrons, it differs by 0.025 in total variation at this count (0.040 at 10, 0.018 at 50).
+# It is below zero, where it is clamped, with probability 3e-7 (8e-4 at 10), which biases the mean by 3e-7 electrons.
 GAUSSIAN_FROM = 25.0
 
-_MAX_COUNT = 80  # P(more than 72 | 25 expected) is 7e-15, the tail poisson_quantile leaves out
+_MAX_COUNT = 80  # P(more than 72 | 25 expected) is 7e-15, the tail that poisson_quantile neglects
 
 
 def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
-    r"""Return one draw of the Poisson law, chosen by ``uniform``, with a gradient for its mean.
+    r"""Draw shot noise by inversion: the quantile of the Poisson distribution at a uniform random number.
 
     .. math::
         k = \begin{cases}
@@ -29,17 +29,18 @@ def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
         uniform: uniform random numbers u in [0, 1], same shape; the same u gives the same draw.
 
     Returns:
-        Electrons, same shape and dtype as ``electrons``, computed in float32 or wider: whole numbers below 25 expected,
-        not rounded from there on (the converter does that), never negative. λ = 0 gives exactly 0.
+        Electrons, same shape and dtype as ``electrons``, computed in float32 or wider, never negative. Below λ = 25
+        they are whole numbers; from 25 on they are not rounded. λ = 0 gives exactly 0.
 
     Raises:
         ValueError: if the two shapes differ.
 
     Convention:
-        - Gradient below 25: straight through, dk/dλ = 1, the derivative of the mean.
-        - Gradient from 25 on: that of the formula, 1 + Φ⁻¹(u) / (2 √λ). Zero for λ < 0 and where the draw is cut at 0.
-        - Cost: a pixel below 25 takes as many terms as the largest count drawn, in all under a microsecond of a CPU
-          core; one above takes a tenth of that.
+        - The gradient below 25 is a straight-through estimate: dk/dλ = 1, the derivative of the mean.
+        - The gradient from 25 on is that of the formula, 1 + Φ⁻¹(u) / (2 √λ). It is zero for λ < 0 and where the draw
+          is clamped at 0.
+        - A pixel below 25 costs as many terms as the largest count drawn, in all under a microsecond of a CPU core. A
+          pixel above costs a tenth of that.
 
     Source: inversion by sequential search, Devroye, Non-Uniform Random Variate Generation (1986), III.2.
 
@@ -56,21 +57,23 @@ def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
     dim = rate < GAUSSIAN_FROM
     draw = _dim_counts_operator if torch.compiler.is_compiling() else _dim_counts
     counted = draw(rate.detach(), uniform.detach()) + (rate - rate.detach())  # adds 0, and a gradient of 1
-    bright = torch.where(dim, GAUSSIAN_FROM, rate)  # keeps the root's infinite slope at zero off the gradient's path
-    spread = (bright + bright.sqrt() * _normal_quantile(uniform)).clamp(min=0)
-    return torch.where(dim, counted, spread).to(electrons.dtype)
+    bright = torch.where(dim, GAUSSIAN_FROM, rate)  # the square root has an infinite derivative at zero
+    gaussian = (bright + bright.sqrt() * _normal_quantile(uniform)).clamp(min=0)
+    return torch.where(dim, counted, gaussian).to(electrons.dtype)
 
 
 def poisson_quantile(rate: Tensor, uniform: Tensor) -> Tensor:
-    r"""Return the smallest whole k with P(X <= k) >= u for X of the Poisson law, summed term by term.
+    r"""Return the quantile of the Poisson distribution: the smallest whole k with P(X <= k) >= u.
+
+    The probabilities are summed term by term.
 
     Args:
         rate: the mean λ in [0, 25), any shape.
-        uniform: u in [0, 1], same shape and dtype. The last 32 ``eps`` below 1 share one count, as the sum of the terms
-            is not exact to better than a few ``eps``.
+        uniform: u in [0, 1], same shape and dtype. Values within 32 ``eps`` of 1 give the same count, because the sum
+            of the terms is exact to a few ``eps`` only.
 
     Returns:
-        k, same shape and dtype. No gradient passes.
+        k, same shape and dtype, without gradient.
 
     Example:
         >>> poisson_quantile(torch.tensor([1.0, 1.0]), torch.tensor([0.36, 0.37]))  # P(X = 0) = 0.3679
@@ -92,8 +95,8 @@ def poisson_quantile(rate: Tensor, uniform: Tensor) -> Tensor:
 
 
 def _dim_counts(rate: Tensor, uniform: Tensor) -> Tensor:
-    """Poisson counts where ``rate`` is below ``GAUSSIAN_FROM``, zero elsewhere."""
-    # float32 sums move the count of one pixel in 3e5; float64 makes replays agree between devices. Apple's has none.
+    """Return Poisson counts where ``rate`` is below ``GAUSSIAN_FROM``, zero elsewhere."""
+    # float32 sums change the count of one pixel in 3e5, so devices would disagree. Apple's GPUs have no float64.
     wide = torch.float32 if rate.device.type == "mps" else torch.float64
     dim = rate < GAUSSIAN_FROM
     if _recording(rate):
@@ -104,8 +107,8 @@ def _dim_counts(rate: Tensor, uniform: Tensor) -> Tensor:
     return count
 
 
-# The same as an operator, which a compiled graph may hold: the work follows the values, and traced with all its terms
-# it costs inductor a minute and a half. Not used eagerly, as an operator's first call imports the compiler (2 s).
+# A custom operator for compiled graphs: the loop ends when the values allow, and tracing all its terms takes inductor
+# 90 s. Eager code does not use it, because the first call of a custom operator imports the compiler (2 s).
 _dim_counts_operator = torch.library.custom_op(
     "kornia_tidy::dim_counts", _dim_counts, mutates_args=(), schema="(Tensor rate, Tensor uniform) -> Tensor"
 )
@@ -113,12 +116,12 @@ _dim_counts_operator.register_fake(lambda rate, _uniform: torch.empty_like(rate)
 
 
 def _recording(tensor: Tensor) -> bool:
-    """Tell whether a CUDA graph is being recorded, when nothing may wait for values."""
+    """Return whether a CUDA graph is being recorded, during which values cannot be read back."""
     return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
 def _normal_quantile(uniform: Tensor) -> Tensor:
-    """Return Φ⁻¹(u) by erfinv, which more devices have than ndtri; finite for u = 0 and 1 too."""
+    """Return the normal quantile Φ⁻¹(u), finite for u = 0 and 1 too. More devices have erfinv than ndtri."""
     eps = torch.finfo(uniform.dtype).eps
-    inside = uniform.clamp(eps / 4, 1 - eps / 2)  # 2u - 1 is then exact on the grid random numbers come on, and not ±1
+    inside = uniform.clamp(eps / 4, 1 - eps / 2)  # 2u - 1 is then exact on the grid of random numbers, and never ±1
     return math.sqrt(2) * torch.erfinv(2 * inside - 1)

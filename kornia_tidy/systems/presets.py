@@ -1,8 +1,8 @@
-"""Nine published optical systems as plain tables: lens, mask, colours, compositing, noise, and where each was read.
+"""Nine published optical systems as tables: lens, mask, wavelengths, compositing and noise, each with its source.
 
-What could not be read anywhere is a guess, and its entry in ``System.sources`` begins with that word. Learnt masks
-are not shipped: most have no licence, and a mask is the user's to learn. Each system starts where its paper starts.
-Where that is a flat mask, which is only the lens, most start from what the system is known for, and say so.
+A value that no accessible source states is a guess, and its entry in ``System.sources`` begins with that word. Learnt
+masks are not included: most have no licence. Each system has the initial mask of its paper. If that is flat, most
+systems here start from a mask with their characteristic property instead, and the entry "start" says which.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from kornia_tidy.systems.system import RGB, System
 
 
 def _implied_pitch(aperture_radius: float, image_distance: float) -> float:
-    """Sensor pixels that a 27-point transform of mask pixels of a tenth of a radius implies at 530 nm, in metres."""
+    """Return the pixel pitch implied by a 27-point transform of mask pixels of 0.1 pupil radii at 530 nm, in metres."""
     return REFERENCE_WAVELENGTH * image_distance / (27 * aperture_radius / 10)
 
 
@@ -41,8 +41,8 @@ def _tidy_camera() -> ThinLensCamera:
 
 
 def _phasecam_camera() -> ThinLensCamera:
-    focus, diameter, reach = 0.85, 2.835e-3, 10.0
-    dioptres = reach * REFERENCE_WAVELENGTH / (math.pi * (diameter / 2) ** 2)
+    focus, diameter, limit = 0.85, 2.835e-3, 10.0  # metres, metres, radians
+    dioptres = limit * REFERENCE_WAVELENGTH / (math.pi * (diameter / 2) ** 2)
     pitch = _implied_pitch(diameter / 2, 1 / (1 / 50e-3 - 1 / focus))
     return ThinLensCamera(50e-3, diameter, focus, pitch, (1 / (1 / focus + dioptres), 1 / (1 / focus - dioptres)))
 
@@ -75,7 +75,7 @@ def _ikoma_camera() -> ThinLensCamera:
 
 
 def _ikoma_masks(generator: torch.Generator | None) -> PhaseMasks:
-    """A smooth profile of noise: 13 free radii and straight lines between them."""
+    """Return a radial mask with a smooth random profile: noise at 13 radii, linear between them."""
     knots = 2.05 * torch.randn(1, 1, 13, generator=generator)
     profile = nn.functional.interpolate(knots, size=61, mode="linear", align_corners=True)[0]
     return RadialMask(1, 138, 61, initial=profile, material=NOA61)
@@ -98,14 +98,14 @@ def _sitzmann_camera() -> ThinLensCamera:
 
 
 def cubic_in_zernikes(strength: float, num_modes: int = 350) -> torch.Tensor:
-    r"""Return the Zernike coefficients of a cubic mask, less the tilt that would shift its image.
+    r"""Return the Zernike coefficients of a cubic mask without the tilt that would shift the image.
 
     .. math:: \alpha (x^3 + y^3) - \tfrac{3}{4} \alpha (x + y)
 
-    whose slope is zero on average over the pupil, so that the light's centre of mass stays on the axis.
+    The mean gradient of this phase over the pupil is zero, so the centroid of the PSF stays on the axis.
 
     Args:
-        strength: alpha in radians at 530 nm where an axis meets the pupil's edge.
+        strength: alpha in radians at 530 nm, the cubic's phase at the pupil's edge on the x or y axis.
         num_modes: number M of polynomials, at least 10.
 
     Returns:
@@ -119,7 +119,7 @@ def cubic_in_zernikes(strength: float, num_modes: int = 350) -> torch.Tensor:
                  0.7070,  0.7070])
     """
     coefficients = torch.zeros(num_modes)
-    third = strength / math.sqrt(128)  # x^3 = (Z(3,1) + Z(3,3)) / sqrt(128) + Z(1,1) / 4, and y^3 alike
+    third = strength / math.sqrt(128)  # x^3 = (Z(3,1) + Z(3,3)) / sqrt(128) + Z(1,1) / 4, and y^3 likewise
     coefficients[[7, 8, 9]], coefficients[6] = third, -third
     coefficients[[1, 2]] = strength / 4 - 0.75 * strength / 2  # Z(1,1) = 2x
     return coefficients
@@ -139,15 +139,16 @@ FISHER_ZERNIKES = (
     -0.06, 0.1, 0.11, -0.08, -0.08, -0.08, -0.08, -0.1, -0.07, -0.09,  # radial order 9
 )
 # fmt: on
-"""Zernike coefficients in radians rms of a mask designed for depth, in the order of OSA/ANSI.
+"""Zernike coefficients in radians rms of a mask designed for depth estimation, in the order of OSA/ANSI.
 
-Found by 250 steps of Adam (rate 0.05, no tilt, the best of 4 random starts) on the bound on defocus, averaged over 11
-depths from psi = -10 to 10 rad, of a point in an unknown place with 3000 photons a channel on a background of 5 a
-pixel, through PhaseCam3D's lens here: 0.0353 rad. See Shechtman et al., Physical Review Letters 113, 133902 (2014).
+It minimises the Cramér-Rao bound on defocus, averaged over 11 depths from psi = -10 to 10 rad, to 0.0353 rad. The
+setting is the lens of PhaseCam3D as below, and a point at an unknown position with 3000 photons a channel on a
+background of 5 photons a pixel. The search was 250 steps of Adam at a rate of 0.05 without tilt, the best of 4 random
+starts. See Shechtman et al., Physical Review Letters 113, 133902 (2014).
 """
 
 CUBIC = 27.0
-"""Strength of the cubic that Sitzmann's system starts from, in radians at the pupil's edge."""
+"""Strength of the initial cubic mask of Sitzmann's system, in radians at the pupil's edge."""
 
 _LIU_SOURCES = {
     "lens": "guess: that of Ikoma et al., whose network and task the paper takes: 50 mm f/6.3 focused at 1.7 m",
@@ -168,7 +169,7 @@ _ALL = (
         name="tidy-5",
         title="TiDy, five masks",
         paper=_TIDY_PAPER,
-        known_for="five masks in one exposure: averaged PSFs that no single mask can make",
+        known_for="five masks in one exposure: average PSFs that no single mask can have",
         mask="5 pixel-wise, 23 x 23, noise",
         camera=_tidy_camera,
         masks=_pixelwise(5),
@@ -179,7 +180,7 @@ _ALL = (
         name="tidy-1",
         title="TiDy, one mask",
         paper=_TIDY_PAPER,
-        known_for="the same with one mask all the time",
+        known_for="one mask for the whole exposure",
         mask="1 pixel-wise, 23 x 23, noise",
         camera=_tidy_camera,
         masks=_pixelwise(1),
@@ -190,14 +191,14 @@ _ALL = (
         name="fresnel",
         title="Fresnel lens",
         paper=f"{_TIDY_PAPER} (its baseline of 0 masks)",
-        known_for="nothing to learn: a diffractive lens moves the focus of each colour to another depth",
+        known_for="a fixed diffractive lens, which focuses each colour at another depth",
         mask="diffractive lens, fixed",
         camera=_tidy_camera,
         masks=lambda _: FresnelLens(),
         sources={
             **_TIDY_LENS,
             "masks": "a fixed Fresnel lens: paper, ablation of the sequence length",
-            "strength": "guess: 10 rad, the strongest round number that 23 pixels carry",
+            "strength": "guess: 10 rad, the largest round number that 23 pixels can sample",
         },
         smooth_iris=False,
     ),
@@ -205,7 +206,7 @@ _ALL = (
         name="phasecam3d",
         title="PhaseCam3D",
         paper="Wu et al.: PhaseCam3D, ICCP 2019",
-        known_for="a mask whose image of a point tells its depth best (Fisher information)",
+        known_for="a mask designed for the best depth estimate of a point (Fisher information)",
         mask="55 Zernikes, 23 x 23, Fisher",
         camera=_phasecam_camera,
         masks=lambda _: ZernikeMask(1, 23, 55, initial=torch.tensor(FISHER_ZERNIKES)),
@@ -221,7 +222,7 @@ _ALL = (
             "compositing": "gather: code",
             "noise": "0.01: code",
             "masks": "55 Zernikes to radial order 9: code",
-            "start": "a Fisher mask, as in the paper; not theirs, which has no licence, but one designed here",
+            "start": "a Fisher mask, as in the paper, but our own: theirs has no licence",
         },
         smooth_iris=False,
     ),
@@ -229,7 +230,7 @@ _ALL = (
         name="ikoma2021",
         title="Ikoma et al.",
         paper="Ikoma et al.: Depth from Defocus with Learned Optics, ICCP 2021",
-        known_for="a mask turned on a lathe: round PSFs, and near things that hide far ones",
+        known_for="a rotationally symmetric mask with round PSFs, and rendering with occlusion",
         mask="radial profile, 61 radii, noise",
         camera=_ikoma_camera,
         masks=_ikoma_masks,
@@ -243,7 +244,7 @@ _ALL = (
             "index": "NOA61, Cauchy's equation: code",
             "compositing": "occlusion: code and paper",
             "noise": "0.003, the middle of 0.001 to 0.005: code",
-            "diffraction": "0.7 of the light sees the mask, 0.3 a flat one: code",
+            "diffraction": "0.7 of the light is modulated by the mask, 0.3 is not: code",
             "masks": "a radial profile: code, of 400 radii; 61 here, which 138 pixels across resolve",
             "start": "guess: noise at 13 radii; the code starts flat",
         },
@@ -256,12 +257,12 @@ _ALL = (
         name="chang2019",
         title="Chang and Wetzstein",
         paper="Chang, Wetzstein: Deep Optics for Monocular Depth Estimation and 3D Object Detection, ICCV 2019",
-        known_for="a single lens: red, green and blue are sharp at different depths",
+        known_for="a single lens element: red, green and blue are in focus at different depths",
         mask="singlet, 55 Zernikes, flat",
         camera=_chang_camera,
         masks=lambda _: ZernikeMask(1, 46, 55, initial="flat", material=PMMA),
         sources={
-            "lens": "a single element, focused by colour: abstract; TiDy-PSFs, results",
+            "lens": "a single element with chromatic aberration: abstract; TiDy-PSFs, results",
             "focal length": "guess: 50 mm; no code, and the paper's numbers could not be read",
             "aperture": "guess: f/8",
             "focus": "guess: 1.67 m, the middle of the depths in dioptres",
@@ -280,7 +281,7 @@ _ALL = (
         name="liu2022-pixelwise",
         title="Liu et al., pixel-wise",
         paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
-        known_for="every pixel of the mask is free",
+        known_for="a free height in every pixel of the mask",
         mask="1 pixel-wise, 23 x 23, noise",
         camera=_ikoma_camera,
         masks=lambda generator: PixelwiseMask(1, 23, generator=generator, material=NOA61),
@@ -297,15 +298,15 @@ _ALL = (
         name="liu2022-spiral",
         title="Liu et al., spiral",
         paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
-        known_for="rings that wind the phase around the axis: the PSF turns with depth",
+        known_for="rings of vortex phase: the PSF rotates with depth",
         mask="13 spiral rings",
         camera=_ikoma_camera,
         masks=lambda _: SpiralMask(1, 256, 13, initial="rotating", material=NOA61),
         sources={
             **_LIU_SOURCES,
             "masks": "orbital angular momentum: TiDy-PSFs, results",
-            "formula": "guess: Prasad's spiral zones stand in for one that could not be read; 13 of them, so that the "
-            "PSF turns less than once",
+            "formula": "guess: Prasad's spiral zones, as the paper's own could not be read; 13 of them, so that the "
+            "PSF rotates less than once",
             "start": "guess: charges 1 to 13",
         },
         spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
@@ -316,22 +317,22 @@ _ALL = (
         name="sitzmann2018",
         title="Sitzmann et al.",
         paper="Sitzmann et al.: End-to-end Optimization of Optics and Image Processing, ACM Trans. Graph. 37(4), 2018",
-        known_for="extended depth of field: much the same blur at every depth, to be undone by one inverse",
+        known_for="extended depth of field: nearly the same blur at every depth, removed by one filter",
         mask="350 Zernikes, cubic",
         camera=_sitzmann_camera,
         masks=lambda _: ZernikeMask(1, 69, 350, initial=cubic_in_zernikes(CUBIC), material=SITZMANN_PLATE),
         sources={
-            "focal length": "34.3 mm: a sensor 35.5 mm behind the plate, which is the lens too: code",
+            "focal length": "34.3 mm: a sensor 35.5 mm behind the plate, which is also the lens: code",
             "aperture": "5.00 mm: 1356 samples of 3.69 um: code",
-            "focus": "1 m, where the plate starts: code",
+            "focus": "1 m, that of the initial plate: code",
             "depth": "0.5 to 1000 m: code",
             "pixels": "3.69 um: code",
             "wavelengths": "640, 550, 460 nm: code",
-            "index": "1.488, 1.493, 1.499 there, by Cauchy's equation between: code",
+            "index": "1.488, 1.493, 1.499 at these wavelengths, by Cauchy's equation between them: code",
             "compositing": "gather: code",
             "noise": "0.0105, the middle of 0.001 to 0.02: code",
             "masks": "350 Zernikes: code",
-            "start": "guess: a cubic, the classic of extended depth of field; the code starts flat",
+            "start": "guess: a cubic mask, as is usual for extended depth of field; the code starts flat",
         },
         spectrum=Spectrum((640e-9, 550e-9, 460e-9), RGB.weights),
         sigma=0.0105,
@@ -346,7 +347,7 @@ def published_system(name: str) -> System:
     """Return a published system by its name.
 
     Raises:
-        ValueError: if there is none of that name; the message lists those there are.
+        ValueError: if the name is unknown; the message lists the known ones.
 
     Example:
         >>> published_system("tidy-5").title

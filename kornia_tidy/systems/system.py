@@ -1,4 +1,4 @@
-"""A published optical system as plain data: what to build, and where each value was read."""
+"""Data type of a published optical system: its parts, and the source of each value."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from kornia_tidy.sensor.noise import SensorNoise
 
 RGB = Spectrum.rgb()
 GUESS = "guess"
-"""How the source of a value begins that stands in no text or code that could be read."""
+"""First word in the source of a value that no accessible paper or code states."""
 
 
 @dataclass(frozen=True)
 class System:
-    """A published optical system: what to build, and where each value was read.
+    """A published optical system: the values of its parts and their sources.
 
     Args:
-        name: for :meth:`kornia_tidy.TiDyOptics.from_preset`.
-        title: what people call it.
-        paper: who published it, and where.
-        known_for: what to look at.
-        mask: the mask in words.
-        camera: makes lens and sensor.
-        masks: makes the masks from a generator of their noise, or None.
-        sources: what each value is and where it was read; a guess begins with that word.
-        spectrum: wavelengths, one a channel.
-        compositing: how depths come together.
-        sigma: standard deviation of the noise, full scale 1.
-        modulator: makes what shows the masks.
-        smooth_iris: the iris is a disc with a smooth edge. False: the published grid of whole pixels.
+        name: name for :meth:`kornia_tidy.TiDyOptics.from_preset`.
+        title: common name.
+        paper: publication.
+        known_for: its characteristic property in one phrase.
+        mask: description of the mask.
+        camera: function that returns lens and pixel pitch.
+        masks: function from a generator (or None) to the initial masks.
+        sources: each value and where it was published; a guess begins with the word "guess".
+        spectrum: wavelengths, one for each channel.
+        compositing: how depth layers are combined: "gather", "scatter" or "occlusion".
+        sigma: standard deviation of the read noise, in units of full scale.
+        modulator: function that returns the modulator.
+        smooth_iris: whether the iris is a disc with a smooth edge. False: the published grid of open and shut pixels.
 
     Example:
         >>> from kornia_tidy.systems.presets import published_system
@@ -75,12 +75,14 @@ class System:
         return int(re.findall(r"\b20\d\d\b", self.paper)[-1])
 
     def parts(self, generator: torch.Generator | None = None, **overrides: Any) -> dict[str, Any]:
-        """Return the arguments that make a camera of the system.
+        """Return the arguments of :class:`kornia_tidy.TiDyOptics` for the system.
 
         Args:
-            generator: source of the masks' noise, for those that start from noise.
-            overrides: arguments of :class:`kornia_tidy.TiDyOptics` that replace the system's. Given masks get an iris
-                that fits them.
+            generator: source of the noise of masks that start from noise.
+            overrides: arguments that replace the system's. The iris is sampled on the pixels of given masks.
+
+        Returns:
+            Keyword arguments by name.
         """
         masks = overrides["masks"] if overrides.get("masks") is not None else self.masks(generator)
         size = min(masks.phase.shape[-2:])

@@ -1,15 +1,19 @@
-"""The trade between speed and accuracy, measured on the user's own scene and device."""
+"""Measurement of the speed-accuracy trade-off on the user's own scene and device.
+
+A camera and a scene with depth come in; rows of time, memory and error for each setting go out. Read ``measure.py``
+first; ``sweep_settings.py`` has the settings that are swept.
+"""
 
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.figure import draw_trade
 from kornia_tidy.tradeoff.files import TradeRun, markdown, read_csv, read_json, write_csv, write_json
-from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, PRESET, TOLERANCES, Setting, ladder, planned
 from kornia_tidy.tradeoff.measure import TradeRow, capture, measure, missing, pareto, sweep
+from kornia_tidy.tradeoff.sweep_settings import PLAN, PRESET, SWEEP_VALUES, TOLERANCES, Setting, planned, sweep_settings
 
 __all__ = [
-    "LADDERS",
     "PLAN",
     "PRESET",
+    "SWEEP_VALUES",
     "TOLERANCES",
     "Conditions",
     "Setting",
@@ -17,7 +21,6 @@ __all__ = [
     "TradeRun",
     "capture",
     "draw_trade",
-    "ladder",
     "markdown",
     "measure",
     "missing",
@@ -26,6 +29,7 @@ __all__ = [
     "read_csv",
     "read_json",
     "sweep",
+    "sweep_settings",
     "write_csv",
     "write_json",
 ]

@@ -1,4 +1,4 @@
-"""Under what a sweep was measured: the scene, the code, the machine. It says which rows may stand side by side."""
+"""Conditions of a sweep: scene, code and machine, which decide whether rows can be compared."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ MEASURED_CODE = (
     "runtime/**/*.py",
     "sensor/*.py",
     "tradeoff/costs.py",
-    "tradeoff/ladder.py",
+    "tradeoff/sweep_settings.py",
     "tradeoff/measure.py",
 )
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Under what a sweep was measured. Rows may stand beside each other where :meth:`same` says so.
+    """Scene, code and machine of a sweep. Rows of two sweeps can be compared if :meth:`same` is True.
 
     Args:
-        scene: what the scene is called.
-        scene_hash: of image, depth, masks, lens, spectrum and all else that shapes a capture but the fidelity.
+        scene: name of the scene.
+        scene_hash: of image, depth, masks, lens, spectrum and everything else but the fidelity that affects a capture.
         height: rows of the image in pixels.
         width: columns.
         channels: 1 or 3.
@@ -100,13 +100,13 @@ class Conditions:
         )
 
     def same(self, other: Conditions) -> bool:
-        """Tell whether rows measured under the other conditions can be compared: all but name, commit and date."""
+        """Return whether rows measured under other conditions can be compared: name, commit and date may differ."""
         rest = {"scene": "", "commit": None, "date": ""}
         return replace(self, **rest) == replace(other, **rest)
 
 
 def scene_hash(optics: TiDyOptics, image: Tensor, depth: Tensor) -> str:
-    """Return a hash of all that shapes a noise-free capture, except the fidelity and the code."""
+    """Return a hash of everything that affects a noise-free capture, except the fidelity and the code."""
     digest = hashlib.sha256()
     parts = [part for part in (optics.masks, optics.camera, optics.modulator) for part in part.modules()]
     state = [tensor for part in parts for tensor in (*part.parameters(False), *part.buffers(False))]
@@ -123,7 +123,7 @@ def scene_hash(optics: TiDyOptics, image: Tensor, depth: Tensor) -> str:
 
 
 def code_hash() -> str:
-    """Return a hash of the source that a capture runs through: rows of other code are not to be mixed with its own."""
+    """Return a hash of the source code of a capture, so that rows of different versions are not mixed."""
     root = Path(kornia_tidy.__file__).parent
     digest = hashlib.sha256()
     for path in measured_files(root):
@@ -133,7 +133,7 @@ def code_hash() -> str:
 
 
 def measured_files(root: Path) -> list[Path]:
-    """Return the source files that shape a row: of optics, rendering, sensor, planner and measurement, C among them."""
+    """Return the Python and C files that affect a row: optics, rendering, sensor, planner and measurement."""
     return [path for pattern in MEASURED_CODE for path in sorted(root.glob(pattern))]
 
 
@@ -146,14 +146,14 @@ def git_commit() -> str | None:
         return done.stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", "__init__.py")  # or the repository is another's, around an environment
+        git("ls-files", "--error-unmatch", "__init__.py")  # else it is an enclosing repository
         return git("describe", "--always", "--dirty", "--exclude=*", "--abbrev=12")
     except (OSError, subprocess.CalledProcessError):
         return None
 
 
 def device_name(device: torch.device) -> str:
-    """Return what a device is called by its maker."""
+    """Return the model name of a device."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     try:

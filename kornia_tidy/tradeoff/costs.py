@@ -1,4 +1,4 @@
-"""What a computation costs: seconds as median and spread, and the most memory that its tensors take at once."""
+"""Cost of a computation: median and spread of its time, and peak memory of its tensors."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from torch.profiler import ProfilerActivity, profile
 from kornia_tidy.checks import check_choice
 
 DEVICES = ("cpu", "cuda")
-LONG = 5.0  # seconds after which nothing is repeated any more
+LONG = 5.0  # seconds after which no further run starts
 
 
 class Timing(NamedTuple):
-    """Seconds that something takes: the median over the repeats, and their interquartile range."""
+    """Time of a computation in seconds: median over the repeats, and their interquartile range."""
 
     median: float
     spread: float
 
 
 def seconds(action: Callable[[], Any], repeats: int, device: torch.device) -> Timing:
-    """Time an action after one run that is not counted; the device has finished before the clock stops.
+    """Time an action after one warm-up run, with the device synchronised before the clock is read.
 
     Args:
-        action: called without arguments; what it returns is thrown away.
-        repeats: runs that are counted, 1 or more; fewer once they have taken ``LONG``. What takes as long as that at
-            the first time is not repeated at all. The spread of a single run is 0.
-        device: the one the action works on.
+        action: called without arguments; its result is discarded.
+        repeats: timed runs, 1 or more. No further run starts after ``LONG`` seconds. If the first run takes as long, it
+            is the only one. The spread of a single run is 0.
+        device: on which the action runs.
 
     Raises:
         ValueError: if ``repeats`` is not positive.
@@ -60,7 +60,7 @@ def seconds(action: Callable[[], Any], repeats: int, device: torch.device) -> Ti
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until the device has done all it was asked to do.
+    """Wait until the device has finished all queued work.
 
     Raises:
         ValueError: if the device is neither a CPU nor a CUDA GPU.
@@ -71,16 +71,16 @@ def synchronize(device: torch.device) -> None:
 
 
 def peak_bytes(action: Callable[[], Any], device: torch.device) -> int:
-    """Run an action once and return the most memory that its tensors took at one time, beyond what was there before.
+    """Run an action once and return the peak memory of its tensors in bytes, beyond the memory allocated before.
 
-    Counted is what PyTorch's allocator hands out, temporaries inside operators included; memory that libraries take
-    for themselves is not. On CUDA it is ``torch.cuda.max_memory_allocated``; on a CPU the allocations that PyTorch's
-    profiler records are added up, which needs no sampling and is the same on every run. (A capture of 512 x 512 pixels
-    takes 33.7 MiB by this count; the operating system saw a fresh process grow by 33.3 MiB.)
+    Allocations of PyTorch are counted, including temporaries inside operators, but not memory allocated by other
+    libraries. On CUDA the peak is ``torch.cuda.max_memory_allocated``. On a CPU the allocations recorded by PyTorch's
+    profiler are summed, which is the same on every run. (A capture of 512 x 512 pixels takes 33.7 MiB by this count; a
+    fresh process grew by 33.3 MiB.)
 
     Args:
-        action: called without arguments. It should free nothing that was allocated before.
-        device: the one the action works on.
+        action: called without arguments. It should not free memory that was allocated before.
+        device: on which the action runs.
 
     Example:
         >>> def two_of_a_megabyte():
@@ -91,7 +91,7 @@ def peak_bytes(action: Callable[[], Any], device: torch.device) -> int:
         >>> peak_bytes(two_of_a_megabyte, torch.device("cpu")) // 2**20
         2
     """
-    gc.collect()  # a cycle collected half way would give back what the action never took
+    gc.collect()  # garbage freed during the action would be subtracted from its memory
     synchronize(device)
     if device.type == "cuda":
         before = torch.cuda.memory_allocated(device)
@@ -111,7 +111,7 @@ def peak_bytes(action: Callable[[], Any], device: torch.device) -> int:
 
 @contextmanager
 def _quiet_profiler() -> Generator[None]:
-    """PyTorch's profiler tells the terminal that it starts and stops, unless the environment says otherwise."""
+    """Silence the messages of PyTorch's profiler on the terminal by an environment variable."""
     told = "KINETO_LOG_LEVEL" in os.environ
     os.environ.setdefault("KINETO_LOG_LEVEL", "6")
     try:

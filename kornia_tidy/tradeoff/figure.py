@@ -1,4 +1,4 @@
-"""The speed/accuracy trade as a picture: error over time, one line for each knob, the best of all as a front."""
+"""Figure of the speed-accuracy trade-off: error over time, a line for each swept setting, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from kornia_tidy.figures.style import FAINT, INK, open_chart, require_matplotlib
 from kornia_tidy.tradeoff.files import TradeRun, value_in_words
-from kornia_tidy.tradeoff.ladder import LADDERS, PLAN, PRESET
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
+from kornia_tidy.tradeoff.sweep_settings import PLAN, PRESET, SWEEP_VALUES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 Label = tuple[str, tuple[float, float], str, float]  # text, time in ms and error, colour, size in pt
 
-# Okabe and Ito's colours, which colour-blind people can tell apart, less their yellow, which is lost on white.
+# Okabe and Ito's colours for colour-blind readers, without the yellow, which is invisible on white.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7a5195")
 MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 FRONT = "#c9d3dc"
 TITLE, LABEL, SMALL = 12, 9, 7.5  # pt
 WIDTH, HEIGHT = 10.0, 6.2  # inches
-GAP = 3.0  # how much lower than the smallest error a zero is drawn, as a factor
+GAP = 3.0  # an error of zero is drawn at the smallest other error divided by this
 OFFSETS = ((6, 5), (6, -11), (-6, 5), (-6, -11), (0, 9), (0, -15), (10, -3), (-10, -3), (14, 12), (-14, 12), (14, -18))
 
 
@@ -56,12 +56,12 @@ def draw_trade(run: TradeRun) -> Figure:
     _frame(axes, run, floor)
     _front(axes, run.rows, floor)
     labels: list[Label] = []
-    for number, knob in enumerate(name for name in LADDERS if name != PRESET):
+    for number, knob in enumerate(name for name in SWEEP_VALUES if name != PRESET):
         steps = [row for row in run.rows if row.knob == knob]
         if len({(row.capture_seconds, row.rmse) for row in steps}) > 1:
             labels += _knob(axes, steps, floor, number)
     plans = [row for row in run.rows if row.knob == PLAN]
-    labels = (_plans(axes, plans, floor) if plans else []) + labels  # first come, first served
+    labels = (_plans(axes, plans, floor) if plans else []) + labels  # the first labels get the room
     presets = [row for row in run.rows if row.knob == PRESET]
     _presets(axes, presets, floor)
     _titles(figure, run)
@@ -90,7 +90,7 @@ def _frame(axes: Axes, run: TradeRun, floor: float) -> None:
     if any(row.rmse == 0 for row in run.rows):
         axes.axhline(floor, color=FAINT, linewidth=0.6, linestyle=(0, (2, 3)), zorder=1)
         axes.annotate(
-            f"no error: this is {run.conditions.reference!r}, the measure of the others",
+            f"no error: this is {run.conditions.reference!r}, to which errors refer",
             (0.005, floor),
             xycoords=("axes fraction", "data"),
             xytext=(0, 3),
@@ -105,7 +105,7 @@ def _plain(value: float, _: Any = None) -> str:
 
 
 def _minor(decades: float) -> Any:
-    """Label 2 and 5 between the powers of ten, unless these are many."""
+    """Return a formatter that labels 2 and 5 between powers of ten, unless the axis spans many decades."""
     wanted = (2, 5) if decades < 2.5 else ()
     return lambda value, _=None: (
         f"{value:g}" if round(value / 10 ** math.floor(math.log10(value) + 1e-9)) in wanted else ""
@@ -115,7 +115,7 @@ def _minor(decades: float) -> Any:
 def _front(axes: Axes, rows: Sequence[TradeRow], floor: float) -> None:
     places = [_place(row, floor) for row in pareto(rows)]
     x, y = [place[0] for place in places], [place[1] for place in places]
-    # Beyond its ends the front goes on straight: nothing is faster at any error, nothing slower is better.
+    # The front is extended straight beyond its ends: no row is faster on the left or more accurate on the right.
     x, y = [x[0], *x, axes.get_xlim()[1]], [axes.get_ylim()[1], *y, y[-1]]
     axes.step(x, y, where="post", color=FRONT, linewidth=5, solid_joinstyle="round", zorder=1.5, label="Pareto front")
 
@@ -142,7 +142,7 @@ def _knob(axes: Axes, steps: list[TradeRow], floor: float, number: int) -> list[
 
 
 def _plans(axes: Axes, plans: list[TradeRow], floor: float) -> list[Label]:
-    """A heavy line through what was planned, each with the tolerance that was asked for."""
+    """Draw a heavy line through the plans, and return labels with their tolerances."""
     plans = sorted(plans, key=_order)
     places = [_place(row, floor) for row in plans]
     x, y = zip(*places, strict=True)
@@ -153,7 +153,7 @@ def _plans(axes: Axes, plans: list[TradeRow], floor: float) -> list[Label]:
 
 
 def _order(row: TradeRow) -> float:
-    """Along a knob: by its number, a measured window by what was measured; what has no number stays as it came."""
+    """Return the sort key of a row along its line: the numeric value, or the measured window; 0 for names."""
     value = row.window if row.value is None else row.value
     return 0.0 if isinstance(value, str) else float(value)
 
@@ -174,10 +174,10 @@ def _presets(axes: Axes, presets: list[TradeRow], floor: float) -> None:
 
 def _titles(figure: Figure, run: TradeRun) -> None:
     here = run.conditions
-    figure.text(0.03, 0.945, "What exactness costs", fontsize=TITLE, color=INK, weight="bold")
+    figure.text(0.03, 0.945, "Speed-accuracy trade-off", fontsize=TITLE, color=INK, weight="bold")
     about = (
         f"{here.scene}, {here.width} × {here.height} px, K = {here.masks} masks, {here.compositing}; "
-        f"each thin line turns one knob and leaves the others"
+        f"along each thin line one setting changes"
     )
     figure.text(0.03, 0.9, about, fontsize=LABEL, color=FAINT)
     code = f"kornia-tidy {here.version}" + (f" ({here.commit})" if here.commit else "")
@@ -187,7 +187,7 @@ def _titles(figure: Figure, run: TradeRun) -> None:
 
 
 def _label(axes: Axes, labels: list[Label]) -> None:
-    """Write labels beside their points where they cover neither each other nor a point; leave out what has no room."""
+    """Draw labels beside their points without overlap; labels without room are left out."""
     from matplotlib.patheffects import withStroke  # noqa: PLC0415
 
     canvas: Any = axes.figure.canvas

@@ -1,4 +1,4 @@
-"""A sweep on disk and on paper: JSON with its conditions, CSV for spreadsheets, a table for people."""
+"""Files of a sweep: JSON with its conditions, CSV for spreadsheets, and a table in Markdown."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from typing import Any, get_args, get_type_hints
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.files import parse_json, read_bytes, write_bytes
 from kornia_tidy.tradeoff.conditions import Conditions
-from kornia_tidy.tradeoff.ladder import PLAN, PRESET
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
+from kornia_tidy.tradeoff.sweep_settings import PLAN, PRESET
 
 FORMAT = "kornia_tidy.trade/1"
-_KNOB = "fidelity."  # in front of a column of the CSV that is a knob of the fidelity
+_KNOB = "fidelity."  # prefix of the CSV columns with the settings of the fidelity
 
 
 @dataclass(frozen=True)
 class TradeRun:
-    """Rows and the conditions they were all measured under."""
+    """Rows of a sweep and their common conditions."""
 
     conditions: Conditions
     rows: tuple[TradeRow, ...]
 
 
 def write_json(path: str | os.PathLike[str], run: TradeRun) -> None:
-    """Write a sweep, all or nothing.
+    """Write a sweep as JSON, atomically.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -43,11 +43,11 @@ def write_json(path: str | os.PathLike[str], run: TradeRun) -> None:
 
 
 def read_json(path: str | os.PathLike[str]) -> TradeRun:
-    """Read a sweep written by :func:`write_json`, and check every name and type in it.
+    """Read a sweep written by :func:`write_json`, with a check of every name and type.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is not a sweep, or not of this version's schema.
+        ValueError: if it is not a sweep, or has the schema of another version.
     """
     data = read_bytes(path)
     try:
@@ -59,12 +59,12 @@ def read_json(path: str | os.PathLike[str]) -> TradeRun:
             raise ValueError("rows must be a list")
         conditions = Conditions(**_checked("conditions", Conditions, document["conditions"]))
         return TradeRun(conditions, tuple(_row(entry) for entry in document["rows"]))
-    except ValueError as error:  # json's and Unicode's errors are of this kind too
+    except ValueError as error:  # includes errors of JSON and Unicode
         raise ValueError(f"{path} is not a readable sweep: {error}") from None
 
 
 def write_csv(path: str | os.PathLike[str], rows: Iterable[TradeRow]) -> None:
-    """Write the rows for a spreadsheet, all or nothing; an empty cell is None.
+    """Write the rows as CSV, atomically; None becomes an empty cell.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -96,7 +96,7 @@ def read_csv(path: str | os.PathLike[str]) -> list[TradeRow]:
 
 
 def markdown(rows: Sequence[TradeRow]) -> str:
-    """Return the rows as a table in Markdown; the bold ones are on the Pareto front of time and error.
+    """Return the rows as a table in Markdown, with the Pareto front of time and error in bold.
 
     Example:
         >>> print(markdown([]).splitlines()[0])
@@ -122,7 +122,7 @@ def markdown(rows: Sequence[TradeRow]) -> str:
 
 
 def value_in_words(row: TradeRow) -> str:
-    """Return what a knob was turned to, as a person would write it.
+    """Format the value of the swept setting of a row.
 
     Args:
         row: one row of a sweep.
@@ -135,7 +135,7 @@ def value_in_words(row: TradeRow) -> str:
 
 
 def error_in_words(error: float) -> str:
-    """Return an error in two digits.
+    """Format an error with two significant digits.
 
     Example:
         >>> error_in_words(0.01234), error_in_words(0.0000321), error_in_words(0.0)
@@ -169,7 +169,7 @@ def _row(entry: Any) -> TradeRow:
 
 
 def _checked(what: str, kind: type, entry: Any) -> dict[str, Any]:
-    """Return an entry whose names and types are those of a dataclass, or say what is wrong."""
+    """Return an entry of JSON after a check of its names and types against a dataclass."""
     hints = get_type_hints(kind)
     _check_names(what, entry, set(hints))
     for name, value in entry.items():
@@ -177,7 +177,7 @@ def _checked(what: str, kind: type, entry: Any) -> dict[str, Any]:
         if Fidelity in allowed:
             allowed = (dict,)
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed and name != "value"):
-            if float in allowed and type(value) is int:  # JSON's 2 may have been a 2.0 elsewhere
+            if float in allowed and type(value) is int:  # other programs write 2.0 as 2
                 continue
             raise ValueError(f"{name} in {what} must be {hints[name]}, got {value!r}")
     return entry
@@ -197,7 +197,7 @@ def _columns() -> list[str]:
 
 
 def _typed(cells: dict[str, str]) -> dict[str, Any]:
-    """Return a row of a CSV with its cells in the types that its names have."""
+    """Convert the cells of a CSV row to the types of their columns."""
     knobs = get_type_hints(Fidelity)
     hints = {**get_type_hints(TradeRow), **{_KNOB + name: hint for name, hint in knobs.items()}}
     hints["value"] = {**knobs, PLAN: float}.get(cells["knob"], str)

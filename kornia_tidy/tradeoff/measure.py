@@ -1,4 +1,4 @@
-"""The price of every knob: what a capture costs, and how far it is from the reference, on the user's own scene."""
+"""Measurement of time, memory and error of captures at different fidelities, on the user's own scene."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.render.borders import largest_window
 from kornia_tidy.tradeoff.costs import peak_bytes, seconds
-from kornia_tidy.tradeoff.ladder import PRESET, Setting, Value
+from kornia_tidy.tradeoff.sweep_settings import PRESET, Setting, Value
 
 
 @dataclass(frozen=True)
 class TradeRow:
-    """What one setting costs and what it is worth, on one scene.
+    """Time, memory and error of one fidelity on one scene.
 
     Args:
-        knob: the knob that was turned, or ``"preset"``.
-        value: where it was turned to; for presets, the name.
-        fidelity: all knobs.
+        knob: name of the varied setting, ``"preset"`` or ``"plan"``.
+        value: its value; the name of a preset, the tolerance of a plan.
+        fidelity: all settings.
         layers: PSFs over defocus in the bank.
         window: side of the PSFs in pixels.
         rmse: root of the mean squared difference from the reference capture, full scale 1.
         max_error: largest difference of one sample.
-        capture_seconds: a capture whose masks have changed since the last one: PSF bank and rendering, no gradients.
-            Median over the repeats, here and below; what depends on neither masks nor scene is kept.
+        capture_seconds: time of a capture with changed masks: PSF bank and rendering, no gradients. Tables that depend
+            on neither masks nor scene are cached. All times are medians over the repeats.
         capture_spread: its interquartile range in seconds.
-        render_seconds: a capture whose PSFs are remembered from the one before.
+        render_seconds: time of a capture with the cached PSF bank of the one before.
         render_spread: its interquartile range in seconds.
-        training_seconds: a capture and the gradients of its mean with respect to the masks; None if not measured.
+        training_seconds: time of a capture with the gradients of its mean in the masks; None if not measured.
         training_spread: its interquartile range in seconds.
-        capture_bytes: most memory of tensors at one time in a capture, see
+        capture_bytes: peak memory of tensors in a capture, see
             :func:`~kornia_tidy.tradeoff.costs.peak_bytes`.
         training_bytes: the same for the capture with gradients.
-        repeats: runs asked for; what takes seconds is run less often, see
+        repeats: number of runs asked for; slow captures are repeated less often, see
             :func:`~kornia_tidy.tradeoff.costs.seconds`.
     """
 
@@ -72,30 +72,30 @@ def sweep(
     reference: str | Fidelity = "reference",
     known: Iterable[TradeRow] = (),
 ) -> Iterator[TradeRow]:
-    """Measure settings one after another; each row comes as soon as it is there.
+    """Measure settings one after another, and yield each row as soon as it is measured.
 
     Args:
         optics: the camera: its masks, lens, modulator, spectrum, compositing and border, on the device to measure.
             Its sensor and fidelity do not matter.
         image: (C, H, W) or (B, C, H, W) in the camera's colour space, on the same device.
         depth: its depth, (1, H, W) or (B, 1, H, W).
-        settings: what to measure, see :func:`~kornia_tidy.tradeoff.ladder.ladder`.
+        settings: points of the sweep, see :func:`~kornia_tidy.tradeoff.sweep_settings.sweep_settings`.
         repeats: timed runs of each.
         training: measure captures with gradients too.
-        reference: what errors are measured against.
-        known: rows measured earlier under the same conditions: a setting found there is not measured again.
+        reference: the fidelity to which errors refer.
+        known: rows measured earlier under the same conditions; their settings are not measured again.
 
     Returns:
-        Rows in the order of the settings. Settings that are the same under two names are measured once.
+        Rows in the order of the settings. Equal settings with two names are measured once.
 
     Raises:
         ValueError: if the border is ``"valid"`` (captures would differ in size), or repeats are not positive.
 
     Example:
-        >>> from kornia_tidy.tradeoff.ladder import ladder
+        >>> from kornia_tidy.tradeoff.sweep_settings import sweep_settings
         >>> optics = TiDyOptics(fidelity="draft")
         >>> image, depth = torch.rand(3, 48, 48), torch.full((1, 48, 48), 0.8)
-        >>> rows = sweep(optics, image, depth, ladder("draft", ["window"])[:2], repeats=1, reference="balanced")
+        >>> rows = sweep(optics, image, depth, sweep_settings("draft", ["window"])[:2], repeats=1, reference="balanced")
         >>> [(row.window, row.rmse > 0) for row in rows]
         [(9, True), (17, True)]
     """
@@ -110,7 +110,7 @@ def sweep(
 
 
 def missing(settings: Iterable[Setting], known: Iterable[TradeRow], repeats: int, training: bool) -> set[Fidelity]:
-    """Return the settings that a sweep with these known rows has to measure, each once."""
+    """Return the settings that are not among the known rows, each once."""
     served = {_knobs(row.fidelity) for row in known if _serves(row, repeats, training)}
     return {_knobs(setting.fidelity) for setting in settings} - served
 
@@ -120,7 +120,7 @@ def _serves(row: TradeRow, repeats: int, training: bool) -> bool:
 
 
 def _knobs(fidelity: Fidelity) -> Fidelity:
-    """The setting without its name, which changes nothing."""
+    """Return a fidelity without its name, for comparison."""
     return replace(fidelity, name="")
 
 
@@ -146,14 +146,14 @@ def measure(
         training: measure the capture with gradients too.
 
     Raises:
-        ValueError: if ``truth`` has another shape than the image, repeats are not positive, or there is nothing to
-            train.
+        ValueError: if ``truth`` has another shape than the image, repeats are not positive, or the masks have no
+            parameters to train.
     """
     if truth.shape != image.shape:
         raise ValueError(f"truth must have the image's shape {tuple(image.shape)}, got {tuple(truth.shape)}")
     light, device = linear_light(optics, image), image.device
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of windows too small, aliasing, clamping: the error tells their price
+        warnings.simplefilter("ignore")  # windows, aliasing, clamping: the error includes them
         camera = _camera(optics, fidelity, image)
         moving = [p for p in camera.masks.parameters() if p.requires_grad]
         if training and not moving:
@@ -169,7 +169,7 @@ def measure(
         with torch.no_grad():
             difference = (camera(light, depth) - truth).double()
             whole = seconds(capture_once, repeats, device)
-            camera = _camera(optics, fidelity, image)  # a new one has nothing of an earlier capture to free
+            camera = _camera(optics, fidelity, image)  # a new camera has no cache of an earlier capture to free
             memory = peak_bytes(capture_once, device)
             rendering = seconds(lambda: camera(light, depth), repeats, device)
         gradients, gradients_memory = None, None
@@ -199,7 +199,7 @@ def measure(
 
 @torch.no_grad()
 def capture(optics: TiDyOptics, image: Tensor, depth: Tensor, fidelity: str | Fidelity = "reference") -> Tensor:
-    """Return the noise-free capture in linear light that a camera takes at a setting, of the image's shape and dtype.
+    """Return the noise-free capture of a camera at a fidelity, in linear light with the image's shape and dtype.
 
     Example:
         >>> capture(TiDyOptics(), torch.ones(3, 64, 64), torch.ones(1, 64, 64), "draft").mean().round(decimals=4)
@@ -211,7 +211,7 @@ def capture(optics: TiDyOptics, image: Tensor, depth: Tensor, fidelity: str | Fi
 
 
 def pareto(rows: Iterable[TradeRow]) -> list[TradeRow]:
-    """Return the rows that no other beats in both time of a capture and error, fastest first.
+    """Return the Pareto front of capture time and error, fastest row first.
 
     Example:
         >>> pareto([])
@@ -225,12 +225,12 @@ def pareto(rows: Iterable[TradeRow]) -> list[TradeRow]:
 
 
 def linear_light(optics: TiDyOptics, image: Tensor) -> Tensor:
-    """Linear light of an image, batched or not."""
+    """Decode an image, batched or not, to linear light."""
     return optics.decode(image if image.ndim == 4 else image[None]).reshape(image.shape)
 
 
 def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDyOptics:
-    """The same camera at another setting, its window in the border's limits: noise-free, light in and light out."""
+    """Return a noise-free copy of a camera in linear light at another fidelity, its window limited by the border."""
     if optics.border == "valid":
         raise ValueError("captures at different settings differ in size with the border 'valid': choose another")
     fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
@@ -251,7 +251,7 @@ def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDy
 
 
 def _touch(camera: TiDyOptics) -> None:
-    """Change the masks by nothing, as a step of training would by something: a PSF bank kept from before is stale."""
+    """Invalidate the cached PSF bank, as a training step does, by adding zero to the masks."""
     with torch.no_grad():
         for phase in camera.masks.parameters():
             phase.add_(0)

@@ -49,7 +49,7 @@ def by_us(path: str, algorithm: str) -> torch.Tensor:
 
 
 def start() -> None:
-    """What our decoding process does before it decodes."""
+    """Start-up work of the decoder process before it decodes."""
     subprocess.run(
         [sys.executable, "-I", "-S", "-c", START, json.dumps(sys.path)],
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},

@@ -90,7 +90,7 @@ def folder_of(root: Path, task: str, masks: int, seed: int) -> Path:
 
 
 def train_all(root: Path, tasks: list[str], masks: list[int], seeds: list[int], **changed: Any) -> None:
-    """Train what is not yet trained, with some settings changed for all."""
+    """Train all systems that have no checkpoint yet, with some settings changed for all."""
     for seed in seeds:
         for task in tasks:
             for number in masks:
@@ -126,7 +126,7 @@ def score(folder: Path) -> dict[str, dict[str, float]]:
 
 
 def score_all(root: Path) -> None:
-    """Score what is trained and has no scores yet."""
+    """Score all trained systems without scores."""
     for folder in sorted(root.iterdir()):
         if is_trained(folder) and not (folder / "scores.json").exists():
             scores = score(folder)

@@ -1,4 +1,4 @@
-"""How well PSFs are calibrated from simulated captures of a point, and what Tikhonov makes of them.
+"""Accuracy of PSF calibration from simulated captures of a point, and of Tikhonov restoration with its PSFs.
 
 ``python -m tests.benchmarks.psf_calibration`` prints the table. Each camera is a sensor of 12 bits with a black level,
 with or without a filter array, behind a lens with a coded aperture. The point is imaged exactly, at random ninths of a

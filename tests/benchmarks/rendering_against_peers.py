@@ -206,7 +206,7 @@ def test_ratios_within_one_run(scene):
 
 @pytest.mark.parametrize("scene", ["small", "aloe"])
 def test_occlusion_against_the_stack_of_all_layers(scene):
-    """The stack in float64 says what is right; in float32, as its authors run it, it is timed and its error shown."""
+    """The float64 stack is the reference; in float32, as its authors run it, it is timed and its error printed."""
     image, psi = load_scene(scene)
     bank = make_bank(21, 23)
     coded = tiled_occlusion(image, psi, bank)

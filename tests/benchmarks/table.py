@@ -13,7 +13,7 @@ TOP = {"machine_info": dict, "datetime": str, "benchmarks": list}
 
 
 def read_benchmarks(path: str | Path) -> dict[str, Any]:
-    """Read what pytest-benchmark wrote, and check that all is there that makes a time mean something.
+    """Read the JSON of pytest-benchmark, and check that it has the conditions of the measurement.
 
     Raises:
         ValueError: if a name is missing, or a value is of the wrong kind.

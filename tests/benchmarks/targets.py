@@ -67,7 +67,7 @@ def make_states() -> tuple[Tensor, Tensor]:
 
 
 def make_optics(masks: int = MASKS, fidelity: Fidelity | None = None, **options) -> TiDyOptics:
-    """A camera whose range of defocus is the scene's, without noise and encoding: what is timed is the optics."""
+    """Return a camera fitted to the scene's depths, without noise and encoding, so that only the optics is timed."""
     exact = Fidelity(window=WINDOW, layers="nearest", layer_spacing=2.0) if fidelity is None else fidelity
     torch.manual_seed(0)
     return TiDyOptics(

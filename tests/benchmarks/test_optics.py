@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.mask_design import autocorrelation_witness
+from kornia_tidy.mask_design import autocorrelation_bound
 from kornia_tidy.masks import CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import GreyLevels, PixelCrosstalk, SpatialLightModulator, Switching
 from kornia_tidy.optics import camera_spectrum, circular_aperture, polygon_aperture
@@ -40,9 +40,9 @@ class TestOptics:
         phase = PixelwiseMask(5).phase.detach().to(device)
         bench(lambda: modulator(phase), size=0, masks=5, pupil=23)
 
-    def test_witness(self, bench):
+    def test_autocorrelation_bound(self, bench):
         phase, aperture = PixelwiseMask(5).phase.detach(), circular_aperture(23)
-        bench(lambda: autocorrelation_witness(phase, aperture), size=0, masks=5, pupil=23)
+        bench(lambda: autocorrelation_bound(phase, aperture), size=0, masks=5, pupil=23)
 
     def test_window_fitted_to_new_masks(self, bench, device):
         optics = TiDyOptics(PixelwiseMask(5), fidelity=Fidelity("draft", enclosed_energy=0.6)).to(device)

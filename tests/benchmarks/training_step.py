@@ -1,4 +1,4 @@
-"""What share of a training step is the camera's: PSFs, rendering and noise, forward and backward to the masks.
+"""Share of the camera in the time of a training step: PSFs, rendering and noise, forward and backward.
 
 ``python -m tests.benchmarks.training_step [head ...]``. Batch 8 of dead leaves, K = 5, the camera and the loss that
 ``kornia-tidy train`` has by default. One thread, and its own time on the processor, so that it matters little what else

@@ -99,7 +99,7 @@ class TestMasks(BaseTester):
             ("export heights.npy -o slm.png", "the suffix of what to write must be one of '', '.npy', '.stl'"),
             ("export heights.npy -o none/slm", "cannot write none/slm: there is no folder none"),
             ("export heights.npy -o taken", "cannot write taken: it exists, and --force was not given"),
-            ("export heights.npy -o taken --force", "it holds holiday.jpg, which is no part of frames written"),
+            ("export heights.npy -o taken --force", "it holds holiday.jpg, which is no file of a folder of frames"),
             ("export heights.npy -o heights.npy --force", "cannot write heights.npy: it is the input"),
             ("export heights.npy -o slm --bits 11", "bits must be a whole number from 1 to 10, got 11"),
             ("export heights.npy -o slm --panel 0x5", "a panel is WIDTHxHEIGHT in pixels"),

@@ -75,8 +75,8 @@ class TestRawInfo(BaseTester):
         told = capsys.readouterr()
         assert told.out.count("black 64, white 54998; counts") == 2
         assert told.err == (
-            "kornia-tidy: warning: lie.dng: its white level 255 lies, as its counts reach 54998, which is taken for "
-            "white: if you know the right one, give it (white=..., --white N)\n"
+            "kornia-tidy: warning: lie.dng: its white level 255 is wrong, as its counts reach 54998, which is taken "
+            "for white: if you know the right one, give it (white=..., --white N)\n"
         )
         assert run("info lie.dng --white 60000") == 0
         told = capsys.readouterr()

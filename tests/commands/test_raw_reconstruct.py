@@ -51,7 +51,7 @@ def capture(path, seed=0, size=(90, 110)):
 
 
 def raw_file(size=(60, 80), seed=0):
-    """A DNG of a camera whose colours are those of sRGB."""
+    """Write a DNG of a camera with the colours of sRGB."""
     light = torch.rand(3, *size, generator=torch.Generator().manual_seed(seed))
     camera = RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095)
     camera = replace(camera, camera_to_srgb=torch.eye(3), white_balance=torch.ones(4))
@@ -199,7 +199,7 @@ class TestRawReconstruct(BaseTester):
         assert f"--head HEAD {', '.join(PRETRAINED)}, or a checkpoint" in " ".join(capsys.readouterr().out.split())
 
     def test_feature_dumps_are_developed_linearly(self, tmp_path):
-        """A grey mosaic of 25 % light: what the network sees is 0.25 in all three colours, but for one dead pixel."""
+        """A grey mosaic of 25 % light: the network's input is 0.25 in all three colours, except near one dead pixel."""
         counts = np.full((64, 80), 64 + 240, "<u2")
         counts[0, 0] = 64
         counts.tofile(tmp_path / "a.raw")

@@ -31,7 +31,7 @@ def rendered(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    """A trained system, whose masks are not those that its settings begin with."""
+    """Write a trained system with masks other than the initial ones of its settings."""
     settings = TrainingSettings(masks=1, size=40, width=4, head="plain", window=23, border="replicate", seed=3)
     optics, head = build_optics(settings), build_head(settings)
     with torch.no_grad():

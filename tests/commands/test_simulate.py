@@ -169,9 +169,9 @@ class TestSimulate(BaseTester):
         assert {p: p.stat().st_mtime_ns for p in scene.iterdir()} == before
 
     def test_exception_a_full_disk_is_one_sentence_that_names_the_file(self, scene, capsys):
-        """A limit on the size of files stands for the disk: the write fails half-way, as on a full one."""
+        """A limit on the size of files simulates a full disk: the write fails half-way."""
         command = ["simulate", "image.png", "--depth", "depth.pfm", "--fidelity", "draft", "-o"]
-        assert main([*command, "first.png"]) == 0  # compiles what is not compiled yet, which needs the disk too
+        assert main([*command, "first.png"]) == 0  # compiles the kernels before the limit, as this writes files too
         before = sorted(os.listdir())
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 10, limits[1]))

@@ -82,7 +82,7 @@ class TestSystems(BaseTester):
         files = ["--image", str(folder / "im0.png"), "--depth", str(folder / "disp0GT.pfm"), "--invalid", "inf"]
         stereo = ["--depth-kind", "disparity", "--focal-px", "999.421", "--baseline-m", "0.193", "--doffs-px", "32.8"]
         threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # so that processor time is what an idle machine would take, whoever else works here
+        torch.set_num_threads(1)  # one thread, so that processor time does not depend on other processes
         start = time.process_time()
         status = main(["systems", *files, *stereo, "-o", str(tmp_path / "all.png")])
         torch.set_num_threads(threads)

@@ -22,7 +22,7 @@ KNOBS = ["--knobs", "layer_spacing"]
 
 @pytest.fixture
 def measured(monkeypatch):
-    """The spacings measured, in order; what is measured is made up."""
+    """Replace measurements by invented rows, and return the list of measured spacings in order."""
     settings = []
 
     def made_up(optics, image, depth, fidelity, *_, repeats, training):

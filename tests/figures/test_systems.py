@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from kornia_tidy import DefocusRange, TiDyOptics
-from kornia_tidy.figures.system_survey import survey
+from kornia_tidy.figures.system_statistics import system_statistics
 from kornia_tidy.figures.systems import Portrait, draw_systems
 from kornia_tidy.systems import published_system
 from tests.base import BaseTester
@@ -12,7 +12,7 @@ from tests.base import BaseTester
 
 def portrait(name, **overrides):
     optics = TiDyOptics.from_preset(name, **overrides)
-    return Portrait(published_system(name), optics, survey(optics, nodes=7), torch.rand(3, 20, 30))
+    return Portrait(published_system(name), optics, system_statistics(optics, nodes=7), torch.rand(3, 20, 30))
 
 
 class TestDrawSystems(BaseTester):

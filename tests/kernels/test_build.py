@@ -50,7 +50,7 @@ class CompiledTester(BaseTester):
 
     @staticmethod
     def compiler(path: Path, body: str) -> str:
-        """Write a shell script that stands for a compiler."""
+        """Write a shell script in place of a compiler."""
         path.write_text(f"#!/bin/sh\n{body}\n")
         path.chmod(0o755)
         return str(path)
@@ -168,7 +168,7 @@ class TestCache(CompiledTester):
     """Libraries that are not whole or not the user's own, and folders that cannot be used."""
 
     def damaged(self, source: Path, folder: Path, damage) -> Path:
-        """Compile without loading (a library in use stays as it is), damage what lies in the cache, forget."""
+        """Compile without loading a library, damage the cached file, and clear the cache in memory."""
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(ctypes, "CDLL", str)
             compiled(source, torch.float64)

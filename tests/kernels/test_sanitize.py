@@ -1,4 +1,4 @@
-"""That the sanitizers see what they are there for, in the package's own sources, and nothing in them as they are."""
+"""Sanitizers on the package's C sources: they detect planted faults and report none in the original sources."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.kernels.kernel_shapes import KERNELS
 from tests.kernels.sanitize import ROOT, main, sanitized, why_not
 
 ROW = "const REAL *x = kernel + (p * order + q) * cells * 2;"
-FAULTS = {  # planted in mutual_intensity.c, and what is said of it
+FAULTS = {  # faults planted in mutual_intensity.c, with their reports
     "read beyond the end": (ROW, ROW.replace("+ q)", "+ q + 1)"), "heap-buffer-overflow"),
     "overflow": ("int64_t s = 0;", "int64_t s = 0; volatile int n = 2147483647; n = n + 1;", "signed integer overflow"),
 }

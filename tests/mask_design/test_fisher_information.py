@@ -31,13 +31,13 @@ FINE = Fidelity("fine", pixel_tolerance=1e-4, window=25, stray_light="discard", 
 
 
 def smooth_mask(seed: int = 3, rms: float = 1.0) -> Tensor:
-    """A mask without any symmetry, (1, 23, 23) radians."""
+    """Return a smooth mask without symmetry, (1, 23, 23) radians."""
     strengths = rms / 28**0.5 * torch.randn(28, generator=torch.Generator().manual_seed(seed))
     return ZernikeMask(1, num_modes=28, initial=strengths).phase.detach().double()
 
 
 class GivenPhase(PhaseMasks):
-    """Masks of a phase that is computed elsewhere, so that gradients pass through them."""
+    """Masks with a given phase tensor, so that gradients pass to it."""
 
     def __init__(self, phase: Tensor) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class GivenPhase(PhaseMasks):
 
 
 class SampledCamera:
-    """The published setting written out with NumPy's FFT: expected photons of a point and their derivatives."""
+    """The published setting with NumPy's FFT: expected photons of a point and their derivatives."""
 
     def __init__(self, phase: np.ndarray, photons: float, background: float, samples: int = 64) -> None:
         self.index = np.arange(23) - 11.0
@@ -55,7 +55,7 @@ class SampledCamera:
         self.photons, self.background, self.samples = photons, background, samples
 
     def expected(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Photons (T, M²) and derivatives (T, 3, M²) at T points (psi, x, y), the place being in pixels."""
+        """Return photons (T, M²) and derivatives (T, 3, M²) at T points (psi, x, y), with x and y in pixels."""
         psi, x, y = parameters.T[..., None, None]
         column = 2 * np.pi / self.samples * self.index
         row = column[:, None]
@@ -63,20 +63,20 @@ class SampledCamera:
         waves = np.stack([wave, 1j * self.rho2 * wave, 1j * column * wave, 1j * row * wave])
         light = np.fft.fft2(waves, s=(self.samples, self.samples)) / self.samples
         counts = self.photons * np.abs(light[0]) ** 2 + self.background
-        slopes = 2 * self.photons * (light[0].conj() * light[1:]).real
-        return counts.reshape(len(psi), -1), slopes.transpose(1, 0, 2, 3).reshape(len(psi), 3, -1)
+        derivatives = 2 * self.photons * (light[0].conj() * light[1:]).real
+        return counts.reshape(len(psi), -1), derivatives.transpose(1, 0, 2, 3).reshape(len(psi), 3, -1)
 
     def bound(self, psi: float) -> float:
-        counts, slopes = self.expected(np.array([[psi, 0, 0]]))
-        return float(np.linalg.inv((slopes[0] / counts[0]) @ slopes[0].T)[0, 0] ** 0.5)
+        counts, derivatives = self.expected(np.array([[psi, 0, 0]]))
+        return float(np.linalg.inv((derivatives[0] / counts[0]) @ derivatives[0].T)[0, 0] ** 0.5)
 
     def most_likely(self, images: np.ndarray, start: np.ndarray, steps: int) -> np.ndarray:
-        """Maximum likelihood by Fisher scoring from the truth: the maximum that an unbiased estimate would be at."""
+        """Return maximum likelihood estimates by Fisher scoring from the true values, to find the maximum near them."""
         found = np.tile(start, (len(images), 1))
         for _ in range(steps):
-            counts, slopes = self.expected(found)
-            score = np.einsum("tip,tp->ti", slopes, images / counts - 1)
-            information = np.einsum("tip,tjp->tij", slopes / counts[:, None], slopes)
+            counts, derivatives = self.expected(found)
+            score = np.einsum("tip,tp->ti", derivatives, images / counts - 1)
+            information = np.einsum("tip,tjp->tij", derivatives / counts[:, None], derivatives)
             step = np.linalg.solve(information, score[..., None])[..., 0]
             found = found + np.clip(step, -1, 1)
         return found
@@ -92,16 +92,16 @@ def errors_of_maximum_likelihood(camera: SampledCamera, psi: float, trials: int,
 class TestBoundIsReached(BaseTester):
     @pytest.mark.parametrize("psi", [-8.0, 0.0, 8.0])
     def test_feature_maximum_likelihood_scatters_by_the_bound(self, psi):
-        """1000 images of 3000 photons: the standard deviation itself is known to 2 %."""
+        """With 1000 images of 3000 photons, the standard deviation is measured to 2 %."""
         camera = SampledCamera(smooth_mask()[0].numpy(), 3000, 5)
         errors = errors_of_maximum_likelihood(camera, psi, 1000, steps=3)
         bound = float(defocus_bound(fisher_information(sampled_response(smooth_mask(), APERTURE, [psi]))))
         assert errors.std() == pytest.approx(bound, rel=0.1)
-        assert abs(errors.mean()) < bound / 5  # so the bound for unbiased estimates is the one that counts
+        assert abs(errors.mean()) < bound / 5  # small enough for the bound on unbiased estimates to apply
 
     @pytest.mark.slow
     def test_feature_at_200_photons_the_bound_is_loose(self):
-        """Out of focus the scatter exceeds it by a quarter: what the documentation says."""
+        """Out of focus the standard deviation exceeds the bound by a quarter, as documented."""
         camera = SampledCamera(fisher_mask().numpy() * (math.pi / 530e-9), 200, 5)
         ratios = [errors_of_maximum_likelihood(camera, psi, 1000, 15).std() / camera.bound(psi) for psi in (-8.0, 8.0)]
         assert ratios == pytest.approx([1.25, 1.25], abs=0.1)
@@ -110,21 +110,21 @@ class TestBoundIsReached(BaseTester):
 class TestSampledResponse(BaseTester):
     def test_feature_equals_the_fft(self):
         nodes = [-9.0, 0.0, 3.5]
-        psfs, slopes = sampled_response(smooth_mask(), APERTURE, nodes)
+        psfs, derivatives = sampled_response(smooth_mask(), APERTURE, nodes)
         camera = SampledCamera(smooth_mask()[0].numpy(), 1, 0)
-        counts, derivatives = camera.expected(np.array([[psi, 0, 0] for psi in nodes]))
-        # The transform has its origin in the first pixel, and at the pupil's first sample: a phase no PSF can see.
+        counts, expected = camera.expected(np.array([[psi, 0, 0] for psi in nodes]))
+        # NumPy's FFT has its origin at the first pixel and at the first pupil sample, which only changes phases.
         shifted = np.fft.fftshift(counts.reshape(3, 64, 64), (1, 2))
         self.assert_close(psfs[:, 0], torch.from_numpy(shifted), rtol=0, atol=1e-12)
-        derivatives = np.fft.fftshift(derivatives.reshape(3, 3, 64, 64), (2, 3)).swapaxes(0, 1)
-        self.assert_close(slopes[:, :, 0], torch.from_numpy(derivatives.copy()), rtol=0, atol=1e-12)
+        expected = np.fft.fftshift(expected.reshape(3, 3, 64, 64), (2, 3)).swapaxes(0, 1)
+        self.assert_close(derivatives[:, :, 0], torch.from_numpy(expected.copy()), rtol=0, atol=1e-12)
 
     def test_feature_averages_masks_by_their_weights(self):
         pair = torch.cat([smooth_mask(1), smooth_mask(2)])
         mean = sampled_response(pair, APERTURE, [4.0], weights=torch.tensor([0.75, 0.25]))
         first, second = (sampled_response(mask[None], APERTURE, [4.0]) for mask in pair)
         self.assert_close(mean.psfs, 0.75 * first.psfs + 0.25 * second.psfs)
-        self.assert_close(mean.slopes, 0.75 * first.slopes + 0.25 * second.slopes)
+        self.assert_close(mean.derivatives, 0.75 * first.derivatives + 0.25 * second.derivatives)
         equal = sampled_response(pair, APERTURE, [4.0])
         self.assert_close(equal.psfs, (first.psfs + second.psfs) / 2)
 
@@ -147,21 +147,21 @@ LENSES = {
 
 class TestDefocusResponse(BaseTester):
     @pytest.mark.parametrize("case", LENSES)
-    def test_feature_is_the_bank_and_its_slope(self, case):
-        """Against the bank itself, and central differences of it in defocus: exact to the second order."""
+    def test_feature_is_the_bank_and_its_derivative(self, case):
+        """Against the PSF bank and its central differences over defocus, which are exact to second order."""
         masks, parts = LENSES[case]()
         lens = CodedLens(masks, fidelity=FINE, **parts)
         nodes, h = [-17.0, 0.0, 3.0], 1e-4
-        psfs, slopes = defocus_response(lens, nodes)
+        psfs, derivatives = defocus_response(lens, nodes)
         with torch.no_grad():
             bank, above, below = (lens.psf_bank(defocus=[psi + d for psi in nodes]).psfs for d in (0, h, -h))
         self.assert_close(psfs, bank, rtol=0, atol=1e-9)
-        self.assert_close(slopes[0], (above - below) / (2 * h), rtol=0, atol=1e-8)
-        assert slopes[0].abs().max() > 1e-3
+        self.assert_close(derivatives[0], (above - below) / (2 * h), rtol=0, atol=1e-8)
+        assert derivatives[0].abs().max() > 1e-3
 
     @pytest.mark.parametrize("axis", [1, 2])
-    def test_feature_slopes_of_place_are_those_of_a_tilted_wave(self, axis):
-        """A tilt of many fine mask pixels moves the PSF; a pixel of sensor is `pixel` cycles over a pupil radius."""
+    def test_feature_derivatives_of_position_are_those_of_a_tilted_wave(self, axis):
+        """A tilt on fine mask pixels shifts the PSF; `pixel` cycles per pupil radius shift it by one sensor pixel."""
         lens = CodedLens(PixelwiseMask(1, size=115, initial="flat"), fidelity=FINE, spectrum=Spectrum.monochrome())
         camera, h = lens.camera, 1e-3
         pixel = camera.pixel_pitch * camera.aperture_radius / camera.image_distance / 530e-9
@@ -177,29 +177,31 @@ class TestDefocusResponse(BaseTester):
         ]
         with torch.no_grad():
             psfs = [one.psf_bank(defocus=[6.0]).psfs for one in moved]
-        slopes = defocus_response(lens, [6.0]).slopes[axis]
-        self.assert_close(slopes, (psfs[0] - psfs[1]) / (2 * h), rtol=0, atol=3e-4 * float(slopes.detach().abs().max()))
+        derivatives = defocus_response(lens, [6.0]).derivatives[axis]
+        self.assert_close(
+            derivatives, (psfs[0] - psfs[1]) / (2 * h), rtol=0, atol=3e-4 * float(derivatives.detach().abs().max())
+        )
 
     def test_feature_a_learnable_focus_and_default_nodes(self):
         lens = CodedLens(PixelwiseMask(1), ThinLensCamera(focus_distance=torch.tensor(0.595)), fidelity="draft")
-        psfs, slopes = defocus_response(lens)
+        psfs, derivatives = defocus_response(lens)
         assert psfs.shape == (len(lens.defocus_nodes), 3, lens.window, lens.window)
-        assert slopes.shape == (3, *psfs.shape)
-        assert psfs.dtype == slopes.dtype == torch.float64
+        assert derivatives.shape == (3, *psfs.shape)
+        assert psfs.dtype == derivatives.dtype == torch.float64
 
 
 class TestFisherInformation(BaseTester):
     def test_feature_a_point_between_two_pixels(self):
-        """One pixel has the share p of N photons, the other the rest: the information of a binomial, N p'²/(p(1-p))."""
+        """Two pixels share N photons as p to 1 - p: the information is that of a binomial, N p'²/(p(1-p))."""
         psfs = torch.tensor([0.2, 0.8]).double().reshape(1, 1, 1, 2)
-        slopes = torch.tensor([0.3, -0.3]).double().expand(3, 1, 1, 1, 2)
-        information = fisher_information(PointResponse(psfs, slopes), photons=50, background=0)
+        derivatives = torch.tensor([0.3, -0.3]).double().expand(3, 1, 1, 1, 2)
+        information = fisher_information(PointResponse(psfs, derivatives), photons=50, background=0)
         self.assert_close(information, torch.full((1, 3, 3), 50 * 0.09 / 0.16).double())
 
     def test_feature_channels_add_up(self):
         lens = CodedLens(PixelwiseMask(1), fidelity="draft")
         both = defocus_response(lens, [5.0])
-        parts = [PointResponse(both.psfs[:, [c]], both.slopes[:, :, [c]]) for c in range(3)]
+        parts = [PointResponse(both.psfs[:, [c]], both.derivatives[:, :, [c]]) for c in range(3)]
         self.assert_close(fisher_information(both), sum(fisher_information(part) for part in parts))
 
     @settings(max_examples=25, deadline=None)
@@ -234,14 +236,14 @@ class TestDefocusBound(BaseTester):
 
 class TestCRLB(BaseTester):
     def test_feature_is_the_scatter_of_the_score_of_simulated_photons(self):
-        """Fisher information is the variance of the slope of the log-likelihood: drawn here, photon by photon."""
+        """Fisher information is the variance of the log-likelihood's derivative, here over simulated photon counts."""
         lens = CodedLens(PixelwiseMask(1), fidelity=Fidelity(window=33, stray_light="discard"))
         with torch.no_grad():
             psfs = lens.psf_bank(defocus=[4.99, 5.0, 5.01], dtype=torch.float64).psfs
             bound = float(crlb(lens, [5.0], known_position=True))
-        expected, slope = 3000 * psfs[1] + 5, 3000 * (psfs[2] - psfs[0]) / 0.02
+        expected, derivative = 3000 * psfs[1] + 5, 3000 * (psfs[2] - psfs[0]) / 0.02
         photons = torch.poisson(expected.expand(4000, -1, -1, -1))
-        score = ((photons / expected - 1) * slope).sum((1, 2, 3))
+        score = ((photons / expected - 1) * derivative).sum((1, 2, 3))
         assert bound == pytest.approx(float(score.var()) ** -0.5, rel=0.05)
 
     def test_smoke_any_mask_has_a_bound_in_double_precision(self, device, dtype):
@@ -269,7 +271,7 @@ class TestCRLB(BaseTester):
         self.assert_close(crlb(lens, [-3.0, 7.0])[1:], crlb(lens, [7.0]))
 
     def test_feature_matches_the_sampled_setting_on_the_same_pixels(self):
-        """But for what pixels of a mask throw far out, and points do not: a few percent of the bound."""
+        """They differ by a few percent, because mask pixels scatter light far out and point samples do not."""
         samples, radius, distance = 64, 1.4175e-3, 0.05459
         pitch = (10 / samples) * 530e-9 * distance / radius
         camera = DefocusRange(-10, 10, ThinLensCamera(pixel_pitch=pitch))
@@ -282,7 +284,7 @@ class TestCRLB(BaseTester):
         assert 1.02 < float(ratio.min()) <= float(ratio.max()) < 1.08
 
     def test_feature_an_average_tells_at_most_what_its_masks_tell_on_average(self):
-        """Fisher information is convex in what is expected; so much is lost when one image is all there is."""
+        """Fisher information is convex in the expected image, so averaging PSFs cannot increase it."""
         masks = PixelwiseMask(3).double()
         together = crlb(CodedLens(masks, fidelity=FINE), [-6.0, 6.0], known_position=True)
         lenses = [CodedLens(PixelwiseMask(initial=h).double(), fidelity=FINE) for h in masks.heights().detach()]
@@ -290,7 +292,7 @@ class TestCRLB(BaseTester):
         assert bool((together > alone.square().reciprocal().mean(0).rsqrt()).all())
 
     def test_feature_the_spiral_tells_defocus_alike_at_all_depths(self):
-        """A PSF that turns does so as fast everywhere; the plain lens is blind in focus."""
+        """A rotating PSF changes equally fast at every depth; a plain lens has no information in focus."""
         mask = SpiralMask(1, size=92, num_zones=3, initial="rotating")
         lens = CodedLens(mask, DefocusRange(-10, 10), fidelity=FINE, spectrum=Spectrum.monochrome())
         bound = crlb(lens, np.linspace(-8, 8, 9)).detach()

@@ -9,7 +9,7 @@ from scipy.signal import correlate2d
 from torch import Tensor
 
 from kornia_tidy import FresnelLens, PixelwiseMask
-from kornia_tidy.mask_design.non_convexity import autocorrelation_witness, extreme_points
+from kornia_tidy.mask_design.non_convexity import autocorrelation_bound, extreme_points
 from kornia_tidy.masks import mask_coordinates
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
 from tests.base import BaseTester
@@ -45,8 +45,8 @@ def masks_of(kind: str, size: int) -> Tensor:
     return kinds[kind][None]
 
 
-def witness_by_direct_sums(phase: Tensor, aperture: Tensor, weights: Tensor) -> float:
-    """The autocorrelation summed in space by SciPy, at the lag of the two extreme points."""
+def bound_by_direct_sums(phase: Tensor, aperture: Tensor, weights: Tensor) -> float:
+    """Return the bound from autocorrelations by SciPy's direct sums, at the lag of the two extreme points."""
     size = phase.shape[-1]
     total = np.zeros((2 * size - 1, 2 * size - 1), complex)
     for one, weight in zip(phase.numpy(), weights.numpy(), strict=True):
@@ -57,36 +57,36 @@ def witness_by_direct_sums(phase: Tensor, aperture: Tensor, weights: Tensor) -> 
 
 
 @pytest.mark.parametrize("aperture", APERTURES.values(), ids=APERTURES.keys())
-class TestWitness(BaseTester):
+class TestAutocorrelationBound(BaseTester):
     @pytest.mark.parametrize("kind", ["random", "flat", "Fresnel", "defocused", "strongly defocused", "paper's start"])
     def test_feature_is_one_for_every_single_mask(self, aperture, kind):
         phase = masks_of(kind, aperture.shape[-1])
-        assert abs(float(autocorrelation_witness(phase, aperture)) - 1) < 1e-9
+        assert abs(float(autocorrelation_bound(phase, aperture)) - 1) < 1e-9
 
     def test_feature_is_below_one_for_averages_of_different_masks(self, aperture):
         size = aperture.shape[-1]
         for count in (2, 3, 8):
             phase = torch.cat([masks_of("random", size) for _ in range(count)])
-            assert 0 <= float(autocorrelation_witness(phase, aperture)) < 1 - 1e-6
+            assert 0 <= float(autocorrelation_bound(phase, aperture)) < 1 - 1e-6
 
     def test_feature_is_one_for_averages_of_identical_masks(self, aperture):
         phase = masks_of("random", aperture.shape[-1]).expand(4, -1, -1)
-        assert abs(float(autocorrelation_witness(phase, aperture)) - 1) < 1e-9
-        # A mask raised as a whole has the same PSF.
+        assert abs(float(autocorrelation_bound(phase, aperture)) - 1) < 1e-9
+        # A constant added to a mask does not change its PSF.
         raised = phase + torch.arange(4.0).double()[:, None, None]
-        assert abs(float(autocorrelation_witness(raised, aperture)) - 1) < 1e-9
+        assert abs(float(autocorrelation_bound(raised, aperture)) - 1) < 1e-9
 
     def test_feature_matches_direct_sums(self, aperture):
         phase = torch.cat([masks_of("random", aperture.shape[-1]) for _ in range(3)])
         weights = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
-        expected = witness_by_direct_sums(phase, aperture, weights)
-        assert float(autocorrelation_witness(phase, aperture, weights)) == pytest.approx(expected, abs=1e-9)
+        expected = bound_by_direct_sums(phase, aperture, weights)
+        assert float(autocorrelation_bound(phase, aperture, weights)) == pytest.approx(expected, abs=1e-9)
 
     def test_feature_defocus_common_to_all_masks_changes_nothing(self, aperture):
         size = aperture.shape[-1]
         phase = torch.cat([masks_of("random", size) for _ in range(3)])
-        blurred = autocorrelation_witness(phase + defocus(size, 17.0), aperture)
-        self.assert_close(blurred, autocorrelation_witness(phase, aperture), rtol=0, atol=1e-9)
+        blurred = autocorrelation_bound(phase + defocus(size, 17.0), aperture)
+        self.assert_close(blurred, autocorrelation_bound(phase, aperture), rtol=0, atol=1e-9)
 
     def test_feature_no_other_pair_of_points_is_as_far_apart(self, aperture):
         (y0, x0), (y1, x1) = extreme_points(aperture)
@@ -98,24 +98,24 @@ class TestWitness(BaseTester):
 class TestWeights(BaseTester):
     @staticmethod
     def opposite() -> Tensor:
-        """Two masks whose phasors at the extreme points point away from each other."""
+        """Return two masks with opposite autocorrelations at the extreme points."""
         phase = torch.zeros(2, 5, 5, dtype=torch.float64)
         phase[1, 0, 0] = math.pi
         return phase
 
     @pytest.mark.parametrize(("weights", "expected"), [((0.5, 0.5), 0.0), ((0.75, 0.25), 0.5), ((1.0, 0.0), 1.0)])
     def test_feature_weights_are_those_of_the_mean_of_phasors(self, weights, expected):
-        witness = autocorrelation_witness(self.opposite(), torch.ones(5, 5), torch.tensor(weights))
-        assert float(witness) == pytest.approx(expected, abs=1e-9)
+        bound = autocorrelation_bound(self.opposite(), torch.ones(5, 5), torch.tensor(weights))
+        assert float(bound) == pytest.approx(expected, abs=1e-9)
 
     def test_feature_a_quarter_turn_between_two_masks_gives_half_the_root_of_two(self):
-        witness = autocorrelation_witness(self.opposite() / 2, torch.ones(5, 5))
-        assert float(witness) == pytest.approx(math.sqrt(0.5), abs=1e-9)
+        bound = autocorrelation_bound(self.opposite() / 2, torch.ones(5, 5))
+        assert float(bound) == pytest.approx(math.sqrt(0.5), abs=1e-9)
 
     def test_feature_equal_thirds_are_exact(self):
         phase = torch.zeros(3, 5, 5, dtype=torch.float64)
-        assert abs(float(autocorrelation_witness(phase, torch.ones(5, 5))) - 1) < 1e-9
+        assert abs(float(autocorrelation_bound(phase, torch.ones(5, 5))) - 1) < 1e-9
 
     def test_exception_a_soft_aperture_is_refused(self):
-        with pytest.raises(ValueError, match="binary aperture, got values other than 0 and 1"):
-            autocorrelation_witness(self.opposite(), 0.5 * torch.ones(5, 5))
+        with pytest.raises(ValueError, match="aperture must be binary, got values other than 0 and 1"):
+            autocorrelation_bound(self.opposite(), 0.5 * torch.ones(5, 5))

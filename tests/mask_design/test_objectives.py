@@ -23,7 +23,7 @@ def lens_with(masks, limit=10.0):
 
 
 def bank_of(*psfs):
-    """A bank of one channel, in float64."""
+    """Return a PSF bank of one channel in float64."""
     stack = torch.stack([torch.as_tensor(psf).double() for psf in psfs])[:, None]
     return PSFBank(stack, torch.arange(len(psfs)).double(), stack.sum((2, 3)))
 
@@ -48,7 +48,7 @@ class TestDesign(BaseTester):
         self.assert_close(masks.heights().detach() * 1e8, torch.ones(1, 23, 23))
 
     def test_feature_the_bound_of_a_lens_falls(self):
-        """Two masks in three colours: nothing is special about one mask and the published setting."""
+        """The design works for two masks in three colours too, not only for one mask in the published setting."""
         masks = PixelwiseMask(2)
         lens = CodedLens(masks, DefocusRange(-10, 10), fidelity=COARSE.replace(window=17, layer_spacing=5.0))
         history = design(masks, lambda: crlb(lens).mean(), iterations=15, lr_metres=3e-8)
@@ -63,7 +63,7 @@ class TestDesign(BaseTester):
 
 class TestFisherDesign(BaseTester):
     def test_feature_beats_the_published_mask_by_far(self):
-        """0.0785 rad for the mask published with PhaseCam3D, in the same setting; half the steps do."""
+        """The mask published with PhaseCam3D has 0.0785 rad in the same setting; half the steps suffice here."""
         _, bound = design_fisher_mask(seed=0, iterations=75)
         assert bound < 0.072
 
@@ -73,11 +73,11 @@ class TestFisherDesign(BaseTester):
         assert one == same != other
 
     def test_feature_two_lobes_turn_by_a_quarter_through_focus(self):
-        """The tetrapod of Shechtman et al.: its PSF is long on one axis before focus and on the other one behind it."""
+        """The tetrapod of Shechtman et al.: its PSF is elongated along one axis before focus, the other behind."""
         with torch.no_grad():
             psfs = lens_with(PixelwiseMask(initial=fisher_mask())).psf_bank(defocus=[-8.0, 0.0, 8.0]).psfs[:, 0]
         x = torch.arange(33.0) - 16
-        psfs = psfs * (psfs > 0.2 * psfs.amax((1, 2), keepdim=True))  # the lobes, not the veil around them
+        psfs = psfs * (psfs > 0.2 * psfs.amax((1, 2), keepdim=True))  # the lobes without the stray light around them
         psfs = psfs / psfs.sum((1, 2), keepdim=True)
         x, y = (one - (psfs * one).sum((1, 2))[:, None, None] for one in (x[None, None], x[None, :, None]))
         xx, yy, xy = ((psfs * product).sum((1, 2)) for product in (x * x, y * y, x * y))
@@ -88,17 +88,17 @@ class TestFisherDesign(BaseTester):
         assert abs(float(angle[0] - angle[2])) == pytest.approx(90, abs=3)
 
     def test_feature_lenses_of_other_pixels_gain_too(self):
-        """The default camera's pixels are 2.5 times as coarse as those it was designed with."""
+        """The default camera's pixels are 2.5 times as large as those of the design."""
         nodes = np.linspace(-10, 10, 11)
         ours = crlb(lens_with(PixelwiseMask(initial=fisher_mask())), nodes).detach()
         noise = crlb(lens_with(PixelwiseMask(1)), nodes).detach()
-        plain = crlb(lens_with(PixelwiseMask(1, initial="flat")), [-0.5, 0.5]).detach()  # all but blind in focus
+        plain = crlb(lens_with(PixelwiseMask(1, initial="flat")), [-0.5, 0.5]).detach()  # nearly none in focus
         assert ours.mean() < 0.6 * noise.mean()
         assert ours.max() < 1.25 * ours.min()
         assert ours.max() < 0.5 * plain.min()
 
     def test_feature_is_better_than_defocus_alone(self):
-        """A plain lens that is focused beside the range is nowhere blind in it, but its images are large."""
+        """A plain lens focused outside the range has information at every depth in it, but its PSFs are large."""
         nodes, wide = np.linspace(-10, 10, 11), COARSE.replace(window=65)
         plain = CodedLens(PixelwiseMask(1, initial="flat"), fidelity=wide, spectrum=Spectrum.monochrome())
         ours = crlb(lens_with(PixelwiseMask(initial=fisher_mask())), nodes).detach().mean()
@@ -120,7 +120,7 @@ class TestPointError(BaseTester):
 
 class TestRestorationError(BaseTester):
     def test_feature_is_the_error_of_the_best_filter_written_out(self):
-        """Every frequency by itself, in NumPy: the least of E|1 - G H|² S + |G|² noise² over complex G."""
+        """For each frequency in NumPy: the minimum of E|1 - G H|² S + |G|² noise² over complex G."""
         psfs = torch.rand(3, 7, 7, dtype=torch.float64)
         psfs /= psfs.sum((1, 2), keepdim=True)
         f = np.fft.fftfreq(14)
@@ -143,7 +143,7 @@ class TestRestorationError(BaseTester):
         assert errors == sorted(errors)
 
     def test_feature_where_the_psf_lies_costs_nothing(self):
-        """A filter moves an image back; so the tilt of a mask is free."""
+        """The filter can shift the image back, so the tilt of a mask does not change the error."""
         moved = impulse().roll((2, -1), (0, 1))
         assert float(restoration_error(bank_of(moved))) == pytest.approx(float(restoration_error(bank_of(impulse()))))
 

@@ -1,4 +1,4 @@
-"""Folders of frames: what stands in the files, read with OpenCV alone; and that they come whole or not at all."""
+"""Folders of SLM frames: contents of the files read with OpenCV alone, and no partial folders after errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TestWriteSLMFrames(BaseTester):
     @pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff"])
     @pytest.mark.parametrize("bits", [1, 8, 9, 10])
     def test_feature_the_numbers_in_the_files_are_the_grey_levels(self, tmp_path, bits, suffix):
-        """A wave over 530 nm light is 1060 nm; level g is the number g, in 8 or 16 bits, over 52 x 52 panel pixels."""
+        """One wave at 530 nm is 1060 nm of height; a pixel's value is its level, in 8 or 16 bits, on 52 x 52 pixels."""
         step = 1060e-9 / 2**bits
         levels = torch.arange(23 * 23).view(1, 23, 23) * 7 % 2**bits
         levels[0, 3, 20] = 2**bits - 1
@@ -46,7 +46,7 @@ class TestWriteSLMFrames(BaseTester):
         np.testing.assert_array_equal(picture, expected)
 
     def test_feature_a_measured_response_is_written_through(self, tmp_path):
-        """The panel does g**1.5 / 255**1.5 of 2 pi: to show a quarter of a wave takes level 255 / 4**(2/3) = 101.2."""
+        """The panel has the response 2 pi (g / 255)**1.5, so a quarter wave needs level 255 / 4**(2/3) = 101.2."""
         curve = 2 * math.pi * (torch.arange(256) / 255.0) ** 1.5
         heights = torch.tensor([[[0.0, 265e-9], [530e-9, 795e-9]]], dtype=torch.float64)
         write_slm_frames(tmp_path / "slm", SLMFrames.of(heights, GreyLevels(8, response=curve)), SMALL)
@@ -82,11 +82,15 @@ class TestWriteSLMFrames(BaseTester):
         ("call", "kind", "sentence"),
         [
             ({"suffix": ".jpg"}, ValueError, "suffix must be one of '.png', '.tif', '.tiff', got '.jpg'"),
-            ({"times": frame_times((1, 1, 1), 0.1)}, ValueError, "there are times for 3 frames, and 2 masks"),
+            ({"times": frame_times((1, 1, 1), 0.1)}, ValueError, "times must be one for each of the 2 masks, got 3"),
             ({"placement": PanelPlacement((3, 3))}, ValueError, "a mask of 5x5 pixels must have pixels at least"),
             ({"folder": "none/slm"}, FileNotFoundError, "there is no folder"),
             ({"folder": "taken"}, FileExistsError, "taken: it exists"),
-            ({"folder": "taken", "replace": True}, FileExistsError, "it holds holiday.jpg, which is no part of frames"),
+            (
+                {"folder": "taken", "replace": True},
+                FileExistsError,
+                "it holds holiday.jpg, which is no file of",
+            ),
             ({"folder": "file", "replace": True}, FileExistsError, "file: it is a file, not a folder of frames"),
         ],
     )
@@ -191,7 +195,7 @@ class TestReadSLMFrames(BaseTester):
                 lambda f: np.save(f / "turns.npy", np.zeros((1, 2, 2), np.int16)),
                 r"turns.npy must have shape \(2, 5, 5\)",
             ),
-            (lambda f: np.save(f / "turns.npy", np.zeros((2, 5, 5))), "whole turns are int16, not float64"),
+            (lambda f: np.save(f / "turns.npy", np.zeros((2, 5, 5))), "whole waves must be int16, got float64"),
             (lambda f: picture(f, np.zeros((48, 60), np.uint8)), None),
             (
                 lambda f: picture(f, np.zeros((48, 61), np.uint8)),

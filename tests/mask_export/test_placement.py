@@ -1,4 +1,4 @@
-"""Every panel pixel, against the definition: it shows the mask pixel that its centre lies in."""
+"""Placement against its definition: each panel pixel shows the mask pixel that contains its centre."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIDES = st.integers(1, 9)
 
 
 def numbered(rows: int, columns: int, masks: int = 1) -> torch.Tensor:
-    """A different number in each pixel, from 1."""
+    """Return a mask with a different number in each pixel, from 1."""
     return 1 + torch.arange(masks * rows * columns).view(masks, rows, columns)
 
 
@@ -47,7 +47,7 @@ class TestPanelPlacement(BaseTester):
             PanelPlacement((20, 40)).scale((23, 23))
         with pytest.raises(ValueError, match=r"a pupil_radius of at most 4.174 mm at offset \(0, 0\), got 5 mm"):
             PanelPlacement(pupil_radius=5e-3).scale((23, 23))
-        PanelPlacement(pupil_radius=1200 * 8e-6 / 2.3).scale((23, 23))  # what the sentence allows
+        PanelPlacement(pupil_radius=1200 * 8e-6 / 2.3).scale((23, 23))  # the largest radius that the message allows
         with pytest.raises(ValueError, match=r"of at most 3\.478 mm"):
             PanelPlacement(pupil_radius=4e-3, offset=(0, -100)).scale((23, 23))
         with pytest.raises(ValueError, match=r"frames must have the panel's \(1200, 1920\) pixels, got \(3, 3\)"):
@@ -68,7 +68,7 @@ class TestPanelPlacement(BaseTester):
             assert (frames.shape, frames.dtype) == ((3, 1200, 1920), dtype)
 
     def test_feature_1920_by_1200_and_23_pixels_counted_by_hand(self):
-        """52 panel pixels a mask pixel make 1196: two rows are left above and below, 362 columns on either side."""
+        """23 blocks of 52 panel pixels are 1196: two rows remain above and below, 362 columns on either side."""
         values = numbered(23, 23, 2)
         frames = PanelPlacement().place(values, background=0)
         for k, i, j in ((0, 0, 0), (1, 11, 11), (0, 22, 3), (1, 5, 22)):
@@ -78,7 +78,7 @@ class TestPanelPlacement(BaseTester):
 
     @pytest.mark.parametrize(
         ("flip", "rotate", "there"),
-        [  # where mask pixel (i, j) of 5 rows and 3 columns comes to lie
+        [  # position of mask pixel (i, j) of 5 rows and 3 columns on the panel
             ("none", 0, lambda i, j: (i, j)),
             ("none", 90, lambda i, j: (2 - j, i)),
             ("none", 180, lambda i, j: (4 - i, 2 - j)),
@@ -92,7 +92,7 @@ class TestPanelPlacement(BaseTester):
     )
     def test_feature_turned_and_moved_each_pixel_lies_where_it_should(self, flip, rotate, there):
         values = numbered(5, 3)
-        radius = 10 * 3 * 8e-6 / 2.3  # ten panel pixels a mask pixel
+        radius = 10 * 3 * 8e-6 / 2.3  # ten panel pixels for each mask pixel
         placement = PanelPlacement((1200, 1920), 8e-6, radius, (31, -17), flip, rotate)
         frame = placement.place(values, background=0)[0]
         rows, columns = (3, 5) if rotate % 180 else (5, 3)
@@ -107,7 +107,7 @@ class TestPanelPlacement(BaseTester):
     @settings(max_examples=60, deadline=None)
     @given(SIDES, SIDES, st.integers(9, 40), st.integers(9, 40), st.fractions(1, 5, max_denominator=50), st.data())
     def test_feature_a_panel_pixel_shows_the_mask_pixel_its_centre_lies_in(self, rows, columns, down, right, s, data):
-        """The definition in exact arithmetic, pixel by pixel; an edge halfway belongs to the later block."""
+        """In exact arithmetic for each pixel; a centre on an edge belongs to the right or lower block."""
         shift = (data.draw(st.integers(-3, 3)), data.draw(st.integers(-3, 3)))
         assume(rows * s <= down - 2 * abs(shift[1]))
         assume(columns * s <= right - 2 * abs(shift[0]))
@@ -135,7 +135,7 @@ class TestPanelPlacement(BaseTester):
         [("none", 0, 1, 1), ("left-right", 0, 1, -1), ("up-down", 0, 1, 1), ("none", 90, 0, -1), ("none", 180, 1, -1)],
     )
     def test_convention_a_phase_that_rises_to_larger_columns_moves_the_psf_there(self, flip, rotate, axis, sign):
-        """The tilt goes out, turned over as the optics of a lab may need, and comes back as the tilt it was."""
+        """A tilt written with any flip and rotation is read back as the same tilt."""
         ramp = (torch.arange(23.0) * 45e-9).expand(1, 23, 23)
         frames = SLMFrames.of(ramp, GreyLevels(8))
         placement = PanelPlacement(flip=flip, rotate=rotate)

@@ -1,4 +1,4 @@
-"""The printed mask: a closed body, read from the bytes of its file as a slicer would."""
+"""STL export: the file is a closed body, read from its bytes as a slicer does."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SURFACES = arrays(np.float64, st.tuples(st.integers(1, 5), st.integers(1, 5)), e
 
 
 def read_stl(path) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (T, 3, 3) and normals (T, 3), by the layout of the format."""
+    """Read corners (T, 3, 3) and normals (T, 3) by the layout of the format."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     assert len(data) == 84 + 50 * count
@@ -29,12 +29,12 @@ def read_stl(path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def volume(corners: np.ndarray) -> float:
-    """By the divergence theorem."""
+    """Return the volume of a mesh by the divergence theorem."""
     return float(np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 
 
 def check_closed(corners: np.ndarray) -> None:
-    """Each edge has two triangles, which pass it in opposite directions; and the body has no handle."""
+    """Check that each edge belongs to two triangles of opposite direction, and that the body has no handle."""
     points = [[tuple(corner) for corner in triangle] for triangle in corners.tolist()]
     edges = Counter((t[i], t[(i + 1) % 3]) for t in points for i in range(3))
     assert set(edges.values()) == {1}
@@ -94,7 +94,7 @@ class TestWriteSTL(BaseTester):
         assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=1e-6)
 
     def test_convention_seen_from_above_it_is_the_mask(self, tmp_path):
-        """Columns go to larger x, rows to smaller y, on a mask of 2 rows and 4 columns with one high pixel."""
+        """Columns have increasing x and rows decreasing y: a mask of 2 rows and 4 columns with one high pixel."""
         heights = torch.zeros(2, 4)
         heights[0, 3] = 1e-4
         write_stl(tmp_path / "m.stl", heights, pupil_radius=2e-3 / 2.3)  # pixels of 1 mm

@@ -1,4 +1,4 @@
-"""Heights to grey levels and back: to within half a step, whatever the panel; and what that does to the PSFs."""
+"""Heights to grey levels and back, accurate to half a step for every panel; and the effect on the PSFs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TestSLMFrames(BaseTester):
             SLMFrames.of(torch.zeros(1, 2, 2), GreyLevels(8), 400e-9, NOA61)
 
     def test_feature_levels_by_hand(self):
-        """At 600 nm and index 1.5 a wave is 1200 nm of height: a level of 8 bits is 4.6875 nm."""
+        """At 600 nm and index 1.5 one wave is 1200 nm of height, and one level of 8 bits is 4.6875 nm."""
         heights = torch.tensor([[[0.0, 4.6875, 100.0, 1197.0, 1198.0, -5.0]]], dtype=torch.float64) * 1e-9
         frames = SLMFrames.of(heights, GreyLevels(8), wavelength=600e-9)
         assert frames.grey.tolist() == [[[0, 1, 21, 255, 0, 255]]]
@@ -72,13 +72,13 @@ class TestSLMFrames(BaseTester):
 
     @pytest.mark.parametrize("bits", [2, 4, 8, 10])
     def test_feature_the_psf_bank_comes_back_within_the_bound_of_its_quantisation(self, bits):
-        """Fields differ by 2 sin(e/2) at most, so PSFs by 4 sin(e/2) in L1 (Cauchy-Schwarz, Parseval); e in blue."""
+        """With a phase error e, largest in blue, fields differ by 2 sin(e/2) and PSFs by 4 sin(e/2) in L1 at most."""
         heights = 1.2e-6 * torch.rand(2, 23, 23, dtype=torch.float64)
         frames = SLMFrames.of(heights, GreyLevels(bits))
         apart = (bank(frames.heights()) - bank(heights)).abs().sum((-2, -1))
         for channel, wave in enumerate((610e-9, 530e-9, 470e-9)):
             bound = 4 * math.sin(math.pi / 2**bits * 530e-9 / wave / 2)
-            assert 0.02 * bound < float(apart[:, channel].max()) < bound  # not by being far from it
+            assert 0.02 * bound < float(apart[:, channel].max()) < bound  # the bound is not trivially loose
 
     def test_feature_heights_shown_are_those_that_the_simulated_panel_shows(self):
         heights = 2.4e-6 * torch.rand(2, 23, 23, dtype=torch.float64)

@@ -14,7 +14,7 @@ from tests.base import BaseTester
 
 class TestFrameTimes(BaseTester):
     def test_exception(self):
-        with pytest.raises(ValueError, match="2 swaps of 60 ms must fit into the exposure of 100 ms"):
+        with pytest.raises(ValueError, match="2 transitions of 60 ms must fit into the exposure of 100 ms"):
             frame_times((1, 1, 1), 0.1, 0.06)
         with pytest.raises(ValueError, match="dwell shares must be finite, not negative and not all zero"):
             frame_times((0, 0), 0.1)

@@ -15,7 +15,7 @@ from tests.base import BaseTester
 
 class TestCubicMask(BaseTester):
     def test_feature_modulation_is_that_of_dowski_and_cathey_whatever_the_defocus(self):
-        """Square pupil: sqrt(pi / (12 alpha u)) at the shift u of the pupil; its edges make a ripple on that."""
+        """A square pupil has the modulation sqrt(pi / (12 alpha u)) at a pupil shift u; its edges add a ripple."""
         masks, step = CubicMask(30.0, 345), 0.1
         open_ = (mask_axes(345)[1].abs() < 1).double()
         pupil, one = Pupil(open_[:, None] * open_, 2.3 / 345), torch.ones(1)

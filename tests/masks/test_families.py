@@ -1,4 +1,4 @@
-"""What holds for every family of masks."""
+"""Contract of every mask family: shapes, limits, states, copies, gradients, half precision, compilation."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class TestEveryFamily(BaseTester):
         assert not torch.equal(masks.phase, other.phase)
         other.load_state_dict(masks.state_dict())
         assert torch.equal(masks.phase, other.phase)
-        assert set(masks.state_dict()) == {name for name, _ in masks.named_parameters()}  # no tables in the file
+        assert set(masks.state_dict()) == {name for name, _ in masks.named_parameters()}  # no precomputed tables
 
     def test_feature_copies_and_pickles(self, family):
         masks = family(constraint="sigmoid")
@@ -82,7 +82,7 @@ class TestEveryFamily(BaseTester):
             assert float(parameter.grad.abs().max()) > 0
 
     def test_feature_the_camera_learns_it(self, family):
-        """One Adam step moves every parameter by the learning rate in metres, and lowers the loss."""
+        """One Adam step changes every parameter by the learning rate in metres, and lowers the loss."""
         optics = TiDyOptics(family(), fidelity=FIDELITY)
         (group,) = optics.parameter_groups(lr_metres=1e-10)
         assert group["params"] == list(optics.masks.parameters())
@@ -119,7 +119,7 @@ class TestEveryFamily(BaseTester):
         assert torch.equal(compiled(), masks.heights() * 1e6)
 
 
-@pytest.mark.parametrize("name", ["Zernike", "radial", "spiral", "cubic"])  # shapes that know the pupil, not the mask
+@pytest.mark.parametrize("name", ["Zernike", "radial", "spiral", "cubic"])  # defined on the pupil
 @pytest.mark.parametrize("size", [(23, 41), (41, 23)])
 class TestLongerMasks(BaseTester):
     def test_feature_a_longer_side_changes_nothing_over_the_pupil(self, name, size):

@@ -16,14 +16,14 @@ def drawn(start, seed=0):
 
 class TestFisherMask(BaseTester):
     def test_feature_is_what_the_design_finds(self):
-        """The numbers in the file are rounded to four places: 1e-11 m of height."""
+        """Against the design itself; the constants are rounded to four decimals, which is 1e-11 m of height."""
         mask, bound = design_fisher_mask(seed=3)
         heights = mask.heights()[0].detach()
         self.assert_close(fisher_mask(), heights - heights.min(), rtol=0, atol=2e-10)
         assert bound < 0.067  # rad; the mask published with PhaseCam3D has 0.0785
 
     def test_feature_finer_grids_hold_the_same_surface(self):
-        """69 pixels are three to each of 23: the middle ones lie at the same places."""
+        """69 pixels are three for each of 23, and the middle ones have the same centres."""
         fine, coarse = fisher_mask(69)[1::3, 1::3], fisher_mask()
         self.assert_close(fine - fine[11, 11], coarse - coarse[11, 11], rtol=0, atol=1e-15)
 
@@ -62,7 +62,7 @@ class TestInitialHeights(BaseTester):
         assert not (noise[:clean].abs() > 1e-20).any()
         self.assert_close(noise[clean:].mean((1, 2)), torch.full((5 - clean,), 5.35e-7), rtol=0, atol=5e-8)
         self.assert_close(noise[clean:].std((1, 2)), torch.full((5 - clean,), 3.05e-7), rtol=0, atol=3e-8)
-        assert len({round(float(one.sum()), 12) for one in noise[clean:]}) == 5 - clean  # each its own
+        assert len({round(float(one.sum()), 12) for one in noise[clean:]}) == 5 - clean  # all differ
 
     def test_feature_fishers_that_are_alike_but_for_little_noise(self):
         noise = drawn("like fishers") - fisher_mask()
@@ -75,7 +75,7 @@ class TestInitialHeights(BaseTester):
         for heights in drawn("focal sweep"):
             psfs = CodedLens(PixelwiseMask(initial=heights[None])).psf_bank(1, defocus=depths).psfs
             sharpest.append(depths[int(psfs.amax((1, 2, 3)).argmax())])
-        self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; noise
+        self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; the noise shifts them
 
     def test_exception_unknown_start(self):
         with pytest.raises(ValueError, match=r"start must be one of 'noise', 'fisher, noise', .*, got 'tetrapod'"):

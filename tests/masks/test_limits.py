@@ -30,14 +30,14 @@ class TestLimitedPhase(BaseTester):
         assert limited_phase(free, "none", 1.0) is free
 
     @pytest.mark.parametrize("constraint", LIMITS)
-    def test_feature_slope_is_one_in_the_middle(self, constraint):
-        """So that a learning rate in metres means the same with every constraint."""
+    def test_feature_gradient_is_one_in_the_middle(self, constraint):
+        """With a gradient of 1, a learning rate in metres means the same for every constraint."""
         middle = unlimited_phase(torch.tensor(3.0), constraint, 6.0).requires_grad_()
         limited_phase(middle, constraint, 6.0).backward()
         assert float(middle.grad) == pytest.approx(1.0)
 
     def test_feature_a_clamped_phase_finds_back(self):
-        """Beyond a limit plain clamping has no gradient; here a descent that leads back goes through."""
+        """Beyond a limit plain clamping has no gradient; here one that leads back into the range passes."""
         free = torch.tensor([-9.0, -9.0, 9.0, 9.0, 1.0], requires_grad=True)
         limited_phase(free, "clamp", 6.0).backward(torch.tensor([1.0, -1.0, 1.0, -1.0, 2.0]))
         self.assert_close(free.grad, torch.tensor([0.0, -1.0, 1.0, 0.0, 2.0]))

@@ -33,7 +33,7 @@ class TestPixelwiseMask(BaseTester):
         assert torch.equal(one, two)
 
     def test_feature_half_precision_keeps_the_height(self):
-        """Radians survive a cast to half; metres of order 1e-7 would not."""
+        """Radians keep their precision in half precision; metres of order 1e-7 would not."""
         masks = PixelwiseMask()
         before = masks.heights().detach()
         after = masks.half().heights().detach()

@@ -18,7 +18,7 @@ class TestRadialMask(BaseTester):
             self.assert_close(turned, phase, rtol=0, atol=1e-6)
 
     def test_feature_nearly_symmetric_under_any_turn(self):
-        """Turned by SciPy, which interpolates between pixels: so not closer than that."""
+        """Rotated by SciPy, whose interpolation between pixels limits the agreement."""
         profile = 5 * torch.cos(torch.linspace(0, 6, 41))
         phase = RadialMask(size=160, num_radii=41, initial=profile).phase[0].detach().numpy()
         y, x = mask_axes(160)

@@ -16,7 +16,7 @@ from tests.base import BaseTester
 
 
 def turn(before: np.ndarray, after: np.ndarray) -> float:
-    """Angle in degrees, from +x towards +y, that takes one PSF to another: where rings of both agree best."""
+    """Return the rotation between two PSFs in degrees, from +x towards +y, by the best match of rings."""
     azimuth = np.arange(1440) * 2 * np.pi / 1440
     centre = len(before) // 2
     radius = np.arange(4, centre)[:, None]

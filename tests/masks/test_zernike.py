@@ -15,7 +15,7 @@ from tests.base import BaseTester
 
 
 def disc_quadrature(order: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Points y, x and weights that average every polynomial of a degree below 2 * order exactly over the disc."""
+    """Return nodes y, x and weights of a disc quadrature that is exact for polynomials of degree below 2 * order."""
     nodes, weights = np.polynomial.legendre.leggauss(order)
     azimuth = 2 * math.pi * torch.arange(2 * order + 1, dtype=torch.float64) / (2 * order + 1)
     radius = torch.from_numpy(np.sqrt((nodes + 1) / 2))[:, None]
@@ -54,7 +54,7 @@ class TestZernikePolynomials(BaseTester):
 
     @pytest.mark.parametrize(("n", "m"), [(25, 1), (24, 0), (25, 25), (60, 2)])
     def test_feature_high_orders_equal_jacobi_polynomials(self, n, m):
-        """Where factorials cancel each other: the sum of monomials of order 60 has terms of 1e21."""
+        """At high order the sum of monomials fails by cancellation: at order 60 its terms reach 1e21."""
         radius = torch.linspace(0, 1, 101, dtype=torch.float64)
         index = (n * (n + 2) + m) // 2
         polynomial = zernike_polynomials(index + 1, torch.zeros(()), radius)[index]
@@ -87,7 +87,7 @@ class TestZernikeMask(BaseTester):
 
     @pytest.mark.parametrize("size", [23, 24, (24, 38), (41, 23)])
     def test_feature_a_quarter_mirrored_is_the_whole(self, size):
-        """Every one of 350 polynomials, evaluated on all pixels."""
+        """Against each of 350 polynomials evaluated on all pixels."""
         y, x = mask_axes(size)
         inward = torch.hypot(y, x).clamp(min=1)
         expected = zernike_polynomials(350, y / inward, x / inward)

@@ -1,4 +1,4 @@
-"""The modulator's contract: masks in, states and their shares of the exposure out, and gradients through both."""
+"""Contract of modulators: masks in, states and their fractions of the exposure out, and gradients to both."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TestLearnableDwellTimes(BaseTester):
         for shares in ((), (1, 0), (1, -1), (1, float("inf"))):
             with pytest.raises(ValueError, match="must be positive and finite"):
                 LearnableDwellTimes(shares)
-        with pytest.raises(ValueError, match="there are 3 dwell shares for 2 masks"):
+        with pytest.raises(ValueError, match="dwell shares must be one for each of the 2 masks, got 3"):
             LearnableDwellTimes((1, 1, 1))(torch.zeros(2, 5, 5))
 
     @pytest.mark.parametrize("shares", [(1, 1, 1), (5, 2, 0.1)])
@@ -33,7 +33,7 @@ class TestLearnableDwellTimes(BaseTester):
         self.assert_close(*banks, rtol=0, atol=1e-7)
 
     def test_feature_learning_prefers_the_mask_that_focuses(self):
-        """Beside one flat mask, masks of noise only spread the light: their time goes to the flat one."""
+        """A flat mask focuses light and masks of noise spread it, so learning gives the exposure to the flat one."""
         heights = torch.stack([torch.zeros(23, 23), 1.2e-6 * torch.rand(23, 23)])
         optics = TiDyOptics(PixelwiseMask(initial=heights), modulator=LearnableDwellTimes((1, 1)), fidelity=SMALL)
         optimizer = torch.optim.Adam(optics.parameter_groups(lr_metres=1e-12, lr=0.3))
@@ -125,11 +125,21 @@ class TestSpatialLightModulator(BaseTester):
         assert float((after - before).abs().max()) > 1e-4
         self.assert_close(after, fresh, rtol=0, atol=1e-7)
 
+    def test_feature_a_cast_reaches_the_parts(self):
+        modulator = SpatialLightModulator(GreyLevels(8), LearnableDwellTimes((1, 3))).double()
+        assert {parameter.dtype for parameter in modulator.parameters()} == {torch.float64}
+
     def test_smoke_repr_tells_the_panel(self):
         modulator = SpatialLightModulator(
             GreyLevels(8), Switching(4e-3, dwell=LearnableDwellTimes((1, 3))), fill_factor=0.93
         )
-        for words in ("8 bits", "4 ms a swap", "random", "fill factor 0.93", "learnable dwell shares (0.25, 0.75)"):
+        for words in (
+            "8 bits",
+            "4 ms a transition",
+            "random",
+            "fill factor 0.93",
+            "learnable dwell shares (0.25, 0.75)",
+        ):
             assert words in repr(modulator)
 
 

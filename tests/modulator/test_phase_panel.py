@@ -1,4 +1,4 @@
-"""Grey levels, stroke and crosstalk against closed forms."""
+"""Grey levels, phase gain and crosstalk against closed forms."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.base import BaseTester
 
 
 def turns_apart(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Signed difference in radians, modulo 2 pi."""
+    """Return the signed phase difference in radians, modulo 2 pi."""
     return (a - b + math.pi).remainder(2 * math.pi) - math.pi
 
 
@@ -52,7 +52,7 @@ class TestGreyLevels(BaseTester):
 
     @pytest.mark.parametrize("bits", range(1, 11))
     def test_feature_error_variance_and_efficiency_are_those_of_theory(self, bits):
-        """A uniform error over one step: variance step^2 / 12, and sinc^2(2^-b) of the light stays together."""
+        """The phase error is uniform over one step: variance step^2 / 12 and efficiency sinc^2(2^-b)."""
         wanted = 12 * math.pi * torch.rand(400, 500, dtype=torch.float64) - 20
         error = turns_apart(GreyLevels(bits)(wanted), wanted)
         step = 2 * math.pi / 2**bits
@@ -63,7 +63,7 @@ class TestGreyLevels(BaseTester):
 
     @pytest.mark.parametrize(("bits", "order"), [(1, 0.4053), (2, 0.8106), (3, 0.9496), (4, 0.9872)])
     def test_feature_a_stepped_grating_has_goodmans_efficiency(self, bits, order):
-        """Literals of the first order of 2, 4, 8 and 16 steps; the finest step here is 1/1024 of a period."""
+        """First-order efficiencies of 2, 4, 8 and 16 steps from the book; a period is sampled at 1024 points."""
         ramp = 2 * math.pi * (torch.arange(1024, dtype=torch.float64) + 0.5) / 1024
         shown = GreyLevels(bits)(ramp)
         first = torch.polar(torch.ones_like(ramp), shown - ramp).mean()
@@ -71,8 +71,8 @@ class TestGreyLevels(BaseTester):
 
     @pytest.mark.parametrize("bits", [1, 2, 3])
     def test_feature_the_peak_of_the_psf_falls_by_the_efficiency(self, bits):
-        """A fine ramp keeps its focus off the axis, with sinc^2(2^-b) of the light of the exact ramp."""
-        size = 161  # 17.9 pixels a period: phases fall everywhere in a step
+        """A quantised phase ramp focuses off the axis with sinc^2(2^-b) of the peak of the exact ramp."""
+        size = 161  # 17.9 pixels a period, so that phases are spread evenly over a step
         ramp = 0.35 * torch.arange(size, dtype=torch.float64).expand(size, size)
         masks = PixelwiseMask(initial=ramp * 530e-9 / math.pi)
         fidelity = Fidelity(window=41, layer_spacing=40.0, stray_light="discard")
@@ -104,7 +104,7 @@ class TestGreyLevels(BaseTester):
         self.assert_close(shown, torch.tensor([top, 0.0]))
 
     def test_feature_a_measured_response_is_written_through(self):
-        """Frames written through the curve show what was wanted, to half a local step."""
+        """Frames computed with the measured curve show the wanted phase to half the local step."""
         grey = np.linspace(0, 1, 17)
         curve = 2.2 * math.pi * grey**1.8
         panel = GreyLevels(10, response=curve.tolist())
@@ -158,7 +158,7 @@ class TestPixelCrosstalk(BaseTester):
 
     @pytest.mark.parametrize("sigma", [0.1, 0.4, 1.5])
     def test_feature_the_kernel_is_the_mean_of_a_blurred_pixel(self, sigma):
-        """Pixel 0 alone, blurred by SciPy's Gaussian, averaged over each pixel by SciPy's quadrature."""
+        """Against a single pixel blurred by SciPy's Gaussian and averaged over each pixel by SciPy's quadrature."""
         kernel = crosstalk_kernel(sigma)
         reach = len(kernel) // 2
         for d in range(-min(reach, 3), min(reach, 3) + 1):

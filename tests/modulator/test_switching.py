@@ -1,4 +1,4 @@
-"""Switching inside the exposure: the light of the states in between, counted to the last place."""
+"""Switching within the exposure: states, times and weights of the transitions."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class TestSwitching(BaseTester):
         states, weights = Switching(4e-3, between=between)(phase)
         assert (states.device.type, states.dtype, weights.dtype) == (device.type, dtype, dtype)
         self.assert_close(states[:3], phase, rtol=0, atol=0)
-        assert "4 ms a swap in an exposure of 100 ms" in repr(Switching(4e-3, between=between))
+        assert "4 ms a transition in an exposure of 100 ms" in repr(Switching(4e-3, between=between))
 
     def test_exception(self):
-        with pytest.raises(ValueError, match=r"^5 swaps of 20.5 ms must fit .* of 100 ms, got 102.5 ms$"):
+        with pytest.raises(ValueError, match=r"^5 transitions of 20.5 ms must fit .* of 100 ms, got 102.5 ms$"):
             Switching(20.5e-3)(torch.zeros(6, 5, 5))
         for time in (-1e-3, float("nan"), float("inf")):
             with pytest.raises(ValueError, match="switching_time must be zero or positive"):
@@ -113,7 +113,7 @@ class TestSwitching(BaseTester):
                 weight * TiDyOptics(PixelwiseMask(initial=state * to_metres).double(), **options)(image, depth)
                 for state, weight in zip(states, weights, strict=True)
             )
-        self.assert_close(captured, average, rtol=0, atol=2e-7)  # masks hold float32 when made
+        self.assert_close(captured, average, rtol=0, atol=2e-7)  # masks are created in float32
 
     def test_feature_training_reaches_masks_through_every_kind(self):
         for between in KINDS:
@@ -160,7 +160,7 @@ class TestRandomStates(BaseTester):
         self.assert_close(optics.psf_bank().psfs, first, rtol=0, atol=0)
 
     def test_feature_their_mean_field_is_zero(self):
-        """Worst of all states: nothing of the light stays together."""
+        """A random pattern is the worst state: its mean field, and so its peak, vanishes."""
         patterns = random_phases(0, 50, 64, 64)
         assert float(torch.polar(torch.ones_like(patterns), patterns).mean().abs()) < 5 / math.sqrt(patterns.numel())
         assert 0 <= float(patterns.min()) < float(patterns.max()) < 2 * math.pi
@@ -168,7 +168,7 @@ class TestRandomStates(BaseTester):
 
 class TestResponse(BaseTester):
     def test_feature_exponential_solves_the_equation_of_relaxation(self):
-        """tau r' = 1 - r with r(0) = 0 and the time constant of the rise time, by SciPy."""
+        """Against SciPy's solution of tau r' = 1 - r with r(0) = 0 and tau from the rise time."""
         rise = 5e-3
         swap, tau = settling_time(rise), rise / (math.log(0.9) - math.log(0.1))
         response, _ = sampled_response("exponential", 7)
@@ -186,7 +186,7 @@ class TestResponse(BaseTester):
 
     @pytest.mark.parametrize("between", ["linear", (0.0, 1.0)])
     def test_feature_a_straight_swap_has_the_mean_of_its_phasors(self, between):
-        """The mean of exp(i u D) over u in [0, 1] is exp(i D/2) sinc(D/2pi), whatever the sampling."""
+        """The mean of exp(i u D) over u in [0, 1] is exp(i D/2) sinc(D/2pi), and quadrature reaches it."""
         step = torch.linspace(-7, 7, 25, dtype=torch.float64).reshape(1, 5, 5)
         states, weights = Switching(0.1, between=between)(torch.cat([torch.zeros_like(step), step]))
         phasors = torch.polar(torch.ones_like(states), states)

@@ -287,7 +287,7 @@ BY_KIND: dict[str, tuple[Damage, ...]] = {
 
 
 def damaged(data: bytes, kind: str, generator: Generator) -> tuple[str, bytes]:
-    """Return what was done, and the file after it; every other time it is one of the ways of its kind."""
+    """Return a description of a random damage and the damaged file; half of the damages are specific to the format."""
     own = BY_KIND[kind]
     damage: Damage = pick(generator, own) if own and generator.random() < 0.5 else pick(generator, BLIND)
     return damage.__name__, damage(data, generator)

@@ -22,7 +22,7 @@ from kornia_tidy import cli
 from tests.mutations.pristine import Case
 
 SECONDS = 60.0
-MEMORY = 3 << 29  # bytes of address space beyond what this process has
+MEMORY = 3 << 29  # bytes of address space beyond that of this process
 REFUSED, GUARDED = 2, 70
 UNFORESEEN = "unforeseen"  # a file that names the kind of an error
 LONGEST = 1000  # characters of a sentence
@@ -99,7 +99,7 @@ def _child(case: Case, path: Path, folder: Path) -> None:
 
 
 def _note_kind(told: Callable[[Exception], int]) -> Callable[[Exception], int]:
-    """Keep what kind of error became a sentence: of what a file holds none but these should come as far."""
+    """Record the type of each error that becomes a message; damaged content may only raise the allowed types."""
 
     def note(error: Exception) -> int:
         if not isinstance(error, (OSError, ValueError)) and not cli._is_out_of_memory(error):

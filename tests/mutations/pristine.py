@@ -76,7 +76,7 @@ def _write_pictures(folder: Path) -> None:
 
 
 def _pictures(folder: Path) -> list[Case]:
-    """Each as the picture or the depth of a scene, whose other half is whole."""
+    """Each file as the picture or the depth of a scene with an intact other half."""
     kinds = {".png": "png", ".tif": "tiff", ".jpg": "jpeg", ".npy": "npy", ".pfm": "pfm"}
     cases = []
     for path in sorted(folder.iterdir()):
@@ -110,7 +110,7 @@ def _masks(folder: Path) -> list[Case]:
 
 
 def _checkpoints(folder: Path) -> list[Case]:
-    """Trained systems, of no training at all: one whose network sees the capture alone, one that refocuses."""
+    """Untrained systems in the format of trained ones: one with the capture as input, one with refocused images."""
     plain = TrainingSettings(
         task="joint", masks=2, head="plain", width=4, size=32, scenes=2, validation_scenes=1, window=9,
         fidelity="draft",

@@ -20,7 +20,7 @@ def polygon_area(sides: int, radius: float) -> float:
 
 
 def sampled_cover(size: int, pitch: float, inside, subdivisions: int = 64) -> torch.Tensor:
-    """Return the share of a fine lattice of points in each cell that satisfy inside(x, y): brute force."""
+    """Return by brute force the fraction of each cell's sample points that satisfy inside(x, y)."""
     points = (np.arange(size * subdivisions) + 0.5) * pitch / subdivisions - size * pitch / 2
     hits = inside(points[None, :], points[:, None]).astype(float)
     return torch.from_numpy(hits.reshape(size, subdivisions, size, subdivisions).mean(axis=(1, 3)))
@@ -55,7 +55,7 @@ class TestCircularAperture(BaseTester):
             circular_aperture(4, pitch=1.0, radius=0.5)
 
     def test_feature_the_papers_grid_has_317_open_cells(self):
-        """PhaseCam3D, 23 cells of 0.1: the lattice disc of radius 10, N(10) = 317 in Gauss's circle problem."""
+        """PhaseCam3D, 23 cells of 0.1: a disc of radius 10 on the integer lattice has N(10) = 317 points (Gauss)."""
         aperture = circular_aperture(23)
         assert aperture.sum() == 317
         assert aperture.unique().tolist() == [0, 1]
@@ -64,7 +64,7 @@ class TestCircularAperture(BaseTester):
 
     @pytest.mark.parametrize("cells", range(1, 12))
     def test_feature_binary_counts_are_those_of_the_gauss_circle_problem(self, cells):
-        """OEIS A000328: lattice points within distance n of the origin, whatever rounding does to n · pitch."""
+        """OEIS A000328: lattice points within distance n of the origin, at pitches with different rounding."""
         points = (1, 5, 13, 29, 49, 81, 113, 149, 197, 253, 317, 377)[cells]
         for pitch in (0.1, 1 / 3, 1e-3):
             assert circular_aperture(27, pitch, radius=cells * pitch).sum() == points
@@ -84,7 +84,7 @@ class TestCircularAperture(BaseTester):
         assert circular_aperture(1, pitch=2.0, edges="area").item() == pytest.approx(math.pi / 4, abs=1e-15)
 
     def test_feature_a_quarter_disc_in_a_cell_has_the_segment_formula(self):
-        """Two by two cells of 0.8: each is 0.8² less the corner outside the unit circle, integrated by hand."""
+        """Two by two cells of 0.8: each has 0.8² less the corner outside the unit circle, integrated by hand."""
         corner = 0.8 * 0.6 + (math.asin(0.8) - math.asin(0.6)) / 2  # rectangles 0.8 x 0.6, sector between
         expected = torch.full((2, 2), corner / 0.8**2, dtype=torch.float64)
         self.assert_close(circular_aperture(2, 0.8, edges="area"), expected, rtol=0, atol=1e-14)
@@ -189,7 +189,7 @@ class TestPolygonAperture(BaseTester):
     )
     @pytest.mark.parametrize(("size", "pitch"), [(7, 0.3), (4, 0.37)])
     def test_feature_a_cell_holds_its_covered_fraction(self, sides, rotation, radius, size, pitch):
-        """Against 64² points in each cell, inside where no side lies between them and the axis."""
+        """Against 64² points in each cell; a point is inside if it lies on the axis' side of every edge."""
 
         def inside(x, y):
             middles = rotation + (2 * np.arange(sides) + 1) * np.pi / sides
@@ -212,7 +212,7 @@ class TestPolygonAperture(BaseTester):
         assert torch.equal(polygon_aperture(23, 0.1, **SQUARE), (expected > 0).double())  # the rim is inside
 
     def test_feature_many_sides_approach_the_disc(self):
-        """The sagitta of a side is 1 - cos(π/1000) = 5e-6, which over a pitch of 0.1 is 5e-5 of a cell's width."""
+        """The sagitta of a side is 1 - cos(π/1000) = 5e-6; at a pitch of 0.1 this is 5e-5 of a cell's width."""
         polygon = polygon_aperture(23, 0.1, 1000, edges="area")
         self.assert_close(polygon, circular_aperture(23, edges="area"), rtol=0, atol=1.5e-4)
 
@@ -224,7 +224,7 @@ class TestPolygonAperture(BaseTester):
 
     @both_edges
     def test_convention_the_first_corner_is_on_the_right_and_turns_down(self, edges):
-        """Row is y, downwards; column is x: the triangle's first corner is at +x, and a quarter turn takes it to +y."""
+        """Rows are y, downwards; columns are x. The triangle's first corner is at +x; a quarter turn moves it to +y."""
         right = polygon_aperture(23, 0.1, 3, edges=edges)
         assert right[11, 20] > 0
         assert right[11, 2] == right[2, 11] == right[20, 11] == 0

@@ -99,7 +99,7 @@ class TestMaterial(BaseTester):
             assert material.index(wavelength) == pytest.approx(database_index(text, wavelength * 1e6), abs=1e-12)
 
     def test_feature_the_film_of_joseph_2020_is_another_noa61(self):
-        """The docstring's warning: 1.498 at 530 nm was measured on a thin film, far from the maker's 1.564."""
+        """The disagreement in NOA61's docstring: 1.498 at 530 nm in a thin film, against the maker's 1.564."""
         text = shared("data/materials/other_optical_adhesives_NOA-61_nk_Joseph.yml").read_text(encoding="utf-8")
         rows = [[float(number) for number in row] for row in re.findall(r"^\s+(\d\.\d+) (\d\.\d+)$", text, re.M)]
         nearest = min(rows, key=lambda row: abs(row[0] - 0.53))
@@ -124,7 +124,7 @@ class TestMaterial(BaseTester):
     @given(st.floats(0.0, 0.99), st.floats(0.001, 1.0))
     @settings(deadline=None, max_examples=50)
     def test_property_dispersion_is_normal(self, material, start, step):
-        """Clear dielectrics slow short waves more: n falls with the wavelength over the whole visible range."""
+        """In transparent dielectrics n decreases with the wavelength over the whole visible range."""
         shortest, longest = max(material.valid[0], 400e-9), min(material.valid[1], 700e-9)
         wavelength = shortest + start * (longest - shortest)
         longer = min(wavelength + step * (longest - shortest), longest)
@@ -155,7 +155,7 @@ class TestCauchyThrough(BaseTester):
             assert glass.index(wavelength) == pytest.approx(index, abs=1e-12)
 
     def test_feature_finds_a_published_cauchy_equation_again(self):
-        """NOA61 has three terms, so three of its values give all others."""
+        """NOA61's equation has three terms, so three of its values determine it."""
         waves = (450e-9, 600e-9, 1550e-9)
         found = cauchy_through("NOA61 again", "NOA61", tuple((w, NOA61.index(w)) for w in waves))
         for um in (0.47, 0.53, 0.7, 1.2):

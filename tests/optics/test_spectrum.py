@@ -142,17 +142,17 @@ class TestCameraSpectrum(BaseTester):
             assert centroids[0] > centroids[1] > centroids[2]
 
     def test_feature_fine_slices_hold_sensitivity_times_light(self, colour):
-        """300 slices of 1 nm: the one around 550.5 nm holds the product of the two tables interpolated there."""
+        """300 slices of 1 nm: the weight around 550.5 nm is the product of the two tables interpolated there."""
         spectrum = camera_spectrum(SIGMA, "A", samples=300)
         sensitivity, light = colour.MSDS_CAMERA_SENSITIVITIES[SIGMA], colour.SDS_ILLUMINANTS["A"]
-        share = 0.05  # of the way from 550 to 560 nm
+        fraction = 0.05  # of the way from 550 to 560 nm
         below, above = (sensitivity.values[list(sensitivity.wavelengths).index(nm)] for nm in (550, 560))
         lamp = np.interp(550.5, light.wavelengths, light.values)
         weights = [row[150] for row in spectrum.weights]
-        assert weights == pytest.approx(((1 - share) * below + share * above) * lamp, rel=1e-4)
+        assert weights == pytest.approx(((1 - fraction) * below + fraction * above) * lamp, rel=1e-4)
 
     def test_feature_lamp_lines_between_samples_are_not_lost(self):
-        """Slices are means of finer slices, so that every line of a fluorescent lamp counts whatever the sampling."""
+        """A coarse slice is the mean of its finer slices, so no line of a fluorescent lamp falls between samples."""
         coarse, fine = (np.array(camera_spectrum(NIKON, "FL11", samples).weights) for samples in (4, 60))
         assert coarse == pytest.approx(fine.reshape(3, 4, 15).mean(axis=-1), rel=1e-3)
 
@@ -182,7 +182,7 @@ class TestCameraSpectrum(BaseTester):
         run_python("import sys, kornia_tidy.optics.spectrum; assert 'colour' not in sys.modules")
 
     def test_feature_leaves_warnings_and_print_options_as_they_were(self):
-        """Even without matplotlib, whose absence colour warns about (here an error)."""
+        """Without matplotlib too: colour warns of its absence, and warnings are errors here."""
         run_python(
             "import sys, warnings, numpy\n"
             "sys.modules['matplotlib'] = None\n"

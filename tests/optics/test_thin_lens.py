@@ -22,7 +22,7 @@ class TestThinLensDefocus(BaseTester):
         self.assert_close(psi, torch.tensor([0.0, -scale / 0.595], device=device, dtype=dtype), atol=2e-6)
 
     def test_feature_matches_the_exact_path_difference(self, device):
-        """Against sqrt(z^2 + r^2) - z written out: within R^2/4 (1/z^2 + 1/(z z_f) + 1/z_f^2) of psi."""
+        """Against the path sqrt(z^2 + r^2) - z, to the relative error R^2/4 (1/z^2 + 1/(z z_f) + 1/z_f^2)."""
         radius, focus = 1.4175e-3, 0.595
         z = torch.tensor([0.2975, 0.4, 0.8, 3.0, 1e3], device=device, dtype=torch.float64)
         path = (z.square() + radius**2).sqrt() - z - (math.sqrt(focus**2 + radius**2) - focus)
@@ -156,7 +156,7 @@ class TestDefocusRange(BaseTester):
 
 class TestSinglet(BaseTester):
     def test_feature_axial_colour_is_the_focal_length_over_abbe_number(self):
-        """Between the lines F and C the focus of a singlet moves by f / V, with V = 67.8 for fused silica."""
+        """Between the lines F and C the focal length of a singlet changes by f / V, V = 67.8 for fused silica."""
         lens = ThinLensCamera(lens_material=FUSED_SILICA)
         scale = math.pi * lens.aperture_radius**2 / 530e-9
         lines = (486.13e-9, 587.56e-9, 656.27e-9)
@@ -165,7 +165,7 @@ class TestSinglet(BaseTester):
 
     @pytest.mark.parametrize("wavelength", [450e-9, 530e-9, 650e-9])
     def test_feature_the_psf_is_sharpest_where_the_lensmaker_says(self, wavelength):
-        """The sharpest depth of each colour, found in PSFs, against 1/z = 1/f(lambda) - 1/s': the shift to 1 %."""
+        """The depth of the highest PSF peak, against 1/z = 1/f(lambda) - 1/s': the shift in defocus to 1 %."""
         camera = ThinLensCamera(lens_material=PMMA)
         fidelity = Fidelity(window=15, stray_light="discard", double=True)
         masks = PixelwiseMask(1, initial="flat")
@@ -192,7 +192,7 @@ class TestSinglet(BaseTester):
 
     @pytest.mark.parametrize("fidelity", ["draft", "paper"])
     def test_feature_swapping_the_lens_is_seen_at_once(self, fidelity):
-        """Remembered PSFs know the colour of the lens they were made for: red gets sharp where its focus lies."""
+        """The PSF cache depends on the lens material: with PMMA, red is sharp at its own focus and blue is not."""
         camera = DefocusRange(-10, 10)
         optics = CodedLens(PixelwiseMask(1, initial="flat"), camera, fidelity=fidelity)
         with torch.no_grad():

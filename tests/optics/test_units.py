@@ -1,4 +1,4 @@
-"""Wrong units and ranges: each is told with the remedy, and real scenes raise no alarm."""
+"""Wrong units and value ranges: each message names the remedy, and real scenes cause none."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class TestDepth(BaseTester):
             ((2.0, 400.0), {}),  # a street
             ((30.0, INF), {}),  # a landscape under a sky
             ((INF, INF), {}),
-            ((60.0, 2000.0), {"camera": ThinLensCamera(0.3, 0.1, 100.0, depth_range=(50.0, INF))}),  # a long lens
+            ((60.0, 2000.0), {"camera": ThinLensCamera(0.3, 0.1, 100.0, depth_range=(50.0, INF))}),  # a telephoto lens
             ((3.9, 4.0), {"camera": ThinLensCamera.for_scene((0.5, 4.0))}),
             ((0.0, 1.0), {"camera": DefocusRange()}),
             ((900.0, 900.0), {"check_inputs": False}),
@@ -240,9 +240,9 @@ class TestLens(BaseTester):
     @pytest.mark.parametrize(
         "options",
         [
-            {"focal_length": 2e-3, "aperture_diameter": 2e-3, "focus_distance": 4e-3},  # a microscope's objective
+            {"focal_length": 2e-3, "aperture_diameter": 2e-3, "focus_distance": 4e-3},  # a microscope objective
             {"focal_length": 3.9, "aperture_diameter": 0.28, "focus_distance": INF, "depth_range": (1e4, INF)},
-            {"focal_length": 4e-3, "aperture_diameter": 2e-3, "pixel_pitch": 0.56e-6},  # a telephone
+            {"focal_length": 4e-3, "aperture_diameter": 2e-3, "pixel_pitch": 0.56e-6},  # a mobile phone
         ],
     )
     def test_feature_real_lenses_pass(self, options):
@@ -383,7 +383,7 @@ class TestNotANumber(BaseTester):
 class TestDepthFiles(BaseTester):
     @staticmethod
     def disparity():
-        """As Middlebury's: 20 to 60 px, unknown here and there."""
+        """Return a disparity map like Middlebury's: 20 to 60 px, with scattered unknown pixels."""
         values = np.random.default_rng(0).uniform(20, 60, (40, 40)).astype(np.float32)
         values[np.random.default_rng(1).uniform(size=(40, 40)) < 0.1] = np.inf
         return values
@@ -402,7 +402,7 @@ class TestDepthFiles(BaseTester):
         read_depth(path, kind="disparity", focal_px=1000.0, baseline_m=0.1)
         read_depth(path, invalid=[INF])
         sky = np.full((40, 40), 30, np.float32)
-        sky[:15, :30] = sky[18, 4:9] = np.inf  # and below a branch
+        sky[:15, :30] = sky[18, 4:9] = np.inf  # the second patch: sky below a branch
         path.write_bytes(encode_pfm(sky))
         assert read_depth(path).valid.all()
         path.write_bytes(encode_pfm(self.disparity() / 20))
@@ -443,7 +443,7 @@ class TestNoFalseAlarm(BaseTester):
         image, depth = found.image[:, ::step, ::step].contiguous(), found.depth[:, ::step, ::step].contiguous()
         near, far = float(depth.min()), float(depth.max())
         with warnings.catch_warnings():
-            # Of the default range and of windows something may be said; of units nothing.
+            # Warnings about the default range and about windows may come, but none about units.
             warnings.filterwarnings("ignore", message=".*beyond the camera's range|the largest PSF window")
             for lens in (ThinLensCamera(), ThinLensCamera.for_scene((near, max(far, 1.1 * near)))):
                 camera(camera=lens)(image, depth)

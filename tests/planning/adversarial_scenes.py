@@ -268,7 +268,7 @@ def one_depth(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor
 
 
 def noisy_patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """A patch, white or faint, whose pixels lie at two depths in turn, before a background on a layer."""
+    """A white or faint patch with pixels alternating between two depths, in front of a background on a layer."""
     (own, other), where = _depths(generator), _window(size, generator)
     light = _uniform(0, 1, generator) * torch.ones(1, 3, *size)
     defocus = _plane(size, float(round(other)))
@@ -280,7 +280,7 @@ def noisy_patch(size: tuple[int, int], generator: torch.Generator) -> tuple[Tens
 
 
 def texture_in_step(size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Light and depth are the same noise: what is bright is near."""
+    """Light and depth are the same noise, so that bright pixels are near."""
     shared = smooth((1, 1, *size), _uniform(0.3, 4, generator), generator).sigmoid()
     lo, hi = sorted(_depths(generator))
     return shared.repeat(1, 3, 1, 1), lo + (hi - lo) * shared
@@ -317,7 +317,7 @@ SCENES = {
 
 
 def report(outcomes: list[Outcome]) -> str:
-    """Return the table: of each compositing, and of each kind in it, what was found."""
+    """Return the table of results, by compositing and by kind of scene."""
     rows: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for outcome in outcomes:
         rows[outcome.case.compositing, "all"].append(outcome)

@@ -1,4 +1,4 @@
-"""What plans are judged with: cameras that capture both plan and reference, masks, smooth noise and real scenes."""
+"""Test rig of plans: cameras that render both plan and reference, masks, smooth noise and real scenes."""
 
 from __future__ import annotations
 

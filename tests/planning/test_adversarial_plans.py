@@ -1,4 +1,4 @@
-"""Plans of scenes made to break them: what is measured stays within the tolerance asked."""
+"""Plans of adversarial scenes: the measured error stays within the tolerance."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class TestDepths(BaseTester):
         self.assert_close(Depths(defocus, -20, 20, "reflect").products(light), whole, atol=1e-9, rtol=1e-5)
 
     def test_feature_shares_lie_where_the_light_is(self):
-        """A texture at one depth in the dark of another: what is in reach counts for both, nothing for the third."""
+        """A texture at one depth in the dark of another: its power counts for both depths, and not for a third."""
         light, defocus = torch.zeros(1, 1, 256, 256), torch.zeros(1, 1, 256, 256)
         light[..., 30:60, 30:60] = torch.rand(30, 30)
         defocus[..., 30:60, 30:60] = 5

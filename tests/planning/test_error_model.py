@@ -112,7 +112,7 @@ class TestPower(BaseTester):
 
     @pytest.mark.parametrize("sizes", [(20, 10), (21, 10), (21, 9), (15, 12)])
     def test_feature_a_coarser_grid_is_that_of_the_image(self, sizes):
-        """On white noise without any correlation, whose covariance at all other shifts is small on both grids."""
+        """On white noise, which has a small covariance at nonzero shifts on both grids."""
         light = torch.rand(1, 2, 48, 48, dtype=torch.float64)
         fine, coarse = (power_spectrum(light, "reflect", size) for size in sizes)
         self.assert_close(coarser(fine, sizes[1]), coarse, atol=1e-12, rtol=1e-9)
@@ -129,7 +129,7 @@ class TestPower(BaseTester):
 class TestLayers(BaseTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear", "cubic", "bandlimited"])
     def test_feature_a_pixel_takes_what_the_camera_gives_it(self, layers):
-        """Against the capture of a point: the PSF that the camera makes of its layers."""
+        """Against the capture of a point, which is the layered PSF of the camera."""
         fidelity = Fidelity(window=15, layers=layers, layer_spacing=1.0, stray_light="discard", double=True)
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, color_space="linear", border="zero")
         survey, psi = CameraSurvey(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
@@ -144,7 +144,7 @@ class TestLayers(BaseTester):
         self.assert_close(coded, psf, atol=1e-12, rtol=0)
 
     def test_feature_differences_are_those_of_convolved_images(self):
-        """Two constant PSFs, of which the scene takes different shares."""
+        """Two constant PSFs with different shares of the scene."""
         generator = torch.Generator().manual_seed(0)
         light = torch.rand(1, 1, 24, 24, dtype=torch.float64, generator=generator)
         psfs = torch.randn(2, 1, 3, 3, generator=generator)

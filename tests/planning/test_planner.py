@@ -46,7 +46,7 @@ SPECTRA = {
 
 @pytest.fixture(scope="module")
 def rig():
-    """A flat mask, whose reference has 45 pixels: that of a random one has 257, and takes thirty times as long."""
+    """A flat mask has a reference window of 45 pixels; that of a random mask has 257 and takes thirty times as long."""
     return Rig(TiDyOptics(MASKS["flat"](torch.Generator().manual_seed(0)), sensor=None))
 
 
@@ -76,7 +76,7 @@ class TestTolerance(BaseTester):
     @needs_data
     @pytest.mark.usefixtures("narrow")
     def test_property_real_scenes_that_hide_parts_of_themselves_stay_within_the_tolerance_asked(self):
-        """Of one mask, and of two that are rendered one by one; what is predicted is a bound."""
+        """For one mask and for two that are rendered one by one, the predicted memory is an upper bound."""
         for masks in ("learned", "random"):
             optics = TiDyOptics(MASKS[masks](torch.Generator().manual_seed(0)), sensor=None, compositing="occlusion")
             self.judge(Rig(optics), [(name, 64) for name in NAMES[5::32]], margin=5)
@@ -96,7 +96,7 @@ class TestTolerance(BaseTester):
         self.judge(Rig(optics), [(name, 160) for name in NAMES[::every]], margin)
 
     def judge(self, rig, scenes, margin=2.5):
-        """With one more part the sum, which is predicted, is further above what unlike parts come to."""
+        """With one more uncorrelated part, the predicted sum exceeds the true error by more."""
         ratios = []
         for name, side in scenes:
             light, defocus = real_scene(name, rig.optics, side)
@@ -191,7 +191,7 @@ class TestTolerance(BaseTester):
         scene = spectral.planner.scene(defocus, light)
         fidelity = scene.reference.replace(wavelengths=wavelengths)
         measured = spectral.error(light, defocus, fidelity, scene.reference)
-        coloured = spectral.optics.spectrum.basis is not None  # then it is a bound: what colours add is not in step
+        coloured = spectral.optics.spectrum.basis is not None  # an upper bound: colours are uncorrelated
         assert 1 < scene.error(fidelity) / measured < (4 if coloured else 2)
 
     @needs_data

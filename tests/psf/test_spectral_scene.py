@@ -60,7 +60,7 @@ class TestSmoothestReflectances(BaseTester):
         ("basis", "message"),
         [
             (((1.0, 0.0),), r"basis must have shape \(2, 2\) as the weights have, got \(1, 2\)"),
-            (((1.0, 0.0), (1.0, 0.0)), "basis must be seen as 1 by its own channel and as 0 by others"),
+            (((1.0, 0.0), (1.0, 0.0)), "basis must give 1 in its own channel and 0 in the others"),
         ],
     )
     def test_exception_basis(self, basis, message):

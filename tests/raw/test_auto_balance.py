@@ -57,14 +57,15 @@ class TestAutoBalance(BaseTester):
             auto_balance(replace(raw, counts=blown))[[0, 1, 2]], torch.tensor([2.0, 1.0, 1.25]), rtol=2e-3
         )
 
-    def test_feature_large_captures_are_looked_at_here_and_there(self):
+    def test_feature_large_captures_are_subsampled(self):
         raw = grey_under({"R": 0.5, "G": 1.0, "B": 0.8}, size=3000)
         self.assert_close(auto_balance(raw)[[0, 1, 2]], torch.tensor([2.0, 1.0, 1.25]), rtol=2e-3, atol=0)
 
     @pytest.mark.parametrize(
-        ("level", "reason"), [(60000, "is saturated everywhere, so nothing tells"), (100, "a channel of the capture")]
+        ("level", "reason"),
+        [(60000, "is saturated everywhere, so its white"), (100, "a channel of the capture")],
     )
-    def test_exception_nothing_tells(self, level, reason):
+    def test_exception_balance_cannot_be_estimated(self, level, reason):
         raw = grey_under({"R": 0.5, "G": 1.0, "B": 0.8})
         with pytest.raises(ValueError, match=reason):
             auto_balance(replace(raw, counts=torch.full_like(raw.counts, level)))

@@ -253,7 +253,7 @@ class TestOpen(BaseTester):
     def test_feature_a_white_level_that_lies_gives_way_to_the_counts(self, white, most):
         counts = np.random.default_rng(0).integers(64, most + 1, (36, 48))
         counts[0, 0] = most
-        told = f"its white level {white} lies, as its counts reach {most}, which is taken for white: .*--white N"
+        told = f"its white level {white} is wrong, as its counts reach {most}, which is taken for white: .*--white N"
         with pytest.warns(UserWarning, match=told) as caught:
             raw = RawCapture.open(dng(counts, white=white))
         assert len(caught) == 1

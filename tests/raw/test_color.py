@@ -52,7 +52,7 @@ class TestCameraToSrgb(BaseTester):
         self.assert_close(matrix.sum(1), torch.ones(3), atol=1e-12)
 
     def test_exception_channel_blind_to_white(self):
-        with pytest.raises(ValueError, match="must see white in every channel, it gives"):
+        with pytest.raises(ValueError, match="must respond to white in every channel, got"):
             camera_to_srgb(-tensor(G2))
 
     def test_cardinality(self, dtype):
@@ -121,5 +121,5 @@ class TestAdaptedToSrgb(BaseTester):
         matrix, daylight = camera_to_srgb(tensor(G2))
         with pytest.raises(ValueError, match="chromatic adaptation must be one of 'Bradford'"):
             adapted_to_srgb(matrix, daylight, daylight, "none")
-        with pytest.raises(ValueError, match="belongs to no light: its XYZ is"):
+        with pytest.raises(ValueError, match="belongs to no illuminant: its XYZ is"):
             adapted_to_srgb(matrix, daylight, torch.tensor([1.0, 1.0, 1e-3]), "Bradford")

@@ -102,7 +102,7 @@ class TestDecodeRaw(BaseTester):
 
     @pytest.mark.skipif(sys.platform != "linux", reason="the limit of memory is the system's")
     def test_exception_memory_is_bounded(self):
-        """24 megapixels are 46 MiB of file and as much of counts; Python, NumPy and LibRaw take what they take here."""
+        """A file of 24 megapixels needs 46 MiB, its counts as much, and Python, NumPy and LibRaw their own memory."""
         arguments = [sys.executable, "-I", "-S", "-c", PEAK, str(DECODER), json.dumps(sys.path), "60", str(2**31)]
         told = subprocess.run(
             arguments,

@@ -30,7 +30,7 @@ ROUNDING = {"opencv_vng": 0.5 / 255, "libraw_dht": 3 / 65535}
 
 
 def seen(image: torch.Tensor, letters: str) -> torch.Tensor:
-    """What a sensor with these filters sees of (C, H, W), channels in the order of their letters in filter_tile."""
+    """Return the mosaic of an image (C, H, W) behind a filter array, with channels in the order of filter_tile."""
     tile, colors = filter_tile(letters)
     names = "".join(dict.fromkeys(colors))
     height, width = image.shape[-2:]
@@ -87,7 +87,7 @@ class TestDemosaic(BaseTester):
 
     @pytest.mark.parametrize("letters", [*BAYER, "GMYC", XTRANS])
     def test_feature_is_normalised_convolution_by_scipy(self, letters, dtype):
-        """Samples and mask convolved with a tent, divided, and what is measured kept; float64, away from the border."""
+        """Normalised convolution: samples and mask convolved with a tent, divided, samples kept; float64, no border."""
         mosaic = torch.rand(1, 24, 30, dtype=dtype)
         ours = demosaic(mosaic, *filter_tile(letters))
         reach = 3 if letters == XTRANS else 2

@@ -265,5 +265,5 @@ class TestDevelop(BaseTester):
             develop(capture(), **options)
 
     def test_exception_unknown_filters(self):
-        with pytest.raises(ValueError, match="nothing is known of the colours of its filters GMCY: give a matrix"):
+        with pytest.raises(ValueError, match="the capture has no colour matrix for its filters GMCY: give a matrix"):
             develop(capture("GMYC"))

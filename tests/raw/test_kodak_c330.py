@@ -17,7 +17,7 @@ from tests.raw.c330 import LENGTHS, ramp
 class TestKodakC330(BaseTester):
     @pytest.mark.parametrize("length", LENGTHS)
     def test_feature_three_planes_of_libraws_four(self, length):
-        """Four planes of LibRaw's, the last of which is empty; they are sRGB's colours, linear."""
+        """LibRaw returns four planes: three of linear sRGB and an empty one."""
         data = ramp(length)
         with pytest.warns(
             UserWarning, match=f"has no header: by its length of {length} bytes it is taken for a picture"

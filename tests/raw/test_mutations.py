@@ -61,7 +61,7 @@ def mutated(seed):
 
 @contextmanager
 def forked_decoding():
-    """Let RawCapture.open decode in forks; limits, decoder and the reading of what it wrote stay as they are."""
+    """Replace the decoder process of RawCapture.open by a fork, with the same limits, decoder and reader."""
     command = [sys.executable, "-I", "-S", Path(__file__).with_name("decoding_forks.py"), json.dumps(sys.path)]
     command.append(decoding.DECODER.parent)
     before = decoding._run

@@ -35,7 +35,7 @@ def small():
 
 
 def large():
-    """14 bits, another corner, colours of its own: of white, red and blue see about half of what green does."""
+    """A camera with 14 bits, another corner of the tile, and half the response of green in red and blue."""
     blank = RawCapture.from_counts(torch.zeros(1, 2, 2), "GBRG", [1000, 1024, 1030, 1024], 16383)
     own = {"xyz_to_camera": MATRIX, "white_balance": torch.tensor([2.2, 1.0, 1.6, 1.0])}
     return replace(blank, **own), SensorNoise.physical(30000, 3)

@@ -41,7 +41,7 @@ class TestSensorCounts(BaseTester):
     @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GBRG", "GRBG", XTRANS])
     @pytest.mark.parametrize("bits", [10, 12, 14, 16])
     def test_feature_each_pixel_sees_its_own_color(self, device, pattern, bits):
-        """A loop over the pixels of an image whose sides are no multiples of the tile."""
+        """Against a loop over the pixels, for an image with sides that are not multiples of the tile."""
         light = torch.rand(1, 3, 13, 17, device=device)
         counts = sensor_counts(light, camera(pattern, bits), color="channels")[0, 0].cpu()
         side, black, white = math.isqrt(len(pattern)), 2**bits // 16, 2**bits - 1
@@ -84,7 +84,7 @@ class TestSensorCounts(BaseTester):
 
     @pytest.mark.parametrize("changes", [{"xyz_to_camera": MATRIX}, {"camera_to_srgb": torch.linalg.inv(MATRIX + 1)}])
     def test_feature_balance_and_matrix_take_the_light_back(self, device, changes):
-        """What a developer does, written out: times the white balance, times the matrix; for all colours near grey."""
+        """Development written out: times the white balance, times the matrix; for colours near grey."""
         balance = torch.tensor([2.1, 1.0, 1.5, 1.0])
         own = camera("RGGB", 16, white_balance=balance, **changes)
         light = 0.5 + 0.2 * torch.rand(1, 3, 1, 1, device=device).expand(1, 3, 4, 4)
@@ -129,7 +129,7 @@ class TestSensorCounts(BaseTester):
             sensor_counts(light, camera(None))
         with pytest.raises(ValueError, match="color must be one of 'camera', 'channels', got 'raw'"):
             sensor_counts(light, camera(), color="raw")
-        with pytest.raises(ValueError, match="carries no matrix: choose color='channels'"):
+        with pytest.raises(ValueError, match="has no colour matrix: choose color='channels'"):
             sensor_counts(light, camera())
         with pytest.raises(ValueError, match="color='channels' needs a camera of red, green and blue, this has 'GMCY'"):
             sensor_counts(light, camera("GMYC"), color="channels")

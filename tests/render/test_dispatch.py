@@ -73,7 +73,7 @@ class TestChoose(BaseTester):
         def total(image, method):
             return render(image, defocus, bank, compositing, method=method).sum()
 
-        message = f"method '{method}' does not support this scene: torch.compile, torch.func and .* plain operations"
+        message = f"method '{method}' does not support this scene: torch.func and .* plain operations"
         with pytest.raises(ValueError, match=message):
             torch.func.grad(total)(image, method)
         self.assert_close(torch.func.grad(total)(image, "auto"), torch.func.grad(total)(image, "dense"), rtol=0, atol=0)
@@ -88,6 +88,24 @@ class TestChoose(BaseTester):
         large = scene_of("scatter", 1, 1, LARGEST_PLANE // 12 // 2048 + 1, 2048)
         assert "a dozen planes" in explain(large).objections["dense"]
         assert choose(large).name == "tiled"
+
+    def test_feature_a_choice_is_remembered_for_the_same_layers_and_for_no_others(self):
+        """With the tiles, which take as long to choose as a small image to render."""
+        flat, nodes = torch.zeros(1, 1, 200, 300), torch.arange(20.0)
+        ramp = torch.linspace(0, 19, 300).expand(flat.shape)
+        image = torch.rand(1, 1, 200, 300)
+        psfs = torch.rand(20, 1, 23, 23)
+        sizes = []
+        for psi in (flat, ramp, flat):
+            first, again = (
+                layered_scene(image, psi, nodes, psfs, compositing="scatter", layers="nearest") for _ in range(2)
+            )
+            assert choose(first) is choose(again)
+            assert first.grids == again.grids
+            sizes += [grid.size for grid in first.grids.values()]
+            assert torch.equal(render_scene(first), render_scene(again))
+        assert len(sizes) == 3
+        assert sizes[0] == sizes[2] != sizes[1]
 
     def test_feature_dense_is_taken_where_psfs_are_as_large_as_the_image(self):
         """Tiles would each hold all layers and be as large as the image."""

@@ -1,4 +1,4 @@
-"""The sensor against the photon transfer curve, clamps and converters written out."""
+"""Sensor noise against the photon transfer curve, and against clipping and quantisation written out."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class TestSensorNoise(BaseTester):
             ({"full_well": -5.0}, "full_well must be positive and finite electrons, got -5.0"),
             ({"bits": 0}, "bits must be a whole number from 1 to 16, got 0"),
             ({"bits": 17}, "bits must be a whole number from 1 to 16, got 17"),
-            ({"dark": 3.0}, "dark needs full_well .* got dark = 3.0 alone"),
+            ({"dark": 3.0}, "dark needs full_well, .* got dark = 3.0 alone"),
             ({"dark": -3.0, "full_well": 9.0}, "dark must be zero or positive and finite, electrons, got -3.0"),
             ({"dark": 9.0, "full_well": 9.0}, "dark must be below full_well, 9.0 electrons, got 9.0"),
         ],
@@ -136,7 +136,7 @@ class TestSensorNoise(BaseTester):
             assert (field.shape, field.dtype, field.device.type) == (shape, torch.float64, device.type)
 
     def test_feature_photon_transfer(self, device):
-        """Variance over mean is a line: slope 1 / full_well, intercept sigma² + LSB² / 12."""
+        """Variance over mean is a line of gradient 1 / full_well and intercept sigma² + LSB² / 12."""
         sigma, full_well, bits, count = 2e-3, 1e4, 8, 1 << 18
         sensor = SensorNoise(sigma, full_well=full_well, bits=bits)
         levels = torch.linspace(0.05, 0.6, 8, device=device, dtype=torch.float64).view(1, 8, 1, 1)
@@ -151,7 +151,7 @@ class TestSensorNoise(BaseTester):
         lsb = 1 / (2**bits - 1)
         assert abs(slope - 1 / full_well) < 5 * errors[0]
         assert abs(intercept - sigma**2 - lsb**2 / 12) < 5 * errors[1]
-        assert lsb**2 / 12 > 20 * errors[1]  # or the term could be missing unseen
+        assert lsb**2 / 12 > 20 * errors[1]  # so that the test notices if the term is missing
 
     @pytest.mark.parametrize(("sigma", "dark", "full_well"), [(0.05, 0.0, None), (0.0, 400.0, 1e4), (0.01, 400.0, 1e4)])
     def test_feature_a_dark_frame_has_no_mean_and_the_variance_of_its_parts(self, device, sigma, dark, full_well):
@@ -170,7 +170,7 @@ class TestSensorNoise(BaseTester):
         assert torch.equal(sensor(dark_frame - 0.02, params), sensor(dark_frame, params))
 
     def test_feature_highlights_stop_at_the_full_well(self, device, dtype):
-        """Dark signal takes its share of the well."""
+        """Dark signal fills part of the well, so a saturated pixel reads less than 1."""
         bright = torch.full((1, 1, 8, 8), 3.0, device=device, dtype=dtype)
         out = SensorNoise(0.0, full_well=1000, dark=100)(bright)
         self.assert_close(out, torch.full_like(out, 0.9))
@@ -195,14 +195,14 @@ class TestSensorNoise(BaseTester):
         assert codes.round().unique().tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
 
     def test_feature_gradient_is_one_where_nothing_is_clipped(self, device, dtype):
-        """Read noise, converter and dim shot noise are straight through; clipped pixels get none."""
+        """Read noise, quantisation and low-light shot noise pass the gradient unchanged; clipped pixels have none."""
         image = torch.tensor([-0.5, 0.0, 0.2, 0.7, 1.5], device=device, dtype=dtype).view(1, 1, 1, 5)
         assert gradient_of(SensorNoise(0.0, bits=4), image).flatten().tolist() == [0.0, 1.0, 1.0, 1.0, 0.0]
-        noisy = SensorNoise(0.01, full_well=16, bits=4, clip=False)  # 16 electrons: all below the Gaussian's range
+        noisy = SensorNoise(0.01, full_well=16, bits=4, clip=False)  # at most 16 electrons, below the Gaussian range
         assert gradient_of(noisy, image).flatten().tolist() == [0.0, 1.0, 1.0, 1.0, 1.0]
 
     def test_gradcheck(self, device):
-        """The smooth chain: bright shot noise, dark signal and read noise replayed, no converter, no clip."""
+        """The differentiable steps: shot noise above 25 electrons, dark signal and read noise from given fields."""
         sensor = SensorNoise(0.01, full_well=1000, dark=20, clip=False)
         params = sensor.draw((1, 2, 3, 4), device=device, dtype=torch.float64)
         self.gradcheck(lambda x: sensor(x, params), (0.1 + 0.9 * torch.rand(1, 2, 3, 4, device=device),))
@@ -215,7 +215,7 @@ class TestSensorNoise(BaseTester):
         assert not torch.equal(first, sensor(image, sensor.draw(image.shape, device=device)))
 
     def test_feature_a_generator_reproduces_and_leaves_the_global_one(self, device, dtype):
-        """A CPU generator serves an image on any device."""
+        """A CPU generator gives the same noise to an image on any device."""
         sensor, image = SensorNoise.physical(50, 2), torch.rand(2, 3, 8, 8, device=device, dtype=dtype)
         state = torch.get_rng_state()
         first, second, other = (sensor(image, generator=torch.Generator().manual_seed(s)) for s in (1, 1, 2))
@@ -240,7 +240,7 @@ class TestSensorNoise(BaseTester):
     @pytest.mark.parametrize("half", HALF)
     @pytest.mark.parametrize("clip", [True, False])
     def test_feature_half_is_float32_rounded_at_the_end(self, device, half, clip):
-        """Bit for bit, and a sensor cast to half keeps its constants."""
+        """Equality is exact, and a sensor cast to half precision keeps its constants."""
         sensor = SensorNoise(0.003, full_well=1e5, dark=7.3, bits=14, clip=clip)
         image = torch.rand(2, 3, 16, 16, device=device).to(half)
         params = sensor.draw(image.shape, device=device)

@@ -1,4 +1,4 @@
-"""Shot noise against SciPy's Poisson law."""
+"""Shot noise against SciPy's Poisson distribution."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ needs_more_than_half = pytest.mark.parametrize("wide", [torch.float32, torch.flo
 
 
 def sorted_draws(rate: float, count: int) -> torch.Tensor:
-    """Draws at ``count`` evenly spaced u: the law of the sampler itself, without sampling error."""
+    """Return draws at ``count`` evenly spaced u: the sampler's own distribution, without sampling error."""
     uniform = (torch.arange(count, dtype=torch.float64) + 0.5) / count
     return shot_noise(torch.full_like(uniform, rate), uniform)
 
@@ -75,18 +75,18 @@ class TestShotNoise(BaseTester):
     def test_property_below_the_threshold_it_is_the_poisson_quantile(self, rate, uniform):
         out = shot_noise(torch.tensor(rate, dtype=torch.float64), torch.tensor(uniform, dtype=torch.float64)).item()
         expected = stats.poisson.ppf(uniform, rate)
-        if out != expected:  # only where u stands on a step, to the rounding of either sum
+        if out != expected:  # allowed only if u lies on a step of the distribution, to the rounding of either sum
             assert abs(stats.poisson.cdf(min(out, expected), rate) - uniform) < 1e-14
 
     def test_feature_all_draws_of_an_image_equal_the_poisson_quantile(self, device):
-        """No pixel differs, also for float32 u; at u = 0 SciPy answers -1, one below the law's support."""
+        """No pixel differs, for float32 u either. At u = 0 SciPy returns -1, one below the least count."""
         rate, uniform = 25 * torch.rand(1 << 17, device=device), torch.rand(1 << 17, device=device)
         rate = rate.clamp(max=24.999)
         expected = stats.poisson.ppf(uniform.double().cpu().numpy(), rate.double().cpu().numpy())
         assert np.array_equal(shot_noise(rate, uniform).cpu().numpy(), np.maximum(expected, 0))
 
     def test_feature_float32_sums_differ_only_on_a_step(self, device):
-        """The sums of a device without float64: off for under one pixel in 3e4, with u within 4e-6 of a step."""
+        """On a device without float64 under one pixel in 3e4 differs, each with u within 4e-6 of a step."""
         rate, uniform = 25 * torch.rand(1 << 16, device=device), torch.rand(1 << 16, device=device)
         out = poisson_quantile(rate, uniform).double().cpu().numpy()
         rate, uniform = rate.double().cpu().numpy(), uniform.double().cpu().numpy()
@@ -102,7 +102,7 @@ class TestShotNoise(BaseTester):
         assert shot_noise(rate, torch.exp(-rate) * (1 + 1e-15)).tolist() == [1.0] * 4
 
     def test_feature_no_electrons_expected_gives_none(self, device, dtype):
-        """Also for FFT round-off below zero, and whatever u is."""
+        """For every u, and for FFT round-off below zero too."""
         uniform = torch.tensor([0.0, 1e-30, 0.5, 1 - 6e-8, 1.0], device=device, dtype=dtype)
         for rate in (0.0, -0.0, -2e-9, -1.0):
             assert shot_noise(torch.full_like(uniform, rate), uniform).tolist() == [0.0] * 5
@@ -110,7 +110,7 @@ class TestShotNoise(BaseTester):
     @pytest.mark.parametrize("rate", [1e-30, 1e-9, 0.1, 10.0, 24.99, 25.0, 1e3, 1e6, 1e8])
     @needs_more_than_half
     def test_feature_the_ends_of_u_stay_within_nine_sigma(self, device, wide, rate):
-        """SciPy's quantile at 1e-16 of either end is within 8.3 sigma + 12 electrons of the mean."""
+        """SciPy's quantiles 1e-16 from either end lie within 8.3 sigma + 12 electrons of the mean."""
         uniform = torch.tensor([0.0, 1e-38, 1e-7, 1 - 1e-7, 1.0], device=device, dtype=wide)
         out = shot_noise(torch.full_like(uniform, rate), uniform)
         assert (out >= 0).all()
@@ -118,7 +118,7 @@ class TestShotNoise(BaseTester):
         assert (out.diff() >= 0).all()
 
     def test_feature_the_loop_is_long_enough(self):
-        """The largest count the clamped u can ask for."""
+        """The largest count, at the largest u after clamping, is below the limit of the loop."""
         for dtype in (np.float32, np.float64):
             last = 1 - 32 * float(np.finfo(dtype).eps)
             assert stats.poisson.ppf(last, GAUSSIAN_FROM) < shot._MAX_COUNT
@@ -153,13 +153,13 @@ class TestShotNoise(BaseTester):
         self.gradcheck(lambda x: shot_noise(x, uniform), (electrons,))
 
     def test_feature_its_operator_is_fit_for_compilers(self, device, dtype):
-        """PyTorch's own checks of the operator: schema, fake shapes and strides, tracing with dynamic shapes."""
+        """torch.library.opcheck passes: schema, fake shapes and strides, tracing with dynamic shapes."""
         rate = 50 * torch.rand(2, 3, 4, 5, device=device, dtype=dtype)
         for layout in (torch.contiguous_format, torch.channels_last):
             torch.library.opcheck(shot._dim_counts_operator, (rate.to(memory_format=layout), torch.rand_like(rate)))
 
     def test_feature_recording_a_graph_gives_the_same_counts(self, device, dtype, monkeypatch):
-        """While a CUDA graph is recorded nothing waits for values; the recording is feigned here."""
+        """While a CUDA graph is recorded values cannot be read back; the recording is simulated here."""
         rate = 50 * torch.rand(2, 3, 16, 16, device=device, dtype=dtype)
         uniform = torch.rand_like(rate)
         waiting = shot_noise(rate, uniform)

@@ -1,4 +1,4 @@
-"""Published systems: what their sources say, what their physics must do, and how they become cameras."""
+"""Published systems: values against their sources, expected physics, and the cameras built from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.figures.system_survey import contrast_transfer
+from kornia_tidy.figures.system_statistics import contrast_transfer
 from kornia_tidy.inference.tasks import metres
 from kornia_tidy.mask_design.fisher_information import crlb
 from kornia_tidy.masks import CubicMask, RadialMask, ZernikeMask
@@ -37,13 +37,13 @@ def psfs(optics, defocus):
 
 
 def sharpest(optics, defocus, channel=1):
-    """Defocus at which a point's image is brightest."""
+    """Return the defocus at which the peak of the PSF is highest."""
     return defocus[int(psfs(optics, defocus)[:, channel].amax((1, 2)).argmax())]
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """A real scene where there is one, else dead leaves; nearness stretches it over every system's depths."""
+    """Return an image and its normalised inverse depth: a real scene if it is available, else dead leaves."""
     try:
         image, depth, _ = load_scene("middlebury-motorcycle")
     except pytest.skip.Exception:
@@ -53,7 +53,7 @@ def scene():
 
 
 class TestSources(BaseTester):
-    """The table against numbers read in the sources, written out once more."""
+    """The table against numbers of the sources, which are written out here again."""
 
     @pytest.mark.parametrize(
         ("name", "focal_length", "f_number", "focus", "pitch", "depths"),
@@ -118,7 +118,7 @@ class TestSources(BaseTester):
         assert "focal length" in SYSTEMS["chang2019"].guesses
 
     def test_feature_the_paper_fidelity_is_the_published_system(self):
-        """Its PSFs written out with NumPy: a 23-point pupil, 31, 27 and 23 points of an FFT, cut to 23."""
+        """PSFs against NumPy: a 23-point pupil, FFTs of 31, 27 and 23 points, cropped to 23."""
         with pytest.warns(AliasingWarning):
             optics = preset("tidy-5", fidelity="paper", camera=DefocusRange(-20, 20))
         assert optics.defocus_nodes == pytest.approx(np.linspace(-20, 20, 21), abs=1e-12)
@@ -137,12 +137,12 @@ class TestSources(BaseTester):
                 assert abs(light - bank[d, channel]).max() < 1e-6 * light.max()
 
     def test_feature_honest_and_published_psfs_agree_in_size(self):
-        """The implied pixel: where the published grid does not alias, both show the same pattern at the same scale."""
+        """At defocus where the published grid does not alias, both have the same PSFs at the same scale."""
         balanced = psfs(preset("phasecam3d", fidelity=Fidelity(window=23)), [-5.0, 0.0, 5.0])
         paper = psfs(preset("phasecam3d", fidelity="paper"), [-5.0, 0.0, 5.0])
         likeness = torch.nn.functional.cosine_similarity(balanced.flatten(2), paper.flatten(2), dim=2)
         assert float(likeness.min()) > 0.97
-        camera = SYSTEMS["phasecam3d"].camera().resized(0.9)  # pixels 11 % off
+        camera = SYSTEMS["phasecam3d"].camera().resized(0.9)  # pixels 11 % too large
         off = psfs(preset("phasecam3d", camera=camera, fidelity=Fidelity(window=23)), [-5.0, 0.0, 5.0])
         worse = torch.nn.functional.cosine_similarity(off.flatten(2), paper.flatten(2), dim=2)
         assert bool((worse < likeness).all())
@@ -177,11 +177,11 @@ class TestPhysics(BaseTester):
     @pytest.mark.parametrize("name", ["tidy-1", "phasecam3d", "ikoma2021", "chang2019", "sitzmann2018"])
     def test_feature_with_a_flat_mask_the_focus_is_sharpest(self, name):
         optics = preset(name, masks=PixelwiseMask(1, 46 if SYSTEMS[name].smooth_iris else 23, "flat"))
-        expected = -optics.camera.chromatic_defocus(optics.spectrum.wavelengths[1])  # 0 but for the two single lenses
+        expected = -optics.camera.chromatic_defocus(optics.spectrum.wavelengths[1])  # 0 but for singlets
         assert sharpest(optics, [float(psi) for psi in range(-9, 10)]) == pytest.approx(expected, abs=0.5)
 
     def test_feature_a_fresnel_lens_moves_each_colour_by_its_wavelength(self):
-        """10 rad at 530 nm are 10 * 530 nm / wavelength there, and defocus is too: all colours meet, but for wraps."""
+        """Without wrapping all colours would have the same focus; the wrapped phase moves red to -11 and blue to -9."""
         optics, nodes = preset("fresnel"), [float(psi) for psi in range(-20, 21)]
         assert sharpest(optics, nodes) == -10
         assert [sharpest(optics, nodes, channel) for channel in (0, 2)] == [-11, -9]
@@ -198,7 +198,7 @@ class TestPhysics(BaseTester):
     def test_feature_phasecam3d_starts_from_a_mask_that_tells_depth(self):
         nodes = [float(psi) for psi in range(-10, 11)]
         fisher = crlb(preset("phasecam3d"), nodes)
-        assert float(fisher.max() / fisher.min()) < 1.8  # as well at every depth
+        assert float(fisher.max() / fisher.min()) < 1.8  # nearly the same at every depth
         noise = crlb(preset("phasecam3d", masks=PixelwiseMask(1)), nodes)
         flat = crlb(preset("phasecam3d", masks=PixelwiseMask(1, initial="flat")), nodes)
         assert float(noise.mean()) > 1.7 * float(fisher.mean())
@@ -227,11 +227,11 @@ class TestPhysics(BaseTester):
         self.assert_close(psfs(optics, [10.0]), expected, rtol=0, atol=1e-7)
 
     def test_feature_changs_colours_are_sharp_where_the_glass_says(self):
-        """A single lens focuses by (n - 1): PMMA, Beadie et al., has 1.49163, 1.49539, 1.49970 (610, 530, 470 nm)."""
+        """The power of a single lens goes as n - 1: PMMA has 1.49163, 1.49539, 1.49970 (610, 530, 470 nm)."""
         optics, nodes = preset("chang2019"), [psi / 2 for psi in range(-46, 47)]
         scale = math.pi * 3.125e-3**2 / 530e-9 / 50e-3
         for channel, index in enumerate((1.49163, 1.49539, 1.49970)):
-            expected = scale * ((index - 1) / 0.49539 - 1)  # red is sharp farther, blue nearer
+            expected = scale * ((index - 1) / 0.49539 - 1)  # red is in focus farther away, blue nearer
             assert sharpest(optics, nodes, channel) == pytest.approx(expected, abs=0.5)
 
     def test_feature_lius_spiral_turns_with_depth_and_not_once_around(self):
@@ -242,8 +242,8 @@ class TestPhysics(BaseTester):
         lobe = light * (light > 0.3 * light.amax((1, 2), keepdim=True))
         up, right = -(lobe * reach[:, None]).sum((1, 2)), (lobe * reach).sum((1, 2))
         angle = np.unwrap(torch.atan2(up, right).numpy())
-        turn = np.polyfit(nodes, angle, 1)[0]  # of 13 rings: psi / 13, and psi is less at 550 nm
-        assert turn == pytest.approx(1 / 13, rel=0.06)
+        rotation = np.polyfit(nodes, angle, 1)[0]  # 13 rings: psi / 13, where psi is less at 550 nm than at 530 nm
+        assert rotation == pytest.approx(1 / 13, rel=0.06)
         lo, hi = optics.camera.defocus_range
         assert (hi - lo) / 13 < 2 * math.pi
 
@@ -259,11 +259,11 @@ class TestPhysics(BaseTester):
         assert spreads[1] > 1
 
     def test_feature_the_cubic_in_zernikes_is_a_cubic_without_tilt(self):
-        own = ZernikeMask(initial=cubic_in_zernikes(27.0, 55)).phase[0].detach()
+        phase = ZernikeMask(initial=cubic_in_zernikes(27.0, 55)).phase[0].detach()
         x = torch.linspace(-1.1, 1.1, 23)
         inside = x[:, None] ** 2 + x**2 <= 1
         expected = CubicMask(27.0).phase[0].detach() - 0.75 * 27 * (x[:, None] + x)
-        self.assert_close(own[inside], expected[inside], rtol=0, atol=1e-4)
+        self.assert_close(phase[inside], expected[inside], rtol=0, atol=1e-4)
         optics = preset("sitzmann2018", fidelity=Fidelity(window=129))
         light = psfs(optics, [0.0])[0, 1]
         reach = torch.arange(129.0) - 64
@@ -324,7 +324,7 @@ class TestFromPreset(BaseTester):
 
     def test_feature_overrides_replace_parts_and_nothing_else(self):
         optics = preset("ikoma2021", masks=PixelwiseMask(2, 30), sensor=None)
-        assert optics.pupil.amplitude.shape == (30, 30)  # an iris that fits
+        assert optics.pupil.amplitude.shape == (30, 30)  # the iris follows the mask's pixels
         assert optics.sensor is None
         assert (optics.compositing, optics.camera.focus_distance) == ("occlusion", 1.7)
         assert preset("tidy-1", masks=None).masks.phase.shape == (1, 23, 23)

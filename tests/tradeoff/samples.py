@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from kornia_tidy import Fidelity
-from kornia_tidy.tradeoff import TOLERANCES, Conditions, TradeRow, TradeRun, ladder
+from kornia_tidy.tradeoff import TOLERANCES, Conditions, TradeRow, TradeRun, sweep_settings
 
 ROW = TradeRow(
     knob="preset",
@@ -55,7 +55,7 @@ def whole_sweep() -> TradeRun:
             capture_seconds=0.05 * 1.2 ** (5 * i % 17),
             window=setting.value if setting.knob == "window" and setting.value else 61,
         )
-        for i, setting in enumerate(ladder())
+        for i, setting in enumerate(sweep_settings())
     ]
     rows += [
         replace(ROW, knob="plan", value=tolerance, rmse=0.6 * tolerance, capture_seconds=0.02 * 4**i)

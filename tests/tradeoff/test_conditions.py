@@ -100,7 +100,7 @@ class TestConditions(BaseTester):
             "sensor/noise.py",
             "planning/planner.py",
             "planning/error_model.py",
-            "tradeoff/ladder.py",
+            "tradeoff/sweep_settings.py",
         ):
             (copy / name).write_text("")
             assert code_hash() not in hashes, name

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from kornia_tidy.tradeoff import TradeRun, draw_trade, pareto
-from kornia_tidy.tradeoff.ladder import LADDERS
+from kornia_tidy.tradeoff.sweep_settings import SWEEP_VALUES
 from tests.base import BaseTester
 from tests.tradeoff.samples import CONDITIONS, ROW, whole_sweep
 
@@ -22,7 +22,7 @@ class TestDrawTrade(BaseTester):
         run = whole_sweep()
         axes = draw_trade(run).axes[0]
         lines = {line.get_label(): line for line in axes.lines}
-        for knob in LADDERS:
+        for knob in SWEEP_VALUES:
             if knob != "preset":
                 expected = sorted(1e3 * row.capture_seconds for row in run.rows if row.knob == knob)
                 assert sorted(lines[knob].get_xdata()) == pytest.approx(expected)

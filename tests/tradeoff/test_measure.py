@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, TiDyOptics
-from kornia_tidy.tradeoff import capture, ladder, measure, missing, pareto, sweep
-from kornia_tidy.tradeoff.ladder import Setting
+from kornia_tidy.tradeoff import capture, measure, missing, pareto, sweep, sweep_settings
+from kornia_tidy.tradeoff.sweep_settings import Setting
 from tests.base import BaseTester
 from tests.tradeoff.samples import ROW
 
@@ -112,7 +112,7 @@ class TestMeasure(BaseTester):
 class TestSweep(BaseTester):
     @pytest.fixture
     def measured(self, monkeypatch):
-        """Count what is measured, and make it up."""
+        """Replace measurements by invented rows, and count them."""
         calls = []
 
         def made_up(optics, image, depth, fidelity, truth, *, repeats, training):
@@ -131,9 +131,9 @@ class TestSweep(BaseTester):
         assert rows[1].rmse == rows[1].max_error == 0
 
     def test_feature_the_same_setting_is_measured_once_and_the_reference_once(self, measured):
-        rows = list(sweep(TiDyOptics(fidelity=QUICK), *scene(), ladder("draft")))
-        assert len(measured) == 1 + len({replace(s.fidelity, name="") for s in ladder("draft")})
-        assert [(r.knob, r.value, r.fidelity) for r in rows] == ladder("draft")
+        rows = list(sweep(TiDyOptics(fidelity=QUICK), *scene(), sweep_settings("draft")))
+        assert len(measured) == 1 + len({replace(s.fidelity, name="") for s in sweep_settings("draft")})
+        assert [(r.knob, r.value, r.fidelity) for r in rows] == sweep_settings("draft")
 
     def test_feature_known_rows_are_not_measured_again(self, measured):
         optics = TiDyOptics(fidelity=QUICK)

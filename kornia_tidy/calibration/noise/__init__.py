@@ -1,6 +1,7 @@
-"""Photon transfer: pairs of flat fields come in; gain, read noise and full well of a sensor go out.
+"""Noise calibration by photon transfer: gain, read noise and full well of a sensor from its captures.
 
-Read ``photon_transfer.py`` first.
+Pairs of flat fields, or a single picture with smooth areas, come in. The parameters of a ``SensorNoise`` go out. Read
+``photon_transfer.py`` first.
 """
 
 from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer, photon_transfer

@@ -1,9 +1,10 @@
-r"""Photon transfer: a camera's gain and read noise from how the variance of its counts grows with their level.
+r"""Photon transfer: a camera's gain and read noise from the variance of its counts as a function of their level.
 
 .. math:: \sigma^2(\mu) = \frac{\mu}{g} + \left( \frac{\sigma_r}{g} \right)^2 + \frac{1}{12}
 
-with μ in counts over black, the gain g in electrons a count, the read noise σ_r in electrons, and the converter's
-rounding. A straight line gives both. A single picture shows the sensor's fixed pattern too, which adds (p μ)².
+Here μ is the level in counts above black, g the gain in electrons a count, σ_r the read noise in electrons, and 1/12
+the rounding of the converter. A straight line gives g and σ_r. A single picture includes the sensor's fixed pattern,
+which adds (p μ)².
 """
 
 from __future__ import annotations
@@ -31,26 +32,26 @@ from kornia_tidy.sensor.noise import SensorNoise
 
 FORMAT = "kornia_tidy.photon_transfer/1"
 ROUNDING = 1 / 12  # variance that rounding to whole counts adds
-RESOLVED = 0.24  # EMVA 1288: variance in counts squared below which rounding hides the read noise
-SAME_LEVEL = 0.02  # captures whose levels differ by less, and by less than a count more, are of one exposure
-LEAST_POINTS, LEAST_POINTS_SINGLE = 3, 8  # flats say exactly what noise is; of a picture many points together do
-WORST_R_SQUARED, WORST_GAIN_ERROR = 0.9, 0.25  # beyond these the pictures are said not to allow a calibration
+RESOLVED = 0.24  # counts squared; EMVA 1288: with less variance, rounding hides the read noise
+SAME_LEVEL = 0.02  # captures whose levels differ by at most this fraction plus one count have the same exposure
+LEAST_POINTS, LEAST_POINTS_SINGLE = 3, 8  # a point from a single picture is less certain than one from flats
+WORST_R_SQUARED, WORST_GAIN_ERROR = 0.9, 0.25  # a worse fit is refused
 _BISQUARE = 4.685  # Tukey's constant: 95 % efficient for Gaussian noise
 
 
 @dataclass(frozen=True)
 class TransferLine:
-    """A line through points of a photon-transfer curve.
+    """Line fitted to the points of a photon-transfer curve.
 
     Attributes:
         gain: electrons a count.
-        gain_error: its standard uncertainty.
-        read_noise: electrons, at zero light; dark current's noise is in it.
-        read_noise_error: its standard uncertainty; larger than it where rounding hides it.
-        fixed_pattern: standard deviation of the pixels' response, as a share of the level; 0 where it cancelled.
-        r_squared: share of the points' variance that the line explains, the fixed pattern's part taken off. All
-            points count, those that the robust fit held for outliers too.
-        samples: degrees of freedom behind the points.
+        gain_error: standard uncertainty of the gain.
+        read_noise: electrons at zero light, including the noise of the dark current.
+        read_noise_error: standard uncertainty of the read noise; it exceeds the value if rounding hides the noise.
+        fixed_pattern: standard deviation of the pixels' response as a fraction of the level; 0 for differences.
+        r_squared: fraction of the points' variance that the line explains, after subtraction of the fixed pattern. It
+            includes the points that the robust fit rejected.
+        samples: degrees of freedom of all points.
     """
 
     gain: float
@@ -67,14 +68,14 @@ class PhotonTransfer:
     """A camera's noise at one ISO setting.
 
     Attributes:
-        camera: its name, empty if unknown.
-        iso: the setting, None if unknown.
+        camera: name of the camera, empty if unknown.
+        iso: ISO setting, None if unknown.
         method: ``"single"`` for one picture of any scene, ``"flats"`` for differences of captures.
-        black: mean count without light, as measured if there were dark frames, else as the file says.
-        white: count of saturation.
-        line: for all channels together, which share the converter.
-        channels: for each alone, where it has points enough.
-        points: of the curve.
+        black: mean count without light, measured in dark frames if there were any, else from the file.
+        white: count at saturation.
+        line: line for all channels together, which share the converter.
+        channels: line for each channel that has enough points.
+        points: points of the curve.
     """
 
     camera: str
@@ -88,21 +89,21 @@ class PhotonTransfer:
 
     @property
     def full_well(self) -> float:
-        """Electrons that make the count of saturation, which the pixel may hold more of at this ISO."""
+        """Electrons at the count of saturation; at high ISO the pixel itself can hold more."""
         return self.line.gain * (self.white - self.black)
 
     @property
     def read_noise_resolved(self) -> bool:
-        """Whether the read noise is seen, by three standard errors, to be more than the converter's steps hide.
+        """Whether the read noise exceeds, by three standard errors, the least that the converter's steps resolve.
 
-        Where they hide it the captures in the dark say nothing, and the line's value at zero light comes from the
-        bright ones alone: chance often makes it look large enough, and its error tells.
+        Below that, dark captures carry no information, and the value at zero light is extrapolated from bright ones. It
+        can be too large by chance, so its error is taken into account.
         """
-        surely = max(self.line.read_noise - 3 * self.line.read_noise_error, 0.0)
-        return (surely / self.line.gain) ** 2 + ROUNDING >= RESOLVED
+        least = max(self.line.read_noise - 3 * self.line.read_noise_error, 0.0)
+        return (least / self.line.gain) ** 2 + ROUNDING >= RESOLVED
 
     def sensor_noise(self) -> SensorNoise:
-        """Return this camera as the library's sensor, whose full scale 1 is the count of saturation.
+        """Return a sensor with this camera's noise, in units where full scale is the count of saturation.
 
         Example:
             >>> line = TransferLine(2.0, 0.01, 6.0, 0.1, 0.0, 0.999, 10000)
@@ -114,25 +115,28 @@ class PhotonTransfer:
 
 
 def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] = ()) -> PhotonTransfer:
-    """Measure a camera's gain and read noise.
+    """Measure a camera's gain and read noise by photon transfer.
 
     Args:
         captures: one picture of any scene with smooth areas of different brightness; or flats, two or more of each
-            exposure, in any order. Flats may be of any scene that holds still, and those in the dark are welcome.
-        darks: captures without light at the same settings: their mean is black then, place by place of the tile, and
-            two or more are points of the curve.
+            exposure, in any order. Flats may show any static scene, and may include dark captures.
+        darks: captures without light at the same settings. Their mean replaces the file's black level, separately for
+            each position of the filter array's tile. Two or more also give points of the curve.
+
+    Returns:
+        The calibration.
 
     Raises:
         ValueError: if captures are not of one camera, ISO and size, an exposure has no second capture, or the pictures
-            do not allow a calibration: no noise to be seen between texture, one level only, no straight line.
+            do not allow a calibration because of texture, a single level, or a curve that is not straight.
 
     Convention:
-        - Fixed pattern, scene and drift of the light cancel in flats. In a single picture fixed pattern shows, and is
-          fitted with the line; texture too fine or too faint to be told from noise makes the gain some percent small,
-          which the error does not hold.
-        - Whether the file's black is right cannot be seen without ``darks``: one count too many makes the read noise
-          squared too small by one count's electrons.
-        - Where the read noise is below 0.4 counts its value is uncertain, as the error says.
+        - Fixed pattern, scene and drift of the light cancel in flats. In a single picture the fixed pattern is fitted
+          together with the line. Texture that is too fine or faint to be distinguished from noise makes the gain a few
+          percent too small, which the stated error does not include.
+        - Without ``darks`` an error of the file's black level remains undetected. A black level too high by one count
+          lowers the read noise squared by the electrons of one count.
+        - A read noise below 0.4 counts is uncertain, and its error is accordingly large.
 
     Source: Janesick, Photon Transfer, 2007; EMVA Standard 1288, 4.0.
 
@@ -174,20 +178,24 @@ def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] 
 
 
 def fit_line(points: Sequence[CurvePoint], fixed_pattern: bool = False) -> TransferLine:
-    """Fit the line of photon transfer: weighted by what is known of each point, and deaf to outliers.
+    """Fit the photon-transfer line by robust weighted least squares.
 
     Args:
         points: level, variance and degrees of freedom; three or more, eight with a fixed pattern.
-        fixed_pattern: whether there may be a part that grows as the square of the level, as in a single picture; it is
-            kept where it is seen with three standard errors.
+        fixed_pattern: whether to fit a term quadratic in the level too, as a single picture needs. It is kept if it is
+            significant by three standard errors.
+
+    Returns:
+        The line.
 
     Raises:
         ValueError: if there are fewer points, or variance does not grow with level.
 
     Convention:
-        - Points of less than 0.24 counts squared are left out: what rounding adds to them is not 1/12.
-        - Weights are those of the fitted line, var(s²) = 2 σ⁴ / samples, and Tukey's bisquare of what is left.
-        - Uncertainties follow from the weights, or from the scatter about the line where that is larger.
+        - Points of less than 0.24 counts squared are ignored, because rounding does not add 1/12 to them.
+        - A weight is the inverse of the variance of the fitted value, var(s²) = 2 σ⁴ / samples, times Tukey's bisquare
+          of the residual.
+        - Uncertainties follow from the weights, or from the scatter about the line if that is larger.
 
     Example:
         >>> points = [CurvePoint("L", m, m / 2 + 9 + 1 / 12, 10**6) for m in (0.0, 100.0, 1000.0)]
@@ -212,7 +220,11 @@ def fit_line(points: Sequence[CurvePoint], fixed_pattern: bool = False) -> Trans
 
 
 def write_json(path: str | os.PathLike[str], result: PhotonTransfer) -> None:
-    """Write a calibration, all or nothing.
+    """Write a calibration as a JSON file; after an error no partial file remains.
+
+    Args:
+        path: file to write; an existing one is replaced.
+        result: the calibration.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
@@ -222,7 +234,10 @@ def write_json(path: str | os.PathLike[str], result: PhotonTransfer) -> None:
 
 
 def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
-    """Read a calibration written by :func:`write_json`.
+    """Read a calibration from a JSON file written by :func:`write_json`.
+
+    Args:
+        path: file to read.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -251,7 +266,7 @@ def _fit(points: Sequence[CurvePoint], fixed_pattern: bool) -> TransferLine | No
     level = torch.tensor([point.level for point in points], dtype=torch.float64)
     variance = torch.tensor([point.variance for point in points], dtype=torch.float64)
     samples = torch.tensor([point.samples for point in points], dtype=torch.float64)
-    scale = max(float(level.abs().max()), 1e-9)  # the columns are then of one size
+    scale = max(float(level.abs().max()), 1e-9)  # gives all columns of the design the same magnitude
     if float(level.max() - level.min()) < 1e-3 * scale:
         return None
     powers = torch.stack([torch.ones_like(level), level / scale, (level / scale) ** 2], dim=-1)
@@ -265,10 +280,9 @@ def _fit(points: Sequence[CurvePoint], fixed_pattern: bool) -> TransferLine | No
     pattern = float(terms[2]) / scale**2 if len(terms) == 3 else 0.0
     gain = 1 / slope
     straight = variance - pattern * level**2
-    misfit = (straight - terms[0] - slope * level).square().sum()
-    spread = (straight - straight.mean()).square().sum()
-    # Of the read noise squared, in electrons: (intercept - rounding) / slope².
-    read = (float(terms[0]) - ROUNDING) * gain**2
+    residual = (straight - terms[0] - slope * level).square().sum()
+    total = (straight - straight.mean()).square().sum()
+    read = (float(terms[0]) - ROUNDING) * gain**2  # read noise squared in electrons: (intercept - rounding) / slope²
     gradient = torch.tensor([gain**2, -2 * read * gain / scale], dtype=torch.float64)
     read_error = float((gradient @ covariance[:2, :2] @ gradient).sqrt())
     noise = math.sqrt(max(read, 0.0))
@@ -278,13 +292,13 @@ def _fit(points: Sequence[CurvePoint], fixed_pattern: bool) -> TransferLine | No
         noise,
         math.sqrt(noise**2 + read_error) - noise if noise**2 < read_error else read_error / (2 * noise),
         math.sqrt(pattern),
-        float(1 - misfit / spread),
+        float(1 - residual / total),
         int(samples.sum()),
     )
 
 
 def _robust(design: Tensor, values: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
-    """Return coefficients and their covariance by reweighted least squares."""
+    """Return coefficients and their covariance by iteratively reweighted least squares."""
     fitted = values
     trust = torch.ones_like(values)
     terms, normal, scatter = design.new_zeros(design.shape[1]), torch.eye(design.shape[1]).to(design), 1.0
@@ -293,10 +307,10 @@ def _robust(design: Tensor, values: Tensor, samples: Tensor) -> tuple[Tensor, Te
         weight = trust / error.square()
         normal = design.T @ (weight[:, None] * design)
         terms = torch.linalg.lstsq(normal, design.T @ (weight * values)).solution
-        fitted = (design @ terms).clamp(min=ROUNDING)  # whatever a step of the iteration believes
+        fitted = (design @ terms).clamp(min=ROUNDING)  # an early step may give negative variances
         off = (values - design @ terms) / (fitted * (2 / samples).sqrt())
         scatter = max(1.0, 1.4826 * float(off.abs().median()))
-        if step > 3:  # the weights have settled
+        if step > 3:  # the first weights come from a poor fit
             before, trust = trust, (1 - (off / (_BISQUARE * scatter)).square()).clamp(min=0).square()
             if torch.allclose(before, trust, rtol=0, atol=1e-7):
                 break
@@ -307,7 +321,7 @@ def _robust(design: Tensor, values: Tensor, samples: Tensor) -> tuple[Tensor, Te
 
 
 def _check_alike(captures: Sequence[RawCapture]) -> None:
-    """Refuse captures that do not share what a calibration is of."""
+    """Raise if the captures differ in camera, ISO, size, filter array or white level."""
     first = captures[0]
     kinds: dict[str, Any] = {
         "camera": lambda raw: raw.info.camera,
@@ -317,9 +331,9 @@ def _check_alike(captures: Sequence[RawCapture]) -> None:
         "white level": lambda raw: raw.white,
     }
     for raw in captures[1:]:
-        for what, of in kinds.items():
-            if of(raw) != of(first):
-                raise ValueError(f"captures must be of one {what}, got {of(first)} and {of(raw)}")
+        for name, value in kinds.items():
+            if value(raw) != value(first):
+                raise ValueError(f"captures must be of one {name}, got {value(first)} and {value(raw)}")
 
 
 def _check_line(line: TransferLine, single: bool) -> None:
@@ -337,7 +351,7 @@ def _check_line(line: TransferLine, single: bool) -> None:
 
 
 def _mean_black(darks: Sequence[RawCapture]) -> Tensor:
-    """Mean count at each place of the tile, or of each channel, in the form of ``RawCapture.black``."""
+    """Return the mean count at each position of the tile, or of each channel, in the shape of ``RawCapture.black``."""
     first = darks[0]
     rows, columns = tile_of(first)
     counts = torch.stack([raw.counts.double().mean(0, keepdim=first.counts.shape[0] == 1) for raw in darks]).mean(0)
@@ -349,7 +363,7 @@ def _mean_black(darks: Sequence[RawCapture]) -> Tensor:
 
 
 def _exposures(captures: Sequence[RawCapture], black: Tensor | None) -> list[list[RawCapture]]:
-    """Group captures by their mean level; each group needs two."""
+    """Group captures by their mean level, and raise if a group has only one."""
     zero = float(black_planes(captures[0], black).mean())
     leveled = sorted(((float(raw.counts.double().mean()) - zero, raw) for raw in captures), key=lambda pair: pair[0])
     groups: list[list[RawCapture]] = []
@@ -367,7 +381,7 @@ def _exposures(captures: Sequence[RawCapture], black: Tensor | None) -> list[lis
 
 
 def _numbers(kind: type, entry: dict[str, Any]) -> Any:
-    """Return a dataclass of numbers (and a channel's name) from what JSON holds."""
+    """Convert a JSON object to a dataclass, and raise if a field other than the channel's name is not a number."""
     for name, value in entry.items():
         if name != "channel" and (isinstance(value, bool) or not isinstance(value, (int, float))):
             raise ValueError(f"{name} must be a number, got {value!r}")

@@ -1,10 +1,10 @@
-"""Points of the photon-transfer curve: the variance of counts over their level, where nothing but noise varies.
+"""Points of the photon-transfer curve: noise variance over mean level, measured in blocks without texture.
 
-A picture, or the difference of two of the same thing, is cut into small blocks. Each place of the filter array's tile
-is a plane of its own, so nothing is interpolated. A block's residuals r about a fitted plane are noise alone unless the
-scene has texture there, and texture shows in what noise cannot have: neighbours that are alike, within a plane and from
-one plane to the next. Blocks are judged by such correlations of r / |r| only. For Gaussian noise r / |r| and |r|² are
-independent (Basu's theorem), so that what is left out leaves the variance of what is kept unbiased.
+A picture, or the difference of two captures of the same scene, is cut into small blocks. Each position in the filter
+array's tile gives one colour plane, so nothing is interpolated. A linear ramp is fitted to each block. Its residuals r
+are noise alone unless the scene has texture there. Texture correlates neighbouring pixels and colour planes, and noise
+does not, so blocks with such correlations are rejected. The test uses r / |r| only. For Gaussian noise r / |r| and
+|r|² are independent (Basu's theorem), so the rejection does not bias the variance of the remaining blocks.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from torch import Tensor
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.filter_array import tile_planes
 
-MOST_LEVELS = 32  # intervals of level, a channel
-FEWEST_BLOCKS = 30  # in an interval, whose variance is then known to 4 %
-CLIPPED_BLOCKS = 0.02  # share of an interval's blocks from which on all of it is left out: the rest is a selection
-LEAST_SHARE = 0.1  # of an interval's blocks without texture; where there are fewer, these have some that was not seen
-# Correlations, between planes and to the neighbours, in standard deviations from what white noise has. Scenes are
-# mostly alike, fine weaves may be the opposite. One block of white noise in eight is left out.
-LEAST_ALIKE, MOST_ALIKE = -2.3, 1.6
+MOST_LEVELS = 32  # intervals of level for each channel
+FEWEST_BLOCKS = 30  # in an interval; they determine its variance to 4 %
+CLIPPED_BLOCKS = 0.02  # with a larger fraction of clipped blocks an interval is rejected, as the others are a selection
+LEAST_FRACTION = 0.1  # of an interval's blocks must pass; if fewer do, those have undetected texture too
+# Accepted correlation, in standard deviations from that of white noise. Texture usually correlates positively, fine
+# weaves negatively. One block of white noise in eight is rejected.
+LEAST_CORRELATION, MOST_CORRELATION = -2.3, 1.6
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class CurvePoint:
 
     Attributes:
         channel: letter of the color, or ``"L"`` for a sensor without colors.
-        level: mean count over black.
-        variance: of the noise, counts squared.
-        samples: degrees of freedom behind the variance.
+        level: mean count above black.
+        variance: variance of the noise in counts squared.
+        samples: degrees of freedom of the variance.
     """
 
     channel: str
@@ -45,23 +45,23 @@ class CurvePoint:
 
 
 def temporal_points(frames: Sequence[RawCapture], black: Tensor | None = None) -> list[CurvePoint]:
-    r"""Return the curve's points from two or more captures of the same thing under the same light.
+    r"""Measure points of the photon-transfer curve from two or more captures of the same scene under the same light.
 
-    The scene and the sensor's fixed pattern cancel in differences. Of N frames these are the N - 1 contrasts
+    The scene and the sensor's fixed pattern cancel in differences. N frames give the N - 1 contrasts
 
     .. math:: d_k = \frac{x_1 + \dots + x_k - k \, x_{k+1}}{\sqrt{k (k + 1)}},
 
-    independent of one another and each of one frame's variance; for two frames it is :math:`(x_1 - x_2) / \sqrt 2`.
+    which are independent and have the variance of one frame. For two frames this is :math:`(x_1 - x_2) / \sqrt 2`.
 
     Args:
-        frames: captures of one camera, two or more.
-        black: what to take for black instead of the first frame's.
+        frames: two or more captures of one camera.
+        black: black level that replaces the one in the first frame's file.
 
     Returns:
         Points, one for each channel and interval of level.
 
     Convention:
-        Light that drifts between frames changes a block's mean and slope only, which are not noise.
+        - Light that drifts between frames changes only the ramp fitted to a block, not the residuals.
 
     Source: EMVA Standard 1288, 4.0, section 6.5, for two frames.
     """
@@ -79,36 +79,32 @@ def temporal_points(frames: Sequence[RawCapture], black: Tensor | None = None) -
 
 
 def spatial_points(raw: RawCapture, black: Tensor | None = None) -> list[CurvePoint]:
-    """Return the curve's points from a single capture of any scene with some smooth areas of different brightness.
+    """Measure points of the photon-transfer curve from a single capture with smooth areas of different brightness.
 
     Args:
         raw: the capture.
-        black: what to take for black instead of the capture's.
+        black: black level that replaces the one in the capture's file.
 
     Returns:
-        Points, one for each channel and interval of level; few or none where texture is everywhere, or where the file
-        holds no raw noise (smoothed, or interpolated).
+        Points, one for each channel and interval of level. There are few or none if texture is everywhere, or if the
+        file has no raw noise because it was smoothed or interpolated.
 
     Convention:
-        Variance holds the sensor's fixed pattern too, which grows as the square of the level.
+        - The variance includes the sensor's fixed pattern, which grows as the square of the level.
     """
     level = _planes(raw, black)
     return _points(raw, level, [level], _clipped_blocks(raw), robust=True)
 
 
 def tile_of(raw: RawCapture) -> tuple[int, int]:
-    """Return the tile whose places are planes of their own: the filter array's, 2x2 without one."""
+    """Return the rows and columns of the tile by which a capture is split into planes: the filter array's, else 2x2."""
     return (2, 2) if raw.pattern is None else raw.tile
 
 
 def black_planes(raw: RawCapture, black: Tensor | None = None) -> Tensor:
-    """Return black of each plane of :func:`tile_of`, (planes, 1, 1) float64."""
-    own = (raw.black if black is None else black).double().cpu()
-    places = own.flatten() if raw.pattern is not None else own.flatten().repeat_interleave(4)
-    return places[:, None, None]
-
-
-# ---------------------------------------------------------------------- inside
+    """Return the black level of each plane of :func:`tile_of`, (planes, 1, 1) float64."""
+    levels = (raw.black if black is None else black).double().cpu().flatten()
+    return (levels if raw.pattern is not None else levels.repeat_interleave(4))[:, None, None]
 
 
 def _planes(raw: RawCapture, black: Tensor | None) -> Tensor:
@@ -116,26 +112,30 @@ def _planes(raw: RawCapture, black: Tensor | None) -> Tensor:
 
 
 def _side(raw: RawCapture) -> int:
-    """Side of a block in a plane: 16 pixels of a Bayer sensor, 24 of X-Trans."""
+    """Return the side of a block in pixels of a plane: 16 sensor pixels for Bayer arrays, 24 for X-Trans."""
     return 8 if max(tile_of(raw)) == 2 else 4
 
 
 def _blocks(planes: Tensor, side: int) -> Tensor:
-    """(P, H, W) to (P, blocks, side * side)."""
+    """Cut planes into blocks, (P, H, W) to (P, blocks, side * side)."""
     rows, columns = planes.shape[-2] // side, planes.shape[-1] // side
     whole = planes[:, : rows * side, : columns * side].reshape(len(planes), rows, side, columns, side)
     return whole.transpose(2, 3).reshape(len(planes), rows * columns, side * side)
 
 
 def _clipped_blocks(raw: RawCapture) -> Tensor:
-    """Tell which blocks (P, blocks) hold a count at either end of what the converter, or the sensor, reports."""
-    low, high = _rails(raw)
+    """Return which blocks have a clipped count, at black or at saturation, (P, blocks)."""
+    low, high = _clipping_counts(raw)
     counts = _blocks(tile_planes(raw.counts.cpu(), tile_of(raw)), _side(raw))
     return ((counts <= low) | (counts >= high)).any(-1)
 
 
-def _rails(raw: RawCapture) -> tuple[float, float]:
-    """Counts at which values pile up, whatever the file says: more than at the next one, and in 1e-4 of all pixels."""
+def _clipping_counts(raw: RawCapture) -> tuple[float, float]:
+    """Return the lowest and highest count at which values are clipped, found in the histogram.
+
+    An extreme count is a clipping count if it occurs in more than 1e-4 of all pixels, and more than twice as often as
+    the next one. The file's levels may be wrong.
+    """
     counts = raw.counts.flatten().cpu()
     values, sizes = torch.unique(counts, return_counts=True)
     many = 1e-4 * counts.numel()
@@ -151,41 +151,50 @@ def _rails(raw: RawCapture) -> tuple[float, float]:
 def _points(
     raw: RawCapture, level: Tensor, noises: Sequence[Tensor], clipped: Tensor, robust: bool
 ) -> list[CurvePoint]:
-    """Points of planes (P, H, W) of noise, by their level; several of noise share one of level."""
+    """Measure the curve's points from noise planes and their level plane.
+
+    Args:
+        raw: gives the filter array.
+        level: mean level, (P, H, W).
+        noises: planes of noise (P, H, W) that share this level.
+        clipped: blocks with clipped counts, (P, blocks).
+        robust: whether to take the median over blocks, as undetected texture requires, instead of a trimmed mean.
+    """
     side = _side(raw)
     freedom = side * side - 3
     levels = _blocks(level, side).mean(-1)
     if levels.numel() == 0:
         return []
-    judged = [_variance_and_whiteness(noise, side) for noise in noises]
-    variance = torch.stack([v for v, _ in judged], dim=-1)  # (P, blocks, noises)
-    white = torch.stack([w for _, w in judged], dim=-1)  # (blocks, noises)
+    tested = [_variance_and_whiteness(noise, side) for noise in noises]
+    variance = torch.stack([v for v, _ in tested], dim=-1)  # (P, blocks, noises)
+    white = torch.stack([w for _, w in tested], dim=-1)  # (blocks, noises)
     names = _channels(raw)
     points = []
     for name in dict.fromkeys(names):
-        mine = [k for k, other in enumerate(names) if other == name]
-        own_level, own_clipped = levels[mine].flatten(), clipped[mine].flatten()
-        own_variance = variance[mine].flatten(0, 1)
-        own_white = white.repeat(len(mine), 1)
-        interval = _intervals(own_level, own_variance[:, 0], side)
+        planes = [k for k, other in enumerate(names) if other == name]
+        channel_level, channel_clipped = levels[planes].flatten(), clipped[planes].flatten()
+        channel_variance = variance[planes].flatten(0, 1)
+        channel_white = white.repeat(len(planes), 1)
+        interval = _intervals(channel_level, channel_variance[:, 0], side)
         for k in interval.unique():
-            here = interval == k
-            if own_clipped[here].double().mean() > CLIPPED_BLOCKS:
+            inside = interval == k
+            if channel_clipped[inside].double().mean() > CLIPPED_BLOCKS:
                 continue
-            here &= ~own_clipped
-            values = own_variance[here][own_white[here]]
-            if len(values) < max(FEWEST_BLOCKS, LEAST_SHARE * int(here.sum()) * robust):
+            inside &= ~channel_clipped
+            values = channel_variance[inside][channel_white[inside]]
+            if len(values) < max(FEWEST_BLOCKS, LEAST_FRACTION * int(inside.sum()) * robust):
                 continue
-            seen = own_level[here][own_white[here].any(-1)]
+            accepted = channel_level[inside][channel_white[inside].any(-1)]
             center = _median_variance(values, freedom) if robust else _mean_variance(values)
-            points.append(CurvePoint(name, float(seen.mean()), center, freedom * len(values)))
+            points.append(CurvePoint(name, float(accepted.mean()), center, freedom * len(values)))
     return points
 
 
 def _intervals(level: Tensor, variance: Tensor, side: int) -> Tensor:
-    """Number the interval of each block's level. They are even in its root, as shot noise is.
+    """Return the index of the level interval of each block; intervals are equal in the square root of the level.
 
-    They are wider than the uncertainty of a level: sorted by its own noise, the same light would look like several.
+    An interval is wider than the uncertainty of a block's level. Otherwise noise alone would sort blocks of the same
+    level into several intervals.
     """
     top = max(float(level.max()), 1e-9)
     faint, strong = (float(variance.quantile(q)) ** 0.5 / side for q in (0.05, 0.95))  # uncertainty of the levels
@@ -196,39 +205,43 @@ def _intervals(level: Tensor, variance: Tensor, side: int) -> Tensor:
 
 
 def _variance_and_whiteness(noise: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Variance (P, blocks) about a plane fitted to each block, and which places look like noise (blocks,)."""
+    """Return the residual variance of each block, (P, blocks), and whether its residuals are white noise, (blocks,).
+
+    The residuals are those of a linear ramp fitted to the block in each plane.
+    """
     ramp = torch.arange(side, dtype=noise.dtype) - (side - 1) / 2
     ones = torch.ones_like(ramp)
     basis = torch.stack([torch.outer(a, b).flatten() for a, b in ((ones, ones), (ones, ramp), (ramp, ones))])
     basis = basis / basis.norm(dim=-1, keepdim=True)
-    together, alike, variances = torch.zeros(()), torch.zeros(()), []
-    for plane in noise:  # one at a time, as a picture of 20 million pixels makes large blocks
+    total, neighbours, variances = torch.zeros(()), torch.zeros(()), []
+    for plane in noise:  # one at a time, to save memory with pictures of 20 million pixels
         blocks = _blocks(plane[None], side)[0]
         rest = blocks - (blocks @ basis.T) @ basis
         energy = rest.square().sum(-1)
         variances.append(energy / (side * side - 3))
         unit = (rest / energy.clamp(min=1e-12).sqrt()[:, None]).unflatten(-1, (side, side))
-        together = together + unit
+        total = total + unit
         right = (unit[..., 1:] * unit[..., :-1]).sum((-2, -1))
         below = (unit[:, 1:] * unit[:, :-1]).sum((-2, -1))
-        alike = alike + right + below
+        neighbours = neighbours + right + below
     count = len(noise)
-    between = (together.square().sum((-2, -1)) - count) / (count * (count - 1))  # mean over pairs of planes
-    mean, deviation = _neighbors_of_noise(basis)
+    between = (total.square().sum((-2, -1)) - count) / (count * (count - 1))  # mean over pairs of planes
+    mean, deviation = _neighbor_correlation(basis)
     white = torch.ones_like(between, dtype=torch.bool)
-    for off in (
+    for correlation in (
         between / (2 / ((side * side - 3) * count * (count - 1))) ** 0.5,
-        (alike / count - mean) / (deviation / count**0.5),
+        (neighbours / count - mean) / (deviation / count**0.5),
     ):
-        white &= (off > LEAST_ALIKE) & (off < MOST_ALIKE)
+        white &= (correlation > LEAST_CORRELATION) & (correlation < MOST_CORRELATION)
     return torch.stack(variances), white
 
 
-def _neighbors_of_noise(basis: Tensor) -> tuple[float, float]:
-    """Mean and standard deviation of white noise's correlation with its neighbours right and below, in a block.
+def _neighbor_correlation(basis: Tensor) -> tuple[float, float]:
+    """Return mean and standard deviation of the correlation of neighbouring pixels, for white noise in a block.
 
-    Of r = x - (its part in the basis), the correlation is r' A r / |r|² with A the pairs of neighbours: a quadratic
-    form on the sphere of k dimensions, of mean tr(A) / k and variance 2 (k tr(A²) - tr(A)²) / (k² (k + 2)).
+    With r the residual of x after projection on the basis and A the matrix of neighbour pairs (right and below), the
+    correlation is r' A r / |r|². This is a quadratic form on the sphere of k dimensions, of mean tr(A) / k and variance
+    2 (k tr(A²) - tr(A)²) / (k² (k + 2)).
     """
     cells = basis.shape[-1]
     side = int(cells**0.5)
@@ -244,19 +257,22 @@ def _neighbors_of_noise(basis: Tensor) -> tuple[float, float]:
 
 
 def _median_variance(values: Tensor, freedom: int) -> float:
-    """Variance whose chi-squared law has this median (Wilson and Hilferty's): texture not found pulls it little."""
+    """Return the variance from the median over blocks, by Wilson and Hilferty's median of the chi-squared distribution.
+
+    A median is insensitive to blocks with undetected texture.
+    """
     return float(values.median()) / (1 - 2 / (9 * freedom)) ** 3
 
 
 def _mean_variance(values: Tensor) -> float:
-    """Mean without outliers, for noise of any law (quantized, few electrons): cosmic rays, something that moved."""
+    """Return the mean variance without outliers, such as cosmic rays or motion, for noise of any distribution."""
     middle = values.median()
     spread = 1.4826 * (values - middle).abs().median()
     return float(values[values <= middle + 8 * spread + 1e-9].mean())
 
 
 def _channels(raw: RawCapture) -> list[str]:
-    """Name the channel of each plane; the two greens are one."""
+    """Return the channel name of each plane; both greens have the same."""
     if raw.pattern is not None:
         return [raw.colors[index] for row in raw.pattern for index in row]
     return [name for name in raw.colors or "L" for _ in range(4)]

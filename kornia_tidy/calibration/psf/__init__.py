@@ -1,6 +1,7 @@
-"""From captures of points of light to the PSFs of a camera, and to the mask that makes them.
+"""PSF calibration: the PSFs of a camera measured from captures of point sources, and the mask retrieved from them.
 
-Raw captures of a point at several depths come in; a PSF bank or fitted masks go out. Read ``measured_psfs.py`` first.
+Captures of a point at several depths come in. A PSF bank with its uncertainty, or fitted masks, go out. Read
+``measured_psfs.py`` first.
 """
 
 from kornia_tidy.calibration.psf.dithering import ResolvedPSF, resolve_psf

@@ -1,4 +1,4 @@
-"""Several exposures of one thing merged into one, so that what is bright and what is faint are both measured."""
+"""Merging of exposures: several exposures of one scene give a linear image of high dynamic range."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ from torch import Tensor
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.sensor.noise import SensorNoise
 
-SATURATION = 0.95  # of full scale: above, noise may have been cut off
+SATURATION = 0.95  # of full scale; above, noise may have been clipped
 
 
 def capture_variance(signal: Tensor, sensor: SensorNoise) -> Tensor:
-    r"""Return the variance of the values that a sensor reports.
+    r"""Return the noise variance of a sensor's values.
 
     .. math:: \sigma^2 = \frac{s}{F} + \frac{d}{F^2} + \sigma_r^2 + \frac{q^2}{12}
 
-    with F electrons at full scale, d of dark signal, read noise and the converter's step q.
+    with F electrons at full scale, a dark signal of d electrons, the read noise and the converter's step q.
 
     Args:
         signal: s, mean values without noise, 1 at full scale.
-        sensor: its noise. Without a full well shot noise is taken for none.
+        sensor: noise parameters. Without a full well there is no shot noise.
+
+    Returns:
+        Variance in units of full scale squared, the shape of ``signal``.
 
     Source: EMVA Standard 1288, 4.0, section 2.
 
@@ -39,20 +42,22 @@ def capture_variance(signal: Tensor, sensor: SensorNoise) -> Tensor:
 def merge_exposures(
     frames: Tensor, exposures: Tensor, sensor: SensorNoise, saturation: float = SATURATION
 ) -> tuple[Tensor, Tensor]:
-    r"""Return the light per unit of exposure, each frame weighted by the inverse of its variance.
+    r"""Merge several exposures into the light per unit of exposure, weighted by inverse variance.
 
     .. math:: L = \frac{\sum_e w_e \, t_e y_e}{\sum_e w_e \, t_e^2}, \qquad w_e = 1 / \sigma^2(t_e L)
 
-    Variances follow the light found in a first round, not the noisy values, which would favour those that are too low.
+    The variances are computed from a first estimate of L. The noisy values themselves would give too much weight to
+    values that are too low by chance.
 
     Args:
-        frames: y, (..., E, C, H, W) linear, the black level taken off and 1 at full scale, not clamped below.
+        frames: y, (..., E, C, H, W) linear, black level subtracted, 1 at full scale, not clamped at zero.
         exposures: t, (E,) in seconds or any other unit, positive.
         sensor: noise of one frame.
-        saturation: values at or above are left out.
+        saturation: values at or above this are ignored.
 
     Returns:
-        L and its variance, (..., C, H, W) float64; where all frames are saturated, that of the shortest and infinity.
+        L and its variance, (..., C, H, W) float64. Where all frames are saturated, L is that of the shortest exposure
+        and the variance is infinite.
 
     Raises:
         TypeError: if the frames are not floating point.
@@ -81,5 +86,5 @@ def merge_exposures(
     weight = good / capture_variance(time * light.unsqueeze(-4), sensor).clamp(min=1e-300)
     information = (weight * time.square()).sum(-4)
     merged = (weight * time * value).sum(-4) / information.clamp(min=1e-300)
-    seen = information > 0
-    return torch.where(seen, merged, value.select(-4, shortest) / exposures[shortest]), 1 / information
+    measured = information > 0
+    return torch.where(measured, merged, value.select(-4, shortest) / exposures[shortest]), 1 / information

@@ -1,4 +1,4 @@
-"""PSFs measured over depth: a bank to render and to restore with, how sure it is, and what became of each capture."""
+"""Measured PSFs over depth: a PSF bank for rendering and restoration, its uncertainty, and a report on each capture."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.tensor_files import read_tensors
 
-MOST_MISFIT = 25.0  # residuals of five times the noise: more is no PSF of these captures
+MOST_MISFIT = 25.0  # residuals of five times the noise; with larger ones the PSF does not describe the captures
 
 
 @dataclass(frozen=True)
 class PointReport:
-    """What became of one point image.
+    """Report on one point image in the measurement.
 
     Args:
-        distance: of the point in metres.
-        row: where its chief ray fell, in pixels of the sensor.
-        column: as well.
-        brightness: over the mean of those used at this distance; None if it was never used.
-        misfit: mean square of its residuals in units of their variance, 1 is noise; None likewise.
-        rejected: why it was not used, or None.
+        distance: distance of the point in metres.
+        row: row of the chief ray, in pixels of the sensor.
+        column: column of the chief ray, in pixels of the sensor.
+        brightness: relative to the mean of the images used at this distance; None if the image has a fault.
+        misfit: mean square of the residuals in units of their variance, 1 for pure noise; None if the image has a
+            fault.
+        rejected: reason for which the image was not used, or None.
     """
 
     distance: float
@@ -53,11 +54,11 @@ class MeasuredPSFs:
     """PSFs measured over depth.
 
     Args:
-        bank: the PSFs, each summing to one: what light leaves the window is not seen and counted as none.
-        uncertainty: (D, C, P, P) standard deviation of each, of the noise in the captures. What else there is, such as
-            a point that moved between the frames, shows in the misfit of the reports.
-        distances: (D,) in metres, of the bank's nodes: from far to near.
-        reports: of every point image.
+        bank: the PSFs, each summing to one. Light outside the window was not measured and is ignored.
+        uncertainty: (D, C, P, P) standard deviation of each value from the noise of the captures. Other errors, such as
+            motion of the point between frames, appear in the misfit of the reports.
+        distances: (D,) distance in metres of each node of the bank, from far to near.
+        reports: one for each point image.
     """
 
     bank: PSFBank
@@ -75,7 +76,10 @@ class MeasuredPSFs:
             raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it all as safetensors, all or nothing; :meth:`PSFBank.load` reads the bank of it.
+        """Write the measurement as a safetensors file, whose bank :meth:`PSFBank.load` reads.
+
+        Args:
+            path: file to write; after an error no partial file remains.
 
         Raises:
             FileNotFoundError: if the folder does not exist.
@@ -85,16 +89,20 @@ class MeasuredPSFs:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> MeasuredPSFs:
-        """Read what :meth:`save` wrote.
+        """Read a measurement from a file written by :meth:`save`.
+
+        Args:
+            path: file to read.
+            device: device of the tensors.
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if the file is no PSF bank, or one that was not measured.
+            ValueError: if the file is not a PSF bank, or a bank that was not measured.
         """
         bank = PSFBank.load(path, device)
-        stored, notes = read_tensors(path, "PSF bank", device)
-        names = [name for name in ("measured.uncertainty", "measured.distances") if name in stored]
-        tensors = {name.removeprefix("measured."): stored[name] for name in names}
+        found, notes = read_tensors(path, "PSF bank", device)
+        names = [name for name in ("measured.uncertainty", "measured.distances") if name in found]
+        tensors = {name.removeprefix("measured."): found[name] for name in names}
         try:
             reports = tuple(PointReport(**report) for report in parse_json(notes.get("reports", "")))
             return cls(bank, reports=reports, **tensors)
@@ -103,14 +111,13 @@ class MeasuredPSFs:
 
 
 def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil | None = None) -> float:
-    r"""Return the highest frequency that a lens passes in any direction: :math:`d R p / (\lambda s')` cycles per pixel.
+    r"""Return the diffraction cutoff of a lens in cycles per pixel, :math:`d R p / (\lambda s')`.
 
     Args:
-        camera: the lens, with its aperture's radius R, image distance s' and pixel pitch p.
-        wavelength: the shortest in the channel, in metres.
-        pupil: its aperture, of which d is the largest distance between two open points in pupil radii. Default: that of
-            a lens with 23x23 mask pixels, whose corners reach beyond the disc: d = 2.14, along an axis 2.1, where the
-            disc has 2.
+        camera: lens with aperture radius R, image distance s' and pixel pitch p.
+        wavelength: shortest wavelength of the channel in metres.
+        pupil: aperture whose diameter d is the largest distance between two open points, in pupil radii. Default: that
+            of 23x23 mask pixels. Its corner pixels reach beyond the disc, so d is 2.14, and 2 for the disc.
 
     Source: Goodman, Introduction to Fourier Optics, section 7.2.
 
@@ -129,21 +136,24 @@ def measure_psfs(
     window: int,
     cutoff: float | Sequence[float] = 1.0,
 ) -> MeasuredPSFs:
-    """Return the PSFs that point images at known distances show.
+    """Measure a PSF bank from point images at known distances.
 
     Args:
-        images: of each distance in metres, from :func:`point_images`.
-        camera: what turns a distance into defocus.
-        window: side P of the PSFs in pixels of the sensor, that of the images.
+        images: point images from :func:`point_images` by their distance in metres.
+        camera: converts distance to defocus.
+        window: side P of the PSFs in pixels of the sensor, the same as for the images.
         cutoff: highest frequency that the lens passes in each channel, in cycles per pixel of the sensor, see
             :func:`diffraction_cutoff`.
 
+    Returns:
+        The PSFs, their uncertainty and a report on each image.
+
     Raises:
-        ValueError: if at some distance no image can be used, the PSFs found leave residuals of five times the noise
-            and more, or the cutoffs are not one a channel.
+        ValueError: if at some distance no image can be used or residuals exceed five times the noise, or if there is
+            not one cutoff for each channel.
 
     Warns:
-        UserWarning: if there are fewer images than frequencies that they are to tell apart, before any work.
+        UserWarning: if there are fewer images than aliased frequencies. The warning comes before any computation.
 
     Example:
         >>> from kornia_tidy import SensorNoise
@@ -162,15 +172,15 @@ def measure_psfs(
     nodes = sorted((float(camera.defocus(torch.tensor(z, dtype=torch.float64))), z) for z in images)
     psfs, deviations, reports = [], [], []
     for _, distance in nodes:
-        own = list(images[distance])
-        good = [image for image in own if image.fault is None]
+        all_images = list(images[distance])
+        good = [image for image in all_images if image.fault is None]
         reports += [
-            PointReport(distance, *(_finer(image) * x for x in image.place), None, None, image.fault)
-            for image in own
+            PointReport(distance, *(_upsampling(image) * x for x in image.place), None, None, image.fault)
+            for image in all_images
             if image.fault is not None
         ]
         if not good:
-            faults = "; ".join(str(image.fault) for image in own) or "there is none"
+            faults = "; ".join(str(image.fault) for image in all_images) or "there is none"
             raise ValueError(f"no point image at {distance:g} m can be used: {faults}")
         found = register(good, limits)
         misfit = float(found.misfit[found.used].mean())
@@ -195,8 +205,9 @@ def measure_psfs(
 
 
 def _limits(images: Mapping[float, Sequence[PointImage]], cutoff: float | Sequence[float]) -> list[float]:
-    """The cutoff of each channel."""
-    channels = 1 + max((channel for own in images.values() for image in own for channel in image.channels), default=0)
+    """Return the cutoff of each channel."""
+    every = (image for at_distance in images.values() for image in at_distance)
+    channels = 1 + max((channel for image in every for channel in image.channels), default=0)
     limits = [cutoff] * channels if isinstance(cutoff, (int, float)) else list(cutoff)
     if len(limits) != channels:
         raise ValueError(f"cutoff must be one number, or one for each of {channels} channels, got {limits}")
@@ -204,13 +215,13 @@ def _limits(images: Mapping[float, Sequence[PointImage]], cutoff: float | Sequen
 
 
 def _warn_of_few(images: Mapping[float, Sequence[PointImage]], limits: Sequence[float]) -> None:
-    """Tell once, of the distance and the channel that lack most, that the prior must make up for missing places."""
+    """Warn once, for the distance and channel that lack most images, that they do not determine the PSF."""
     lacking = []
-    for distance, own in images.items():
-        good = [image for image in own if image.fault is None]
+    for distance, at_distance in images.items():
+        good = [image for image in at_distance if image.fault is None]
         for channel, limit in enumerate(limits if good else ()):
-            planes = good[0].channels.count(channel)  # each sees the point at a place of its own
-            wanted = -(-most_aliases(limit * _finer(good[0])) // planes)
+            planes = good[0].channels.count(channel)  # each plane samples the point at another position
+            wanted = -(-most_aliases(limit * _upsampling(good[0])) // planes)
             lacking.append((wanted - len(good), wanted, len(good), distance, channel))
     if lacking and max(lacking)[0] > 0:
         _, wanted, there, distance, channel = max(lacking)
@@ -221,14 +232,14 @@ def _warn_of_few(images: Mapping[float, Sequence[PointImage]], limits: Sequence[
         )
 
 
-def _finer(image: PointImage) -> int:
-    """Pixels of the sensor to one of the image."""
+def _upsampling(image: PointImage) -> int:
+    """Return the pixels of the sensor for one pixel of the image along each axis."""
     return 1 if image.tile is None else len(image.tile)
 
 
 def _central(psf: Tensor, image: PointImage, window: int) -> Tensor:
-    """The window about the chief ray, which falls on the central pixel of the image."""
-    first = _finer(image) * (image.light.shape[-1] // 2) - window // 2
+    """Crop the PSF to the window around the chief ray, which falls on the central pixel of the image."""
+    first = _upsampling(image) * (image.light.shape[-1] // 2) - window // 2
     return psf[first : first + window, first : first + window]
 
 
@@ -237,9 +248,9 @@ def _reports(distance: float, images: Sequence[PointImage], found: Registered) -
     for n, image in enumerate(images):
         misfit = float(found.misfit[n])
         row, column = (
-            _finer(image) * (place - before + float(after))
+            _upsampling(image) * (place - before + float(after))
             for place, before, after in zip(image.place, image.offset, found.offsets[n], strict=True)
         )
-        words = None if found.used[n] else f"its residuals are {misfit**0.5:.1f} times the noise"
-        reports.append(PointReport(distance, row, column, float(found.brightness[n]), misfit, words))
+        rejected = None if found.used[n] else f"its residuals are {misfit**0.5:.1f} times the noise"
+        reports.append(PointReport(distance, row, column, float(found.brightness[n]), misfit, rejected))
     return reports

@@ -1,4 +1,4 @@
-"""The mask behind measured PSFs: heights, place and focus that our own optics need to make them."""
+"""Phase retrieval: masks, shifts and a defocus offset fitted to measured PSFs through the optical model."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import CodedLens
 
-POLISHING = 40  # steps of quasi-Newton at the end
-STEP = 2.5e-8  # metres of height that the first steps move, 0.15 rad
-ORDERS = 3  # whole waves that heights are looked for in, up and down
+POLISHING = 40  # L-BFGS steps after Adam
+STEP = 2.5e-8  # m; initial learning rate in height, 0.15 rad
+ORDERS = 3  # whole waves above and below within which heights are searched
 
 
 @dataclass(frozen=True, eq=False)
 class MaskFit:
-    """A physical model of measured PSFs.
+    """Result of a fit of the optical model to measured PSFs.
 
     Args:
-        lens: the lens with the masks found.
-        defocus_offset: what to add to the defocus of the measured nodes, in radians; found where the masks are fixed,
-            and else 0: masks that learn take it up.
-        shifts: (D, 2) rows and columns in pixels by which the measured PSFs lie off the chief ray, on average none.
-        psfs: (D, C, P, P) that the model makes, shifts and all.
-        residual: (D, C) relative L1, the sum of the moduli of what is left over that of the PSF.
+        lens: lens with the fitted masks.
+        defocus_offset: correction of the defocus of the measured nodes in radians. It is fitted if the masks are fixed,
+            and 0 otherwise, as learnable masks include it.
+        shifts: (D, 2) rows and columns in pixels from the chief ray to the centre of each measured PSF. For learnable
+            masks their mean is zero.
+        psfs: (D, C, P, P) PSFs of the model, shifts included.
+        residual: (D, C) relative L1 error: the sum of absolute differences over the sum of the PSF.
     """
 
     lens: CodedLens
@@ -46,28 +47,29 @@ class MaskFit:
 
 
 def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel: int | None = None) -> MaskFit:
-    r"""Fit masks to measured PSFs by gradient descent through the optics, from the masks as they are; they change.
+    r"""Fit the masks of a lens in place to measured PSFs, by gradient descent through the optical model.
 
     .. math:: \min \frac{1}{DC} \sum_{dc} \lVert \sqrt{h_{dc}} - \sqrt{m_{dc}} \rVert^2
 
-    Each depth has a shift of its own, as the place of its point is known only so well. Where no mask learns, because
-    what is shown on a modulator is known, the offset of defocus is found instead. Adam along a falling cosine gets
-    near, L-BFGS does the rest.
+    Each depth has its own shift, because the position of its point is known only approximately. If no mask is
+    learnable, because the masks on the modulator are known, a defocus offset is fitted instead. Adam with a cosine
+    schedule comes first, then L-BFGS.
 
     Args:
-        measured: PSFs that sum to one, at two depths or more: one depth does not tell a mask from its twin.
-        lens: masks, camera and spectrum to begin with.
-        iterations: gradient steps.
-        channel: fit this channel alone.
+        measured: PSFs that sum to one, at two depths or more. One depth does not distinguish a mask from its twin (the
+            conjugate, flipped by 180 degrees).
+        lens: initial masks, camera and spectrum.
+        iterations: steps of Adam.
+        channel: fit only this channel.
 
     Returns:
-        The fit, whose lens is the one given.
+        The fit, with the given lens.
 
     Raises:
         ValueError: if the channels are not those of the spectrum, or the iterations not positive.
 
-    Source: Fienup, Applied Optics 21(15) 2758 (1982), for amplitudes; Gonsalves, Optical Engineering 21, 829 (1982),
-    for the diversity that defocus gives.
+    Source: Fienup, Applied Optics 21(15) 2758 (1982), for the error in amplitudes; Gonsalves, Optical Engineering 21,
+    829 (1982), for phase diversity by defocus.
 
     Example:
         >>> small, spectrum = Fidelity("small", window=15), Spectrum.monochrome()
@@ -121,32 +123,32 @@ def retrieve_mask(
     good: float = 0.1,
     generator: torch.Generator | None = None,
 ) -> MaskFit:
-    r"""Find the one mask behind measured PSFs, of which nothing is known.
+    r"""Retrieve an unknown single mask from measured PSFs.
 
-    Each channel is fitted by itself first: in all at once, heights that are wrong by a wave are traps, since a wave of
-    green is none of red. What they say of each pixel, each up to whole waves of its own, fits together at one height;
-    from there all channels are fitted.
+    First each channel is fitted alone, which gives the phase up to whole waves of its wavelength. Then
+    :func:`one_height` combines these phases to one height, and a fit of all channels follows. A fit of all channels
+    from the start would have local minima at heights wrong by one wave, since a wave of green is not a wave of red.
 
     Args:
         measured: as for :func:`fit_masks`.
         camera: the lens.
         spectrum: wavelengths of the channels. Default: 610, 530 and 470 nm, one a channel.
         size: pixels of the mask along a side.
-        iterations: gradient steps of each fit.
-        starts: how often a channel is begun anew from other noise while its residual is not good.
-        good: residual, relative L1, that is.
+        iterations: steps of Adam in each fit.
+        starts: largest number of fits of a channel, each from other noise, until its residual is below ``good``.
+        good: residual, relative L1, at which a channel needs no further start.
         generator: source of the noise.
 
     Returns:
         The fit, with a lens of one mask.
 
     Raises:
-        ValueError: if the PSFs are at one depth alone, or of other channels than the spectrum.
+        ValueError: if the PSFs have only one depth, or their channels are not those of the spectrum.
 
     Source: Cheng and Wyant, Applied Optics 24(6) 804 (1985), for heights from phases at several wavelengths.
     """
     if len(measured.defocus) < 2:
-        raise ValueError("a mask is found of PSFs at two depths or more: one does not tell it from its twin")
+        raise ValueError(f"measured must have PSFs at two depths or more, got {len(measured.defocus)}")
     spectrum = Spectrum.rgb() if spectrum is None else spectrum
     fidelity = Fidelity("fit", window=measured.window)
     found = []
@@ -169,16 +171,17 @@ def retrieve_mask(
 
 
 def one_height(phases: Sequence[Tensor], factors: Sequence[float]) -> Tensor:
-    r"""Return the phase at 530 nm of the heights that fit phases known up to whole waves at several wavelengths.
+    r"""Unwrap phases known at several wavelengths to one height map, returned as phase at 530 nm.
 
     .. math:: \max_{c} \sum_j \max_{n_j} \sum_\lambda \cos(\varphi_{\lambda j} - s_\lambda \varphi_j - c_\lambda)
 
     Args:
-        phases: at each wavelength, of any one shape, each up to whole turns and a constant c of its own.
-        factors: s, from phase at 530 nm to phase at each wavelength.
+        phases: phase at each wavelength, all of the same shape. Each is known up to whole waves in every pixel j, and
+            up to a constant c.
+        factors: s, ratio of the phase at each wavelength to that at 530 nm.
 
     Returns:
-        :math:`\varphi` within :data:`ORDERS` turns either way of the first wavelength.
+        :math:`\varphi`, within :data:`ORDERS` waves of the first wavelength above and below the first phase.
 
     Example:
         >>> heights, factors = torch.linspace(0, 9, 50), [1.0, 530 / 610, 530 / 470]
@@ -200,25 +203,29 @@ def one_height(phases: Sequence[Tensor], factors: Sequence[float]) -> Tensor:
 
 
 class _Model:
-    """The PSFs that a lens makes at the measured depths, with shifts and an offset to learn."""
+    """Optical model of the measured PSFs, with learnable shifts and a learnable defocus offset."""
 
     def __init__(self, measured: PSFBank, lens: CodedLens, channel: int | None) -> None:
         self.lens, self.nodes, self.centre = lens, measured.defocus.tolist(), 0.0
         self.learning = any(parameter.requires_grad for parameter in lens.masks.parameters())
         weights = lens.spectrum.weights if channel is None else (lens.spectrum.weights[channel],)
-        self.spectrum = _lit(Spectrum(lens.spectrum.wavelengths, weights))
+        self.spectrum = _without_unused(Spectrum(lens.spectrum.wavelengths, weights))
         self.target = measured.psfs if channel is None else measured.psfs[:, channel : channel + 1]
-        self.floor = 1e-3 / measured.window**2  # of light, below which no amplitude is told from another
+        self.floor = 1e-3 / measured.window**2  # added to intensities, so that noise near zero has little weight
         self.shifts = torch.zeros(len(self.nodes), 2, requires_grad=True)
         self.offset = torch.zeros((), requires_grad=True)
         camera = lens.camera
         self.step = camera.pixel_pitch * camera.aperture_radius / float(camera.image_distance)
         x = mask_coordinates(min(lens.masks.phase.shape[-2:])).float()
-        self.tilts = 2 * math.pi * self.step / REFERENCE_WAVELENGTH * x  # moves the PSF by a pixel
-        self.bowl = x[:, None] ** 2 + x**2
+        self.tilts = 2 * math.pi * self.step / REFERENCE_WAVELENGTH * x  # shifts the PSF by one pixel
+        self.quadratic = x[:, None] ** 2 + x**2
 
     def psfs(self) -> Tensor:
-        """Shifts and small offsets as steps of phase from mask pixel to mask pixel; what is large is in the nodes."""
+        """Return the model's PSFs, (D, C, P, P).
+
+        Shifts and a small offset are added to the phase of the mask pixels. A large offset would be inaccurate on the
+        pixel grid, so :meth:`settle` moves it to the defocus nodes.
+        """
         states, weights = self.lens.modulator(self.lens.masks.phase.float())
         states = central_square(states)
         waves = self.spectrum.wavelengths
@@ -227,7 +234,7 @@ class _Model:
         shifts = self.shifts - self.shifts.mean(0) if self.learning else self.shifts
         psfs = []
         for node, (down, right) in zip(self.nodes, shifts.unbind(), strict=True):
-            ramp = down * self.tilts[:, None] + right * self.tilts + self.offset * self.bowl
+            ramp = down * self.tilts[:, None] + right * self.tilts + self.offset * self.quadratic
             bank = exact_psf_bank(
                 states + ramp,
                 weights,
@@ -249,7 +256,7 @@ class _Model:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Put the offset into the nodes once it is no longer small, where it is exact."""
+        """Move the defocus offset to the nodes, where it is exact, if it is no longer small."""
         if abs(float(self.offset)) > 0.25:
             self.centre += float(self.offset)
             self.offset.zero_()
@@ -264,11 +271,11 @@ class _Model:
         return MaskFit(self.lens, self.centre, shifts.detach().clone(), psfs, residual)
 
 
-def _lit(spectrum: Spectrum) -> Spectrum:
-    """Leave out wavelengths that no channel sees."""
-    seen = [w for w in range(len(spectrum.wavelengths)) if any(channel[w] for channel in spectrum.weights)]
+def _without_unused(spectrum: Spectrum) -> Spectrum:
+    """Return the spectrum without the wavelengths that have no weight in any channel."""
+    used = [w for w in range(len(spectrum.wavelengths)) if any(channel[w] for channel in spectrum.weights)]
     return Spectrum(
-        tuple(spectrum.wavelengths[w] for w in seen), tuple(tuple(c[w] for w in seen) for c in spectrum.weights)
+        tuple(spectrum.wavelengths[w] for w in used), tuple(tuple(c[w] for w in used) for c in spectrum.weights)
     )
 
 

@@ -1,4 +1,4 @@
-"""The image of one point of light, cut out of a capture and ready to be measured."""
+"""Point images: crops of a capture around each point source, with background subtracted and noise variance."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from kornia_tidy.calibration.psf.points import (
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.sensor.noise import SensorNoise
 
-MARGIN = 8  # pixels around the window, in which moving an image by parts of a pixel may ring
-LEAST_SIGNAL = 10.0  # of a point's light over its noise
-Tile = tuple[tuple[int, ...], ...]  # which channel each pixel of a filter array's square tile sees, by rows
+MARGIN = 8  # pixels around the window, where a sub-pixel shift of an image may ring
+LEAST_SIGNAL = 10.0  # ratio of a point's light to its noise
+Tile = tuple[tuple[int, ...], ...]  # channel of each pixel in a filter array's square tile, by rows
 
 
 @dataclass(frozen=True, eq=False)
 class PointImage:
-    """One point of light on the sensor.
+    """Image of one point source.
 
     Args:
-        place: row and column in the frame, in its pixels, where the chief ray falls as far as is known.
-        light: (C, M, M) about the nearest pixel, the background taken off, per unit of exposure.
-        variance: (C, M, M).
-        tile: of the filter array whose planes these channels are, or None.
-        fault: why it is of no use, or None.
+        place: estimated row and column of the chief ray, in pixels of the frame.
+        light: (C, M, M) centred on the pixel nearest to the chief ray, background subtracted, per unit of exposure.
+        variance: (C, M, M) noise variance of ``light``.
+        tile: tile of the filter array if the C planes are those of a mosaic, or None.
+        fault: reason for which the image cannot be used, or None.
     """
 
     place: tuple[float, float]
@@ -43,17 +43,17 @@ class PointImage:
 
     @property
     def offset(self) -> tuple[float, float]:
-        """Where the chief ray falls, from the centre of the nearest pixel."""
+        """Position of the chief ray relative to the centre of the nearest pixel, (row, column)."""
         return self.place[0] - round(self.place[0]), self.place[1] - round(self.place[1])
 
     @property
     def phases(self) -> Tensor:
-        """How far down and right of the first plane's pixels those of each plane lie, (C, 2), in pixels of a plane."""
+        """Offset of each plane's pixels from those of the first plane, down and right, (C, 2), in pixels of a plane."""
         return _phases(self.tile, len(self.light))
 
     @property
     def channels(self) -> list[int]:
-        """Which channel each plane sees."""
+        """Channel of each plane."""
         return list(range(len(self.light))) if self.tile is None else [channel for row in self.tile for channel in row]
 
 
@@ -67,24 +67,24 @@ def point_images(
     tile: Tile | None = None,
     saturation: float = SATURATION,
 ) -> list[PointImage]:
-    """Return the images of the points in one capture, a frame or several exposures that nothing moved between.
+    """Cut out the images of the points in one capture, which has one or several exposures of a static scene.
 
     Args:
-        frames: (E, C, H, W) linear, the black level taken off and 1 at full scale. Of a mosaic the planes, as
-            :meth:`RawCapture.planes` gives them.
+        frames: (E, C, H, W) linear, black level subtracted, 1 at full scale. For a mosaic these are the planes that
+            :meth:`RawCapture.planes` returns.
         exposures: (E,) in seconds or any other unit.
         sensor: noise of one frame.
-        window: side P of the PSF to be measured in pixels of the sensor, odd. The background is that between P and
-            1.5 P pixels of the point.
-        points: how many points there are.
-        reference: (C, H, W) of the same points at the same places, nowhere saturated, the modulator flat: then each
-            point's place is the centre of that light, which is symmetric. Else it is the centre of the coded light.
-        tile: of a mosaic, the channel that each pixel of its tile sees: ``((0, 1), (1, 2))`` for RGGB. Planes of one
-            channel then make one PSF together, on the pixels of the sensor.
-        saturation: values at or above are left out.
+        window: side P of the PSF to be measured, in pixels of the sensor, odd. The background is measured at distances
+            from P to 1.5 P pixels.
+        points: number of points.
+        reference: (C, H, W) capture of the same points with a flat modulator, without saturation. A point's position
+            is then the centre of this light, which is symmetric. Without it, it is the centre of the coded light.
+        tile: for a mosaic, the channel of each pixel in its tile: ``((0, 1), (1, 2))`` for RGGB. Planes of one
+            channel together give one PSF, on the pixels of the sensor.
+        saturation: values at or above this are ignored.
 
     Returns:
-        One image a point. Those cut short, saturated in the shortest exposure too, or too faint, have a fault.
+        One image for each point. It has a fault if it is cropped by the frame, saturated in every exposure, or faint.
 
     Raises:
         TypeError: if the frames are not floating point.
@@ -113,7 +113,7 @@ def point_images(
 
 
 def plane_window(window: int, tile: Tile | None) -> int:
-    """Return the odd side of the window that holds one of the sensor's pixels, in pixels of a mosaic's plane.
+    """Convert the side of a window from pixels of the sensor to pixels of a mosaic's plane, rounded up to odd.
 
     Example:
         >>> plane_window(41, None), plane_window(41, ((0, 1), (1, 2))), plane_window(43, ((0, 1), (1, 2)))
@@ -155,17 +155,17 @@ def _point_image(
             clear = clear - annulus_background(clear, near, window, 1.5 * window)[:, None, None]
         places = torch.tensor([centre(channel[None], near, window) for channel in clear], dtype=torch.float64)
         places = places + _phases(tile, len(places))
-        share = cut_out(clear, near, window).sum((1, 2)).clamp(min=0)
-        row, column = (share @ places / share.sum()).tolist()
+        weight = cut_out(clear, near, window).sum((1, 2)).clamp(min=0)
+        row, column = (weight @ places / weight.sum()).tolist()
         nearest = round(row), round(column)
         light, variance = (cut_out(x, nearest, side) for x in (light, variance))
     except ValueError as error:
         empty = torch.zeros(frames.shape[1], side, side, dtype=torch.float64)
         return PointImage((float(start[0]), float(start[1])), empty, empty, tile, str(error))
-    blind = ~variance.isfinite()
+    saturated = ~variance.isfinite()
     fault = None
-    if bool(blind.any()):
-        fault = f"{int(blind.any(0).sum())} pixels are saturated in every exposure"
+    if bool(saturated.any()):
+        fault = f"{int(saturated.any(0).sum())} pixels are saturated in every exposure"
     else:
         signal = float((light.sum((1, 2)) / variance.sum((1, 2)).sqrt()).min())
         if signal < LEAST_SIGNAL:

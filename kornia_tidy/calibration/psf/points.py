@@ -1,4 +1,4 @@
-"""Points of light in a picture: where they are, and the light around them."""
+"""Detection of point sources in a picture, their centres, and the background around them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from kornia_tidy.psf.psf_bank import enclosing_window
 
 
 def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]:
-    """Return the pixels about which the light of the brightest points lies, brightest first.
+    """Detect the brightest points of a picture, brightest first.
 
     Args:
         image: (H, W) linear light.
-        count: how many points to look for.
-        window: side in pixels of the square that a point's light fills; the next point lies outside.
+        count: number of points.
+        window: side in pixels of the square that a point's light fills. Other points lie outside of it.
 
     Returns:
-        Row and column of each.
+        Row and column of the pixel at the centre of each point's light.
 
     Raises:
         ValueError: if the picture is smaller than the window, or has no room for that many points.
@@ -36,7 +36,7 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
     if window > min(height, width):
         raise ValueError(f"a window of {window} pixels does not fit into a picture of {height}x{width}")
     value = image.double() - image.double().median()
-    # Half the window's light is enough to see, and where a blunt box would be flat two passes of it have a peak.
+    # A box of half the window collects enough light. Two passes give a peak where one would give a plateau.
     box = max(1, window // 4) * 2 + 1
     smooth = value[None, None]
     for _ in range(2):
@@ -54,22 +54,22 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
 
 
 def annulus_background(image: Tensor, centre: tuple[float, float], inner: float, outer: float) -> Tensor:
-    """Return the light around a point that is not its own: the mean of a ring, without what stands out from it.
+    """Return the background around a point: the mean over an annulus without outliers.
 
-    Values further than three standard deviations from the median, itself estimated by the median deviation, are left
-    out. (The median alone would be a whole step of the converter where the background is even.)
+    Values farther from the median than three standard deviations, estimated by the median absolute deviation, are
+    rejected. The median itself would not do, because in an even background it is rounded to a step of the converter.
 
     Args:
         image: (C, H, W) linear light.
-        centre: row and column of the ring's centre.
-        inner: its inner radius in pixels.
-        outer: its outer radius in pixels.
+        centre: row and column of the annulus' centre.
+        inner: inner radius in pixels.
+        outer: outer radius in pixels.
 
     Returns:
-        (C,) of what lies in the picture.
+        (C,) mean over the part of the annulus within the picture.
 
     Raises:
-        ValueError: if fewer than 32 pixels do.
+        ValueError: if fewer than 32 pixels are within the picture.
 
     Example:
         >>> image = torch.full((1, 32, 32), 0.1)
@@ -92,24 +92,24 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
 
 
 def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:
-    r"""Return the centre of mass of the light in a window that follows it: first moments, all channels together.
+    r"""Return the centroid of the light in a window that is re-centred on it, over all channels together.
 
     .. math:: c = \sum_p p \, y_p \Big/ \sum_p y_p
 
     Args:
-        image: (C, H, W), background taken off; a part of it may be negative.
-        start: row and column near it.
+        image: (C, H, W), background subtracted; noise may make values negative.
+        start: row and column near the centroid.
         window: side in pixels, odd.
 
     Returns:
         Row and column.
 
     Raises:
-        ValueError: if the window leaves the picture or holds no light.
+        ValueError: if the window leaves the picture or has no light.
 
     Convention:
-        - Moments say where the light is, not where the chief ray is. Defocus behind an aperture that is alike on all
-          sides does not move them, a mask does; so do the borders of the window where much light crosses them.
+        - The centroid of the light is not the position of the chief ray. With a symmetric aperture defocus does not
+          move the centroid, but a mask does, and so does light cropped by the window.
 
     Example:
         >>> image = torch.zeros(1, 9, 9)
@@ -134,23 +134,23 @@ def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple
 
 
 def centre_of_symmetry(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:
-    """Return the centre of light that looks alike from both sides: first moments under a Gaussian that moves along.
+    """Return the centre of a symmetric spot: its centroid under a Gaussian weight that is re-centred on it.
 
-    The Gaussian is as wide as the light, so that the noise of a wide window does not count, and unlike a window of
-    whole pixels it is centred on the light itself in the end.
+    The Gaussian is as wide as the light, so the noise of a wide window has little weight. Unlike a window of whole
+    pixels it ends exactly centred on the light.
 
     Args:
-        image: (C, H, W), background taken off.
-        start: row and column near it.
-        window: side in pixels, odd, that holds the light.
+        image: (C, H, W), background subtracted.
+        start: row and column near the centre.
+        window: side in pixels, odd, of a square with all the light.
 
     Returns:
         Row and column.
 
     Raises:
-        ValueError: if the window leaves the picture or holds no light.
+        ValueError: if the window leaves the picture or has no light.
 
-    Source: Bernstein and Jarvis, The Astronomical Journal 123, 583 (2002), for moments weighted by what fits them.
+    Source: Bernstein and Jarvis, The Astronomical Journal 123, 583 (2002), for moments with a matched weight.
 
     Example:
         >>> x = torch.arange(33.0)
@@ -169,7 +169,7 @@ def centre_of_symmetry(image: Tensor, start: tuple[int, int], window: int) -> tu
         down, right = (torch.exp(-((steps - at) ** 2) / (2 * width**2)) for at in (row, column))
         weighted = light * down[:, None] * right
         total = weighted.sum()
-        # Of light as wide as the Gaussian these moments are half way to its centre.
+        # For light as wide as the Gaussian these moments are half the distance to its centre.
         move_down = 2 * float((weighted.sum(1) @ (steps - row)) / total)
         move_right = 2 * float((weighted.sum(0) @ (steps - column)) / total)
         row, column = row + move_down, column + move_right
@@ -179,10 +179,15 @@ def centre_of_symmetry(image: Tensor, start: tuple[int, int], window: int) -> tu
 
 
 def cut_out(image: Tensor, centre: tuple[int, int], side: int) -> Tensor:
-    """Return a square of a picture about a pixel, (..., side, side); the pixel becomes that at ``side // 2``.
+    """Crop a square around a pixel, (..., side, side); the pixel is at index ``side // 2`` of the crop.
+
+    Args:
+        image: (..., H, W).
+        centre: row and column of the pixel.
+        side: side of the square in pixels.
 
     Raises:
-        ValueError: if it leaves the picture.
+        ValueError: if the square leaves the picture.
 
     Example:
         >>> cut_out(torch.arange(25).view(5, 5), (2, 3), 3)

@@ -1,4 +1,4 @@
-"""Point images of one distance brought together: their places between the pixels refined, the odd ones left out."""
+"""Registration of point images at one distance: sub-pixel positions, brightness, and rejection of outliers."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from torch import Tensor
 from kornia_tidy.calibration.psf.dithering import ResolvedPSF, resolve_psf
 from kornia_tidy.calibration.psf.point_images import MARGIN, PointImage
 
-ROUNDS, SMALL_STEP = 8, 5e-4  # of brightness, and in pixels
-LEAST_MISFIT, BETTER = 1.5, 0.7  # an image is odd where the mean misfit is above, and without it smaller by this
-LEAST_IMAGES = 4  # of which one can be odd
+ROUNDS, SMALL_STEP = 8, 5e-4  # the step is relative in brightness and in pixels in position
+# An image is an outlier if the mean misfit exceeds the first value, and without it falls below the second times that.
+LEAST_MISFIT, IMPROVEMENT = 1.5, 0.7
+LEAST_IMAGES = 4  # with fewer, no outlier can be identified
 INSIDE = slice(MARGIN, -MARGIN)
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """What point images of one distance say together.
+    """PSFs of one distance, with the registration of the point images that they were measured from.
 
     Args:
-        psfs: of each channel, on the pixels of the sensor.
-        brightness: (N,) of each image, on average one.
-        offsets: (N, 2) of its chief ray from the centre of its pixel.
-        misfit: (N,) mean square of its residuals in units of their variance.
-        used: (N,) whether it was used.
+        psfs: PSF of each channel, on the pixels of the sensor.
+        brightness: (N,) relative brightness of each image, with a mean of one.
+        offsets: (N, 2) position of each image's chief ray relative to the centre of its pixel.
+        misfit: (N,) mean square of each image's residuals in units of their variance.
+        used: (N,) whether each image was used.
     """
 
     psfs: list[ResolvedPSF]
@@ -37,15 +38,18 @@ class Registered:
 
 
 def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registered:
-    """Find the PSFs of each channel together with the place and the brightness of each image.
+    """Register point images: estimate the PSF of each channel, and the position and brightness of each image.
 
-    Rounds of two steps: PSFs for these places by :func:`resolve_psf`; then places and brightness for these PSFs by
-    Gauss and Newton's step. The places as a whole stay where they are, as no image tells a PSF that is off its centre
-    from a point that is. An image without which the others fit each other far better is left out.
+    Each round has two steps: the PSFs for given positions by :func:`resolve_psf`, then positions and brightness for
+    given PSFs by a Gauss-Newton step. The mean position stays fixed, because a shift of the PSF and a common shift of
+    all points give the same images. An image is rejected if the others fit each other far better without it.
 
     Args:
-        images: N without fault.
+        images: N images without fault.
         cutoff: highest frequency that the lens passes in each channel, in cycles per pixel of the sensor.
+
+    Returns:
+        The PSFs and the registration.
 
     Source: Anderson and King, Publications of the Astronomical Society of the Pacific 112, 1360 (2000).
     """
@@ -63,24 +67,24 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
             offsets = offsets + step[:, 1:].clamp(-0.5, 0.5)
             if float(step[used].abs().max()) < SMALL_STEP:
                 break
-        odd = _odd_one(stack, offsets, brightness, used, fit)
-        if odd is None:
+        outlier = _outlier(stack, offsets, brightness, used, fit)
+        if outlier is None:
             return Registered(
                 stack.resolve(offsets, brightness, used, final=True), brightness, offsets, fit.misfit, used
             )
-        used[odd] = False
+        used[outlier] = False
 
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """The images of one distance, (N, C, M, M), whose planes of one channel share a PSF."""
+    """Point images of one distance, (N, C, M, M). Planes of the same channel share a PSF."""
 
     light: Tensor
     variance: Tensor
     phases: Tensor
     channels: list[int]
     cutoff: Sequence[float]
-    finer: int
+    upsampling: int
 
     @classmethod
     def of(cls, images: Sequence[PointImage], cutoff: Sequence[float]) -> _Stack:
@@ -89,63 +93,68 @@ class _Stack:
         return cls(light, variance, images[0].phases, images[0].channels, cutoff, 1 if tile is None else len(tile))
 
     def resolve(self, offsets: Tensor, brightness: Tensor, used: Tensor, final: bool = False) -> list[ResolvedPSF]:
-        """PSFs of each channel for images of these places and brightness, in the end with all that can be known."""
+        """Return the PSF of each channel for given positions and brightness of the images.
+
+        The final PSFs are on the pixels of the sensor and use weights for each pixel. The others are on the pixels of
+        a plane and assume white noise, which is faster.
+        """
         scale = brightness[used].view(-1, 1, 1, 1)
         light, variance = self.light[used] / scale, self.variance[used] / scale**2
-        places = offsets[used, None] - self.phases  # (N, C, 2)
+        positions = offsets[used, None] - self.phases  # (N, C, 2)
         psfs = []
         for channel, limit in enumerate(self.cutoff):
-            own = [plane for plane, seen in enumerate(self.channels) if seen == channel]
-            parts = (x[:, own].flatten(0, 1) for x in (light, places, variance))
-            psfs.append(resolve_psf(*parts, limit * self.finer, self.finer if final else 1, each_pixel=final))
+            planes = [plane for plane, other in enumerate(self.channels) if other == channel]
+            parts = (x[:, planes].flatten(0, 1) for x in (light, positions, variance))
+            upsampling = self.upsampling if final else 1
+            psfs.append(resolve_psf(*parts, limit * self.upsampling, upsampling, each_pixel=final))
         return psfs
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The steps (N, 3) of brightness, row and column that residuals ask for, and how large the residuals are."""
+    """Gauss-Newton steps (N, 3) of brightness, row and column, and the mean square residuals (N,)."""
 
     step: Tensor
     misfit: Tensor
 
 
 def _fit(stack: _Stack, offsets: Tensor, brightness: Tensor, used: Tensor) -> _Fit:
-    """Return what the residuals of PSFs for these places and brightness say of each image."""
+    """Return the Gauss-Newton step of each image, after a fit of the PSFs to the current positions and brightness."""
     psfs = stack.resolve(offsets, brightness, used)
     scale = brightness.view(-1, 1, 1, 1)
     count = len(stack.channels)
     normal, right = torch.zeros(len(offsets), 3, 3).double(), torch.zeros(len(offsets), 3).double()
     misfit, leverage = torch.zeros(len(offsets)).double(), 0.0
     for plane, channel in enumerate(stack.channels):
-        image, slopes = psfs[channel].seen_from(offsets - stack.phases[plane])
-        design = torch.cat([image[:, None], slopes], 1)[..., INSIDE, INSIDE].flatten(2)  # (N, 3, pixels)
+        image, gradient = psfs[channel].images_at(offsets - stack.phases[plane])
+        design = torch.cat([image[:, None], gradient], 1)[..., INSIDE, INSIDE].flatten(2)  # (N, 3, pixels)
         light, variance = (
             x[:, plane, INSIDE, INSIDE].flatten(1) for x in (stack.light / scale, stack.variance / scale**2)
         )
         residual = light - design[:, 0]
-        # White noise, as resolve_psf takes it: other weights are not minimized by both steps, and need not converge.
+        # White noise, as resolve_psf assumes it. Both steps must minimise the same error for the rounds to converge.
         weighted = design / variance.mean(1)[:, None, None]
         normal = normal + weighted @ design.mT
         right = right + (weighted @ residual[..., None])[..., 0]
         misfit = misfit + (residual.square() / variance).mean(1) / count
         leverage += psfs[channel].leverage / count
-    # What an image decides of the PSF is no residual.
+    # The fit adapts the PSF to each image's own noise, which lowers the residuals by the leverage.
     return _Fit(torch.linalg.solve(normal, right), torch.where(used, misfit / max(1 - leverage, 0.1), misfit))
 
 
-def _odd_one(stack: _Stack, offsets: Tensor, brightness: Tensor, used: Tensor, fit: _Fit) -> int | None:
-    """Return the image without which the others fit each other far better, if there is one.
+def _outlier(stack: _Stack, offsets: Tensor, brightness: Tensor, used: Tensor, fit: _Fit) -> int | None:
+    """Return the index of the outlier, the image without which the others fit each other far better, or None.
 
-    It need not be the one with the largest residuals: few images follow one that is wrong.
+    It need not have the largest residuals, because with few images the PSF adapts to the outlier.
     """
     before = float(fit.misfit[used].mean())
     if before < LEAST_MISFIT or int(used.sum()) < LEAST_IMAGES:
         return None
     candidates = used.nonzero().flatten().tolist()
-    left = []
+    misfits = []
     for candidate in candidates:
         others = used.clone()
         others[candidate] = False
-        left.append(float(_fit(stack, offsets, brightness, others).misfit[others].mean()))
-    best = min(left)
-    return candidates[left.index(best)] if best < BETTER * before else None
+        misfits.append(float(_fit(stack, offsets, brightness, others).misfit[others].mean()))
+    best = min(misfits)
+    return candidates[misfits.index(best)] if best < IMPROVEMENT * before else None

@@ -1,4 +1,4 @@
-"""Noise of a measured PSF taken back where it holds no light: most of a window is nearly empty, and all of it noisy."""
+"""Denoising of measured PSFs: shrinkage towards local means, because most of a window has noise but little light."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ SCALES = (15, 5, 1)  # pixels along a side
 
 
 def shrink(psf: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return each value moved to the mean of its surroundings, the more the less these differ beyond the noise.
+    r"""Denoise a measured PSF by shrinking each value towards a local mean, by a local signal-to-noise ratio.
 
     .. math:: \hat{h}_n = \hat{h}_{n+1} + g \, (m_n - \hat{h}_{n+1}), \qquad g = \frac{s^2}{s^2 + \bar{v}_n}
 
-    with :math:`m_n` the means of ever smaller neighbourhoods down to the pixel itself, :math:`v_n` the variance of
-    their noise, and :math:`s^2` the mean square of what they differ by, less that of the noise, or zero. Bright
-    structure keeps its noise, for its g is near one; empty parts get the mean of a wide neighbourhood, so that no light
-    is lost.
+    Here :math:`m_n` are the means of smaller and smaller neighbourhoods down to the pixel itself, and :math:`v_n` the
+    variance of their noise. The signal :math:`s^2` is the mean square of :math:`m_n - \hat{h}_{n+1}` minus that of the
+    noise, or zero. Bright structure has g near one and hardly changes. Empty parts get the mean of a wide
+    neighbourhood, so no light is lost.
 
     Args:
         psf: h, (C, M, M).

@@ -1,4 +1,4 @@
-"""Captures of even light as NumPy draws them: Poisson electrons, Gaussian read noise, rounded counts."""
+"""Simulated flat fields by NumPy: Poisson electrons, Gaussian read noise, rounded counts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def flat(
     vignetting=0.2,
     info=None,
 ):
-    """One capture of a sheet that darkens towards the corners, by a sensor whose pixels differ."""
+    """Return a flat field with vignetting and fixed pattern noise."""
     y = np.linspace(-1, 1, side)
     light = np.broadcast_to(electrons, (channels, side, side)) * (1 - vignetting * (y[:, None] ** 2 + y**2) / 2)
     light = light * np.random.default_rng(1).normal(1, fixed_pattern, (channels, side, side))
@@ -35,6 +35,6 @@ def flat(
 
 
 def flats(rng, gain, read_noise, levels=LEVELS, *, black=256, white=4095, **options):
-    """Pairs of them, from darkness on."""
+    """Return pairs of flat fields at rising levels, the first two dark."""
     full = gain * (white - black)
     return [flat(rng, full * level, gain, read_noise, black=black, white=white, **options) for level in levels]

@@ -1,4 +1,4 @@
-"""Photon transfer against cameras that NumPy plays, lines that SciPy fits, and real raw files."""
+"""Photon transfer against cameras simulated by NumPy, lines fitted by SciPy, and real raw files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LINE = TransferLine(2.0, 0.01, 6.0, 0.1, 0.0, 0.999, 10000)
 
 
 def curve(gain, read_noise, levels, seed=None, samples=20000, fixed_pattern=0.0):
-    """Points of a camera, with the scatter of so many samples."""
+    """Return points of a camera's photon-transfer curve, with the scatter of a number of samples."""
     levels = np.asarray(levels, dtype=float)
     variance = levels / gain + (read_noise / gain) ** 2 + 1 / 12 + (fixed_pattern * levels) ** 2
     if seed is not None:
@@ -74,17 +74,17 @@ class TestFitLine(BaseTester):
         line, clean = fit_line(spoilt), fit_line(points)
         assert line.gain == pytest.approx(clean.gain, rel=0.01)
         assert line.read_noise == pytest.approx(clean.read_noise, rel=0.02)
-        assert line.r_squared < 0.9 < clean.r_squared  # outliers are not hidden
+        assert line.r_squared < 0.9 < clean.r_squared  # R² includes the outliers
 
     def test_feature_fixed_pattern_is_told_from_shot_noise(self):
         points = curve(2.5, 8.0, np.geomspace(20, 3000, 40), seed=1, fixed_pattern=0.01)
         line = fit_line(points, fixed_pattern=True)
         assert line.fixed_pattern == pytest.approx(0.01, rel=0.05)
         assert line.gain == pytest.approx(2.5, rel=0.02)
-        assert fit_line(points).gain < 0.92 * 2.5  # a line alone takes it for shot noise
+        assert fit_line(points).gain < 0.92 * 2.5  # a straight line takes the fixed pattern for shot noise
 
     def test_feature_rounding_takes_what_it_hides_out_of_the_fit(self):
-        """Far below a count the converter writes the same number always: such a point says nothing."""
+        """With noise far below a count the converter always gives the same value, so the point has no information."""
         points = curve(20.0, 3.0, np.geomspace(20, 3000, 10))
         line = fit_line([*points, CurvePoint("L", 0.0, 0.0, 10**6)])
         assert line.read_noise == pytest.approx(3.0, rel=1e-6)
@@ -114,7 +114,7 @@ class TestPhotonTransfer(BaseTester):
         seed=st.integers(0, 2**32 - 1),
     )
     def test_feature_gain_and_read_noise_come_back_to_3_percent(self, gain, read_noise, bits, pattern, seed):
-        """Read noise below half a count is rounded away by the converter, so that it is no less than that here."""
+        """Read noise is at least half a count here, because rounding hides less."""
         read_noise = max(read_noise, 0.5 * gain)
         stack = flats(
             np.random.default_rng(seed), gain, read_noise, black=2**bits // 16, white=2**bits - 1, pattern=pattern
@@ -127,9 +127,9 @@ class TestPhotonTransfer(BaseTester):
 
     @settings(max_examples=4, deadline=None)
     @given(gain=st.floats(5, 20), share=st.floats(0.05, 0.3), seed=st.integers(0, 2**32 - 1))
-    @example(gain=5.0, share=0.25, seed=129)  # chance makes it 0.49 ± 0.14 counts
+    @example(gain=5.0, share=0.25, seed=129)  # measured by chance as 0.49 ± 0.14 counts
     def test_feature_read_noise_that_rounding_hides_is_said_to_be(self, gain, share, seed):
-        """Of 400 such cameras the value alone exceeds the bound in 5 %, less one error in 0.3 %, less two in none."""
+        """In 400 such cameras the value exceeds the bound in 5 %, minus one error in 0.3 %, minus two in none."""
         result = photon_transfer(flats(np.random.default_rng(seed), gain, share * gain))
         assert not result.read_noise_resolved
         assert result.line.gain == pytest.approx(gain, rel=0.03)
@@ -141,7 +141,7 @@ class TestPhotonTransfer(BaseTester):
         result = photon_transfer([flat(rng, light, 4.0, 10.0, side=512) for _ in range(2)])
         assert result.line.gain == pytest.approx(4.0, rel=0.03)
         assert result.line.read_noise == pytest.approx(10.0, rel=0.03 + 2 * result.line.read_noise_error / 10)
-        assert result.line.fixed_pattern == 0  # a tenth of a percent of it would show in one picture
+        assert result.line.fixed_pattern == 0  # a single picture would show a pattern of 0.1 %
 
     def test_feature_order_does_not_matter_and_stacks_go_with_pairs(self):
         rng = np.random.default_rng(0)
@@ -153,7 +153,7 @@ class TestPhotonTransfer(BaseTester):
         assert result.line.gain == pytest.approx(2.0, rel=0.03)
 
     def test_feature_dark_frames_say_what_black_is(self):
-        """The file says 256 and the sensor 259.5: unseen it would cost 3.5 counts' electrons of read noise squared."""
+        """The file has 256 and the sensor 259.5; undetected, read noise squared is wrong by 3.5 counts."""
         rng = np.random.default_rng(0)
         stack = [replace(raw, black=raw.black - 3.5) for raw in flats(rng, 2.0, 6.0, black=259.5)]
         result = photon_transfer(stack[2:], darks=stack[:2])
@@ -162,7 +162,7 @@ class TestPhotonTransfer(BaseTester):
 
     @pytest.mark.parametrize("pattern", ["RGGB", "GMYC"])
     def test_feature_a_single_picture_will_do(self, pattern):
-        """Patches of even light with texture around them; the fixed pattern is seen as well."""
+        """A picture with even patches between texture; its fixed pattern is measured too."""
         rng = np.random.default_rng(0)
         light = np.kron(np.geomspace(30, 12000, 64).reshape(8, 8), np.ones((96, 96)))
         edges = (np.arange(768) % 96 < 16)[:, None] | (np.arange(768) % 96 < 16)
@@ -215,7 +215,7 @@ class TestPhotonTransfer(BaseTester):
             photon_transfer([])
 
     def test_exception_what_is_no_raw_noise(self):
-        """Counts that a tone curve has bent: noise falls where light grows."""
+        """Counts after a tone curve, where noise decreases with the level."""
         rng = np.random.default_rng(0)
         light = np.kron(np.geomspace(100, 12000, 64).reshape(8, 8), np.ones((64, 64)))
         linear = rng.poisson(light) / 12500
@@ -282,7 +282,7 @@ class TestRealFiles(BaseTester):
         assert line.gain_error < 0.02 * line.gain
 
     def test_feature_read_noise_is_that_of_the_masked_border(self):
-        """The G2's border, which no light reaches, has a standard deviation of 0.79 counts with rounding."""
+        """The masked border of the G2 has a standard deviation of 0.79 counts, rounding included."""
         import rawpy
 
         path = shared("data/raw/thorsted+digicam_corpus/G2_CRW_0305.CRW")

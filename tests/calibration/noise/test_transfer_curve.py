@@ -1,4 +1,4 @@
-"""Noise in blocks: what is noise is kept without a bias, what is scene is not."""
+"""Noise variance in blocks: blocks of pure noise give it without bias, and blocks with texture are rejected."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def gaussian(seed, sigma=20.0, shape=(1, 512, 512), level=2000.0):
 
 
 def pooled(points):
-    """Variance over all points, and its standard error if it is noise."""
+    """Return the mean variance over all points, and its standard error for pure noise."""
     samples = sum(point.samples for point in points)
     return sum(point.variance * point.samples for point in points) / samples, math.sqrt(2 / samples)
 
@@ -37,7 +37,7 @@ class TestSpatialPoints(BaseTester):
         points = spatial_points(raw)
         assert {point.channel for point in points} == set(names)
         variance, error = pooled(points)
-        assert abs(variance / (20.0**2 + 1 / 12) - 1) < 4 * 1.26 * error  # a median is 1.25 times as uncertain
+        assert abs(variance / (20.0**2 + 1 / 12) - 1) < 4 * 1.26 * error  # a median has 1.25 times the error
         kept = sum(point.samples for point in points) / (61 if len(pattern or "four") == 4 else 13)
         blocks = channels * 512**2 / (64 if len(pattern or "four") == 4 else 16)
         assert kept / blocks > 0.8
@@ -53,7 +53,7 @@ class TestSpatialPoints(BaseTester):
 
     @pytest.mark.parametrize("period", [3.0, 7.3, 25.0])
     def test_feature_texture_is_left_out(self, period):
-        """A weave twice as strong as the noise, over the right half: only the left half is measured."""
+        """The right half has a weave of twice the noise's amplitude, so only the left half is measured."""
         x = torch.arange(512)
         weave = 40 * torch.sin(2 * math.pi * x / period) * torch.sin(2 * math.pi * x[:, None] / period)
         texture = torch.where(x >= 256, weave, torch.zeros(())).round().int()
@@ -86,7 +86,7 @@ class TestSpatialPoints(BaseTester):
 class TestTemporalPoints(BaseTester):
     @pytest.mark.parametrize("frames", [2, 3, 7])
     def test_feature_variance_of_a_stack_is_numpys(self, frames):
-        """Against the variance of each pixel over time, of a scene that is all texture."""
+        """Against the variance of each pixel over time, for a scene with texture everywhere."""
         rng = np.random.default_rng(0)
         scene = rng.uniform(500, 3500, (1, 256, 256))
         stack = np.stack([(scene + rng.normal(0, 12, scene.shape)).round() for _ in range(frames)]).astype(np.int32)
@@ -102,7 +102,7 @@ class TestTemporalPoints(BaseTester):
         assert pooled(drifting)[0] == pytest.approx(pooled(still)[0], rel=0.03)
 
     def test_feature_what_moved_is_left_out(self):
-        """The scene of the right half has moved by two pixels between the captures."""
+        """The right half of the scene moves by two pixels between the captures, so its blocks are rejected."""
         rng = np.random.default_rng(0)
         blob = torch.from_numpy(rng.normal(0, 1, (1, 1, 512, 520))).float()
         blob = torch.nn.functional.avg_pool2d(blob, 9, 1, 4)[0] * 2000

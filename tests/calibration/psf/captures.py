@@ -1,4 +1,4 @@
-"""Point captures of a camera we know: exact at any place between the pixels, with all that spoils a measurement."""
+"""Simulated point captures of a known camera, exact at any sub-pixel position, with realistic noise and defects."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.pupil import Pupil
 
-FINE = 9  # parts of a pixel along each side: points lie at whole numbers of them
+FINE = 9  # subdivisions of a pixel along each side; points have positions on this grid
 
 
 def point_light(masks: PhaseMasks, defocus: float, side: int, spectrum: Spectrum, camera: ThinLensCamera) -> Tensor:
-    """Share of a point's light in each ninth of a pixel, (C, 9 side, 9 side), the chief ray in the middle."""
+    """Return a point's light on a grid of ninths of a pixel, (C, 9 side, 9 side), with the chief ray in the middle."""
     phase = masks.phase.detach().float()
     size = phase.shape[-1]
     step = camera.pixel_pitch * camera.aperture_radius / float(camera.image_distance)
@@ -35,22 +35,22 @@ def point_light(masks: PhaseMasks, defocus: float, side: int, spectrum: Spectrum
 
 
 def on_pixels(fine: Tensor, ninths: tuple[int, int] = (0, 0)) -> Tensor:
-    """The image of a point that lies ninths of a pixel down and right of a pixel's centre, (C, side, side)."""
+    """Return the image of a point at an offset in ninths of a pixel from a pixel's centre, (C, side, side)."""
     return avg_pool2d(torch.roll(fine, ninths, (-2, -1))[None], FINE)[0] * FINE**2
 
 
 def exposed(
     light: Tensor, exposures: Tensor, generator: torch.Generator, full_well: float, read: float, background: float
 ) -> Tensor:
-    """Frames of a 12-bit camera, black level taken off, 1 at full scale: (E, C, H, W).
+    """Return frames of a 12-bit camera with the black level subtracted and 1 at full scale, (E, C, H, W).
 
     Args:
-        light: (C, H, W) share of full scale per unit of exposure.
+        light: (C, H, W) fraction of full scale per unit of exposure.
         exposures: (E,).
-        generator: of the noise.
-        full_well: electrons.
-        read: electrons.
-        background: share of full scale per unit of exposure.
+        generator: source of the noise.
+        full_well: full well in electrons.
+        read: read noise in electrons.
+        background: fraction of full scale per unit of exposure.
     """
     black, white = 64, 4095
     electrons = (light.clamp(min=0) + background) * exposures.view(-1, 1, 1, 1) * full_well
@@ -61,7 +61,7 @@ def exposed(
 
 
 def planes(light: Tensor, tile: tuple[tuple[int, ...], ...]) -> Tensor:
-    """What the pixels of each place of a filter array's tile see of light on the sensor, (C, H, W) to its planes."""
+    """Sample light on the sensor (C, H, W) by a filter array, as one plane for each position in its tile."""
     step = len(tile)
     height, width = (size - size % step for size in light.shape[-2:])
     places = ((row, column) for row in range(step) for column in range(step))

@@ -13,7 +13,7 @@ SIDE = 25
 
 
 def airy_like(offsets, cutoff):
-    """A point image with all light up to a cutoff beyond Nyquist, (N, M, M): the square of a sinc has no more."""
+    """Return images of a squared sinc, (N, M, M), whose spectrum ends at a cutoff beyond Nyquist."""
     x = torch.arange(SIDE, dtype=torch.float64) - SIDE // 2
     line = torch.sinc((x - offsets[:, :, None]) * cutoff / 2).square()
     return line[:, 0, :, None] * line[:, 1, None, :]
@@ -25,7 +25,7 @@ def places(count):
 
 class TestResolvePSF(BaseTester):
     def test_feature_aliases_are_told_apart(self):
-        """Light up to 0.8 cycles a pixel: one image moved as if it had no aliases is far off, eight are not."""
+        """With frequencies up to 0.8 cycles a pixel, one shifted image has a large error and eight images have none."""
         offsets = places(8)
         images, truth = airy_like(offsets, 0.8), airy_like(torch.zeros(1, 2), 0.8)[0]
         noise = torch.full_like(images, 1e-10)
@@ -39,16 +39,16 @@ class TestResolvePSF(BaseTester):
         assert error < 0.01
         assert naive > 5 * error
 
-    def test_feature_it_sees_the_images_it_was_made_of(self):
+    def test_feature_its_samples_are_the_images_that_it_was_resolved_from(self):
         offsets = places(8)
         images = airy_like(offsets, 0.8)
         found = resolve_psf(images, offsets, torch.full_like(images, 1e-10), cutoff=1.2)
-        seen, slopes = found.seen_from(offsets)
-        self.assert_close(seen[:, 4:-4, 4:-4], images[:, 4:-4, 4:-4], rtol=0, atol=5e-3)
+        image, gradient = found.images_at(offsets)
+        self.assert_close(image[:, 4:-4, 4:-4], images[:, 4:-4, 4:-4], rtol=0, atol=5e-3)
         step = 1e-4
         for axis in range(2):
-            ahead = found.seen_from(offsets + step * torch.eye(2, dtype=torch.float64)[axis])[0]
-            self.assert_close((ahead - seen) / step, slopes[:, axis], rtol=0, atol=1e-3)
+            ahead = found.images_at(offsets + step * torch.eye(2, dtype=torch.float64)[axis])[0]
+            self.assert_close((ahead - image) / step, gradient[:, axis], rtol=0, atol=1e-3)
 
     def test_feature_the_variance_is_that_of_repeated_measurements(self):
         offsets, generator = places(6), torch.Generator().manual_seed(1)
@@ -66,7 +66,7 @@ class TestResolvePSF(BaseTester):
         assert float(ratio.max()) < 1.6
 
     def test_feature_weights_of_each_pixel_keep_the_noise_of_a_bright_core_out_of_the_dark(self):
-        """Over repeated measurements: half the noise at 4 pixels from the core, and as much as is said."""
+        """In repeated measurements the noise 4 pixels from the core is halved, and agrees with the stated variance."""
         offsets, generator = places(8), torch.Generator().manual_seed(1)
         images = airy_like(offsets, 0.8)
         variance = 1e-8 + 1e-4 * images * (images > 0.1)

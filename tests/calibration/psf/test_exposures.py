@@ -27,7 +27,7 @@ class TestMergeExposures(BaseTester):
     EXPOSURES = torch.tensor([1.0, 8.0, 64.0])
 
     def test_feature_bright_and_faint_are_both_found_as_sure_as_it_says(self):
-        """The scatter over a ramp of four decades against the variance that comes with it."""
+        """The scatter over a ramp of four decades agrees with the returned variance."""
         light = torch.logspace(-4, -0.1, 40).view(1, 1, 40).expand(1, 500, 40)
         frames = exposed(light, self.EXPOSURES, torch.Generator().manual_seed(0), 10500, 2.4, 0.0)
         merged, variance = merge_exposures(frames, self.EXPOSURES, SENSOR)

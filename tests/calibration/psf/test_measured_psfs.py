@@ -27,7 +27,7 @@ INSIDE = slice(SIDE // 2 - WINDOW // 2, SIDE // 2 + WINDOW // 2 + 1)
 
 
 def lights(masks):
-    """Of each distance, the light of its point in ninths of a pixel."""
+    """Return the light of a point at each distance, on a grid of ninths of a pixel."""
     return {z: point_light(masks, float(CAMERA.defocus(torch.tensor(z))), SIDE, SPECTRUM, CAMERA) for z in DISTANCES}
 
 
@@ -43,13 +43,13 @@ def flat():
 
 @pytest.fixture(scope="module")
 def truth(coded):
-    """(D, C, P, P), far to near, each with a sum of one in the window."""
+    """Return the true PSFs (D, C, P, P), from far to near, each with a sum of one in the window."""
     psfs = torch.stack([on_pixels(coded[z])[:, INSIDE, INSIDE] for z in sorted(DISTANCES, reverse=True)])
     return psfs / psfs.sum((2, 3), keepdim=True)
 
 
 def captured(coded, flat, count, seed=0, spoil=None):
-    """Point images at places that differ by ninths of a pixel; the long exposure is saturated four times over."""
+    """Return point images at random sub-pixel positions; the long exposure saturates the core."""
     generator = torch.Generator().manual_seed(seed)
     images = {}
     for z in coded:
@@ -67,7 +67,7 @@ def captured(coded, flat, count, seed=0, spoil=None):
 
 
 def of_a_mosaic(coded, flat, tile, count, exposures=EXPOSURES):
-    """Point images behind a filter array, at places that differ by ninths of a pixel of a plane."""
+    """Return point images behind a filter array, at random sub-pixel positions."""
     generator = torch.Generator().manual_seed(0)
     images = []
     for _ in range(count):
@@ -110,7 +110,7 @@ class TestMeasurePSFs(BaseTester):
             if n == 3:
                 frames[..., 46:49, 36:39] += 0.3  # a reflection beside the point
             if n == 5:
-                frames[..., 40:44, 40:44] = 1.0  # saturated whatever the exposure
+                frames[..., 40:44, 40:44] = 1.0  # saturated in every exposure
             return frames
 
         found = measure_psfs(captured({0.8: coded[0.8]}, flat, 8, spoil=spoil), CAMERA, WINDOW, CUTOFF)
@@ -132,7 +132,7 @@ class TestMeasurePSFs(BaseTester):
     @given(st.integers(-12, 12), st.integers(-12, 12))
     @settings(max_examples=5, deadline=None)
     def test_feature_where_the_point_lies_does_not_matter(self, down, right):
-        """Whole pixels of a frame without noise: the same image, cut out elsewhere."""
+        """Without noise, a point shifted by whole pixels gives the same image."""
         fine = point_light(PixelwiseMask(1, initial=fisher_mask()), 4.0, SIDE, Spectrum.monochrome(), CAMERA)
         light = torch.nn.functional.pad(on_pixels(fine, (2, -3)), (20, 20, 20, 20))
         (one,) = point_images(light[None], torch.ones(1), SENSOR, WINDOW)
@@ -153,7 +153,7 @@ class TestMeasurePSFs(BaseTester):
 
     @pytest.mark.slow
     def test_feature_a_mosaic_gives_the_psfs_on_the_pixels_of_the_sensor(self, coded, flat, truth):
-        """Each plane has every second pixel; the places of the point make up for it, both greens together."""
+        """Each plane has every second pixel; several positions of the point resolve the PSF, with both greens."""
         images = of_a_mosaic(coded[0.8], flat[0.8], ((0, 1), (1, 2)), 24)
         found = measure_psfs({0.8: images}, CAMERA, WINDOW, CUTOFF)
         error = (found.bank.psfs - truth[:1]).abs().sum((2, 3))
@@ -164,7 +164,7 @@ class TestMeasurePSFs(BaseTester):
 
     @pytest.mark.slow
     def test_feature_a_sharp_point_behind_a_mosaic_does_not_diverge(self):
-        """Where places follow weights that the PSFs do not, brightness runs away, and PSFs are wrong by their light."""
+        """With weights in only one of the two steps, registration would diverge in brightness."""
         sharp = point_light(PixelwiseMask(1, initial="flat"), 0.0, SIDE, SPECTRUM, CAMERA)
         images = of_a_mosaic(sharp, sharp, ((0, 1), (1, 2)), 16, torch.tensor([1.0, 8.0, 64.0]))
         psfs = measure_psfs({0.595: images}, CAMERA, WINDOW, CUTOFF).bank.psfs
@@ -174,7 +174,7 @@ class TestMeasurePSFs(BaseTester):
 
     @pytest.mark.parametrize(("tile", "enough", "channel"), [(None, 4, 2), (((0, 1), (1, 2)), 13, 2)])
     def test_feature_too_few_places_are_told_before_any_work(self, tile, enough, channel, monkeypatch):
-        """Disks of the cutoffs hold at most 4 points of the pixels' grid of frequencies, of a plane's grid 13."""
+        """A disc of the cutoff's radius has at most 4 aliased frequencies for the sensor's pixels, 13 for a plane's."""
         planes_ = 3 if tile is None else 4
         light = torch.ones(planes_, 31, 31, dtype=torch.float64)
         images = [PointImage((40.0, 40.0), light, light, tile)] * enough
@@ -186,7 +186,7 @@ class TestMeasurePSFs(BaseTester):
             measure_psfs({0.7: images}, CAMERA, WINDOW, CUTOFF)
 
     def test_exception_psfs_that_do_not_explain_their_captures(self, images):
-        """Images of two distances given as of one: too few to say which is the odd one."""
+        """Images of two distances given as one: there are too few to identify outliers."""
         mixed = images[0.5][:2] + images[0.8][:1]
         with (
             pytest.warns(UserWarning, match="too few"),
@@ -197,7 +197,7 @@ class TestMeasurePSFs(BaseTester):
 
 class TestMeasuredPSFs(BaseTester):
     def test_feature_tikhonov_with_it_is_as_good_as_with_the_true_bank(self, measured, truth):
-        """Of captures of a camera with the true PSFs, at either distance, with 1 % of noise."""
+        """Restoration of captures made with the true PSFs, at both distances, with 1 % noise."""
         scene = dead_leaves(96, 96, num_leaves=100, seed=1)[0][None]
         true = PSFBank.from_measured(truth.float(), measured.bank.defocus)
         optics = TiDyOptics(camera=CAMERA, color_space="linear", border="circular").with_bank(true)
@@ -250,7 +250,7 @@ class TestMeasuredPSFs(BaseTester):
             MeasuredPSFs.load(tmp_path / "none.safetensors")
 
     def test_feature_a_camera_looks_through_it(self, measured):
-        """Against the renderer called by hand."""
+        """A camera with the measured bank gives the same image as the renderer called directly."""
         optics = TiDyOptics(camera=CAMERA, sensor=None, color_space="linear").with_bank(measured.bank)
         image, depth = torch.rand(1, 3, 48, 56), torch.full((1, 1, 48, 56), 0.62)
         wanted = render(image, CAMERA.defocus(depth), measured.bank)

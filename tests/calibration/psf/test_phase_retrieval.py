@@ -34,7 +34,7 @@ class TestFitMasks(BaseTester):
         self.assert_close(fit.shifts, torch.zeros(3, 2), rtol=0, atol=5e-3)
 
     def test_feature_depths_that_lie_off_their_centre_are_put_right(self):
-        """Whole pixels, which no interpolation touches; masks make no half of it, as shifts are on average none."""
+        """Shifts by whole pixels need no interpolation; their mean is zero, so no tilt of the mask can replace them."""
         bank = bank_of(smooth_mask())
         moved = torch.stack(
             [torch.roll(psf, shift, (1, 2)) for psf, shift in zip(bank.psfs, [(0, 0), (1, 0), (0, -1)], strict=True)]

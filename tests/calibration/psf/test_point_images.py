@@ -34,7 +34,7 @@ class TestPointImages(BaseTester):
         self.assert_close(plain.light, lit.light, rtol=0, atol=1e-5)
 
     def test_feature_the_reference_says_where_the_chief_ray_falls(self):
-        """Coded light that lies three pixels off the point: its own centre is there, the reference's is not."""
+        """Coded light three pixels off the chief ray: its centroid is there, that of the reference is on the ray."""
         frames, reference = spot(43, 50)[None], spot(40, 50)
         (alone,) = point_images(frames, ONCE, SENSOR, 31)
         (known,) = point_images(frames, ONCE, SENSOR, 31, reference=reference)
@@ -43,7 +43,7 @@ class TestPointImages(BaseTester):
 
     @pytest.mark.parametrize("place", [(40.0, 50.0), (41.0, 51.0), (40.4, 51.3)])
     def test_feature_planes_of_a_mosaic_agree_on_one_place(self, place):
-        """In pixels of a plane, whose first lies on the first of the sensor."""
+        """Positions are in pixels of a plane; its first pixel is the first of the sensor."""
         mosaic = planes(spot(*place, channels=3, spread=24), RGGB)
         (image,) = point_images(mosaic[None], ONCE, SENSOR, 31, tile=RGGB)
         assert image.place == pytest.approx((place[0] / 2, place[1] / 2), abs=0.01)

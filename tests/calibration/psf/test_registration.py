@@ -12,7 +12,7 @@ NOISE = 1e-3
 
 
 def shot(row, column, brightness, generator):
-    """A round spot whose place is told wrong by up to a fifth of a pixel."""
+    """Return the image of a round spot with an error of up to a fifth of a pixel in its stated position."""
     x = torch.arange(float(SIDE), dtype=torch.float64) - SIDE // 2
     light = brightness * torch.exp(-((x[:, None] - row) ** 2 + (x - column) ** 2) / 6)[None]
     light = light + NOISE * torch.randn(light.shape, generator=generator, dtype=torch.float64)

@@ -28,7 +28,7 @@ class TestShrink(BaseTester):
         self.assert_close(after[0, 28:33, 28:33], before[0, 28:33, 28:33], rtol=1e-3, atol=0)
 
     def test_feature_faint_light_is_not_lost(self):
-        """A tail that no pixel shows, a tenth of the noise: its sum stays."""
+        """A tail of a tenth of the noise is not visible in any pixel, but its sum is preserved."""
         tail = torch.full((1, 61, 61), 2e-6, dtype=torch.float64)
         variance = torch.full_like(tail, 4e-10)
         sums = torch.stack([shrink(noisy(2e-5, seed) - spot() + tail, variance)[0].sum() for seed in range(20)])

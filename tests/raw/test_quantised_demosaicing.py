@@ -1,4 +1,4 @@
-"""Mosaics through whole numbers: bands of rows give what the whole picture gives, and nothing else is lost."""
+"""Quantised demosaicing: bands of rows give the same result as the whole picture, and only quantisation is lost."""
 
 from __future__ import annotations
 
@@ -11,12 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kornia_tidy.raw import demosaic as demosaicing
-from kornia_tidy.raw import whole_numbers
+from kornia_tidy.raw import quantised_demosaicing
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.demosaic import LIBRAW, LIBRAW_LOCAL, LIBRAW_REACH, demosaic, demosaic_to_srgb
 from kornia_tidy.raw.develop import develop
 from kornia_tidy.raw.filter_array import filter_tile
-from kornia_tidy.raw.whole_numbers import FEWEST_ROWS, LARGEST_BAND, ROWS_AT_ONCE, band_edges, in_whole_numbers
+from kornia_tidy.raw.quantised_demosaicing import (
+    FEWEST_ROWS,
+    LARGEST_BAND,
+    ROWS_AT_ONCE,
+    band_edges,
+    demosaic_quantised,
+)
 from tests.base import BaseTester, shared
 
 LOCAL = [
@@ -36,7 +42,7 @@ def thrice(counts):
 class TestInWholeNumbers(BaseTester):
     @pytest.fixture
     def small_bands(self, monkeypatch):
-        monkeypatch.setattr(whole_numbers, "LARGEST_BAND", 64 * 48)
+        monkeypatch.setattr(quantised_demosaicing, "LARGEST_BAND", 64 * 48)
 
     @pytest.mark.parametrize(("letters", "name"), LOCAL)
     def test_feature_bands_are_the_whole_to_the_last_bit(self, letters, name, small_bands, monkeypatch):
@@ -57,14 +63,14 @@ class TestInWholeNumbers(BaseTester):
     @pytest.mark.parametrize("name", ["ahd", "ppg"])
     def test_feature_a_cameras_file_too(self, name, monkeypatch):
         raw = RawCapture.open(shared("data/raw/syoyo+tinydng/colorchart.dng"))
-        monkeypatch.setattr(whole_numbers, "LARGEST_BAND", 1 << 18)
+        monkeypatch.setattr(quantised_demosaicing, "LARGEST_BAND", 1 << 18)
         bands = develop(raw, f"libraw_{name}")
         monkeypatch.setattr(demosaicing, "LIBRAW_LOCAL", ())
         assert torch.equal(bands, develop(raw, f"libraw_{name}"))
 
     def test_feature_values_come_back_to_half_a_step(self):
         mosaic = torch.rand(2, 130, 8) * 3 - 1
-        image = in_whole_numbers(mosaic, thrice, 16, torch.eye(3), 0)
+        image = demosaic_quantised(mosaic, thrice, 16, torch.eye(3), 0)
         step = float(mosaic.max() - mosaic.min()) * ONE_COUNT
         assert (image[:, 0] - mosaic).abs().max() <= 0.505 * step
         low = float(mosaic.min())
@@ -113,18 +119,18 @@ class TestInWholeNumbers(BaseTester):
         mosaic = torch.rand(1, 8, 8)
         mosaic[0, 3, 4] = value
         with pytest.raises(ValueError, match=f"mosaic must be finite, got {value}"):
-            in_whole_numbers(mosaic, thrice, 16, torch.eye(3))
+            demosaic_quantised(mosaic, thrice, 16, torch.eye(3))
 
     def test_exception_of_a_thread_comes_here(self):
         def fails(counts):
             raise RuntimeError(f"no {counts.shape}")
 
         with pytest.raises(RuntimeError, match=r"no \(8, 8\)"):
-            in_whole_numbers(torch.rand(1, 8, 8), fails, 16, torch.eye(3))
+            demosaic_quantised(torch.rand(1, 8, 8), fails, 16, torch.eye(3))
 
     def test_cardinality_eight_bits_and_half_precision(self):
         mosaic = torch.rand(3, 10, 12, dtype=torch.float16)
-        image = in_whole_numbers(mosaic, thrice, 8, torch.eye(3))
+        image = demosaic_quantised(mosaic, thrice, 8, torch.eye(3))
         assert (image.shape, image.dtype) == ((3, 3, 10, 12), torch.float16)
         assert (image[:, 0] - mosaic).abs().max() < 0.51 / 255 + 1e-3
 

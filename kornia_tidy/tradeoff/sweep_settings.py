@@ -1,4 +1,4 @@
-"""What a sweep measures: the presets, every knob of the fidelity turned alone, step by step, and plans."""
+"""Settings of a sweep: the presets, each setting of the fidelity varied alone, and plans."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from kornia_tidy.planning.planner import Planner
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 
 Value = str | float | int | None
-PRESET, PLAN = "preset", "plan"  # stand where a knob's name would
+PRESET, PLAN = "preset", "plan"  # in place of the name of a setting
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the plans
-LADDERS: dict[str, tuple[Value, ...]] = {
+SWEEP_VALUES: dict[str, tuple[Value, ...]] = {
     PRESET: tuple(PRESETS),
     "layers": LAYERS,
     "layer_spacing": (2.5, 2.0, 1.0, 0.5),
-    "pixel_tolerance": (1.0, 1e-1, 1e-2, 1e-3, 1e-6),  # the first samples the middle of a pixel, no more
+    "pixel_tolerance": (1.0, 1e-1, 1e-2, 1e-3, 1e-6),  # the first one samples only the centre of a pixel
     "window": (9, 17, 33, 65, 129, 257),
     "enclosed_energy": (0.5, 0.6, 0.7, 0.8, 0.9),
     "stray_light": STRAY_LIGHT,
@@ -29,39 +29,39 @@ LADDERS: dict[str, tuple[Value, ...]] = {
 
 
 class Setting(NamedTuple):
-    """One step on the ladder of a knob."""
+    """One point of a sweep: the name of the varied setting, its value, and the fidelity with this value."""
 
     knob: str
     value: Value
     fidelity: Fidelity
 
 
-def ladder(base: str | Fidelity = "balanced", knobs: Sequence[str] = tuple(LADDERS)) -> list[Setting]:
-    """Return the settings of a sweep: the presets, and each knob turned alone while the others stay.
+def sweep_settings(base: str | Fidelity = "balanced", knobs: Sequence[str] = tuple(SWEEP_VALUES)) -> list[Setting]:
+    """Return the points of a sweep: the presets, and each setting varied alone while the others stay at the base.
 
-    The base's own value is a step of every ladder. ``enclosed_energy`` takes ``max_window`` with it, up to that of the
-    reference: what it asks for would not be there otherwise.
+    The value of the base is part of every sweep. ``enclosed_energy`` raises ``max_window`` to that of the reference,
+    since a smaller window could not hold the light.
 
     Args:
-        base: a preset's name, or the setting from which the knobs are turned.
-        knobs: names from ``LADDERS``; ``"preset"`` for the presets.
+        base: a preset's name, or the fidelity whose settings are varied.
+        knobs: names of settings from ``SWEEP_VALUES``; ``"preset"`` for the presets.
 
     Raises:
         ValueError: if a name is not known.
 
     Example:
-        >>> [(step.value, step.fidelity.layer_spacing) for step in ladder("draft", ["layer_spacing"])][:2]
+        >>> [(step.value, step.fidelity.layer_spacing) for step in sweep_settings("draft", ["layer_spacing"])][:2]
         [(2.5, 2.5), (2.0, 2.0)]
     """
     base = Fidelity.preset(base) if isinstance(base, str) else base
     settings = []
     for knob in knobs:
-        check_choice("knob", knob, tuple(LADDERS))
+        check_choice("knob", knob, tuple(SWEEP_VALUES))
         if knob == PRESET:
             settings += [Setting(knob, name, PRESETS[name]) for name in PRESETS]
             continue
         own = getattr(base, knob)
-        values = LADDERS[knob] if own in LADDERS[knob] else (*LADDERS[knob], own)
+        values = SWEEP_VALUES[knob] if own in SWEEP_VALUES[knob] else (*SWEEP_VALUES[knob], own)
         settings += [Setting(knob, value, _turned(base, knob, value)) for value in values]
     return settings
 
@@ -69,7 +69,7 @@ def ladder(base: str | Fidelity = "balanced", knobs: Sequence[str] = tuple(LADDE
 def planned(
     optics: TiDyOptics, light: Tensor, depth: Tensor, tolerances: Sequence[float] = TOLERANCES
 ) -> list[Setting]:
-    """Return what is planned for a scene at some tolerances; a plan that is the reference itself is one of them.
+    """Return the plans of a scene at some tolerances as points of a sweep; a plan may be the reference itself.
 
     Args:
         optics: the camera.

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kornia_tidy import TiDyOptics
-from kornia_tidy.figures.system_survey import contrast_transfer, survey
+from kornia_tidy.figures.system_statistics import contrast_transfer, system_statistics
 from tests.base import BaseTester
 
 
@@ -27,11 +27,11 @@ class TestContrastTransfer(BaseTester):
         self.assert_close(contrast_transfer(psf.rot90(1, (2, 3))), contrast_transfer(psf), rtol=1e-4, atol=1e-5)
 
 
-class TestSurvey(BaseTester):
+class TestSystemStatistics(BaseTester):
     @pytest.mark.parametrize("name", ["phasecam3d", "chang2019"])
     def test_smoke_shapes_and_ranges(self, name):
         optics = TiDyOptics.from_preset(name)
-        seen = survey(optics, nodes=5, frequencies=8)
+        seen = system_statistics(optics, nodes=5, frequencies=8)
         assert seen.defocus[[0, -1]].tolist() == pytest.approx(optics.camera.defocus_range)
         assert seen.psfs.shape == (5, 3, optics.window, optics.window)
         self.assert_close(seen.psfs.sum((2, 3)), torch.ones(5, 3), rtol=0, atol=1e-5)

@@ -1,4 +1,4 @@
-"""What an optical system does to a point at every depth: PSFs, contrast, and what an image of it tells of its depth."""
+"""Statistics of an optical system over defocus: PSFs, modulation transfer function, Cramér-Rao bound on depth."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from kornia_tidy.mask_design.fisher_information import crlb
 from kornia_tidy.psf.psf_model import CodedLens
 
 
-class Survey(NamedTuple):
-    """A system over its range of defocus."""
+class SystemStatistics(NamedTuple):
+    """PSFs, contrast and depth bound of a system over its range of defocus."""
 
     defocus: Tensor
     """(D,) radians at 530 nm, ascending: far to near."""
@@ -25,17 +25,17 @@ class Survey(NamedTuple):
 
 
 @torch.no_grad()
-def survey(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> Survey:
-    """Look at a lens over all of its camera's range.
+def system_statistics(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> SystemStatistics:
+    """Compute PSFs, contrast and Cramér-Rao bound of a lens over the defocus range of its camera.
 
     Args:
         lens: masks, modulator, camera and spectrum.
-        nodes: number D of depths, even in defocus.
+        nodes: number D of depths, evenly spaced in defocus.
         frequencies: number F of spatial frequencies.
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
-        >>> seen = survey(CodedLens(PixelwiseMask(1, initial="flat")), nodes=5)
+        >>> seen = system_statistics(CodedLens(PixelwiseMask(1, initial="flat")), nodes=5)
         >>> int(seen.contrast.mean((1, 2)).argmax())  # a plain lens is sharpest in the middle, in focus
         2
     """
@@ -43,7 +43,7 @@ def survey(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> Survey:
     defocus = torch.linspace(lo, hi, nodes, dtype=torch.float64)
     psfs = lens.psf_bank(defocus=defocus.tolist()).psfs
     psfs = psfs / psfs.sum((2, 3), keepdim=True)
-    return Survey(defocus, psfs, contrast_transfer(psfs, frequencies), crlb(lens, defocus.tolist()))
+    return SystemStatistics(defocus, psfs, contrast_transfer(psfs, frequencies), crlb(lens, defocus.tolist()))
 
 
 def contrast_transfer(psfs: Tensor, frequencies: int = 32) -> Tensor:
@@ -53,7 +53,7 @@ def contrast_transfer(psfs: Tensor, frequencies: int = 32) -> Tensor:
 
     Args:
         psfs: (..., P, P), each of sum one.
-        frequencies: number F of rings of equal width from 0 to half a cycle a pixel.
+        frequencies: number F of rings of equal width from 0 to 0.5 cycles per pixel.
 
     Returns:
         (..., F), the mean of each ring.

@@ -1,4 +1,4 @@
-"""Mosaics of real numbers, demosaiced by what computes in unsigned integers: by bands of rows, each in a thread."""
+"""Quantised demosaicing: mosaics as unsigned integers for OpenCV and LibRaw, in bands of rows on several threads."""
 
 from __future__ import annotations
 
@@ -14,27 +14,29 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_finite
 
-ROWS_AT_ONCE = 16  # what is between two steps then stays in the processor's cache
-LARGEST_BAND = 1 << 21  # pixels, 16 MB in LibRaw: malloc keeps that for the next band, the system gives it anew
-FEWEST_ROWS = 64  # of a band: what it computes beyond its edges is then a third of it at most
+ROWS_AT_ONCE = 16  # few enough for intermediate results to stay in the processor's cache
+LARGEST_BAND = 1 << 21  # pixels, 16 MB in LibRaw: malloc reuses such blocks and returns larger ones to the system
+FEWEST_ROWS = 64  # of a band: limits the rows computed twice to a third of a band
 
 
-def in_whole_numbers(
+def demosaic_quantised(
     mosaic: Tensor,
     compute: Callable[[np.ndarray], np.ndarray],
     bits: int,
     matrix: Tensor,
     reach: int | None = None,
 ) -> Tensor:
-    """Return the colours that ``compute`` makes of mosaics, in unsigned integers that span their range, 0 and 1.
+    """Demosaic real-valued mosaics with an integer algorithm, and multiply the colours by a matrix.
+
+    The integers span the range of the mosaics, extended to include 0 and 1.
 
     Args:
         mosaic: (N, H, W), finite.
-        compute: (rows, W) to (rows, W, colors), unsigned integers; called by several threads at once.
+        compute: the algorithm, (rows, W) to (rows, W, colors), unsigned integers; called by several threads at once.
         bits: 8 or 16.
-        matrix: (C, colors) with which colours are multiplied on their way back.
-        reach: rows, an even number, beyond which nothing changes what a row becomes; bands of rows are then computed
-            side by side, and the result is the same. None: only all at once.
+        matrix: (C, colors), applied to the colours as they are converted back to real values.
+        reach: number of rows, even, that influence a row on either side. Bands of rows are then computed in parallel
+            with the same result. None: the algorithm has no bounded reach, and the whole mosaic is one band.
 
     Returns:
         (N, C, H, W) like ``mosaic``.
@@ -45,14 +47,14 @@ def in_whole_numbers(
     tensor = mosaic.detach().to("cpu", torch.promote_types(mosaic.dtype, torch.float32))
     low, high = (float(end) for end in torch.aminmax(tensor))
     if not math.isfinite(high - low):
-        check_finite("mosaic", mosaic)  # says which value
+        check_finite("mosaic", mosaic)  # names the value
     low, high = min(0.0, low), max(1.0, high)
     step = (high - low) / (2**bits - 1)
     height, width = tensor.shape[-2:]
-    # PyTorch's memory: NumPy asks for large pages, which where memory is in pieces cost up to seven times as much.
+    # Allocated by PyTorch: NumPy requests huge pages, which cost up to seven times as much in fragmented memory.
     image = torch.empty(len(tensor), len(matrix), height, width, dtype=tensor.dtype)
     factors = matrix.detach().double().cpu().numpy()
-    back = np.hstack([step * factors, low * factors.sum(1, keepdims=True)])  # from whole numbers, and 1
+    back = np.hstack([step * factors, low * factors.sum(1, keepdims=True)])  # acts on the integers and a constant 1
     edges = [0, height] if reach is None else band_edges(height, width, torch.get_num_threads())
 
     def work(place: tuple[int, tuple[int, int]]) -> None:
@@ -63,14 +65,14 @@ def in_whole_numbers(
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         for _ in threads.map(work, itertools.product(range(len(tensor)), itertools.pairwise(edges))):
-            pass  # what failed raises here
+            pass  # an exception of a thread is raised here
     return image.to(mosaic)
 
 
 def band_edges(height: int, width: int, threads: int) -> list[int]:
-    """Return where bands of rows begin and where the last ends: not too large, and as many as threads or a multiple.
+    """Return the edges of bands of rows of bounded size, with a multiple of the number of threads as their number.
 
-    Rows that are restored together stay together, so that the last bit of a value does not depend on the bands.
+    Edges are multiples of ``ROWS_AT_ONCE``, so that the last bit of a value does not depend on the bands.
 
     Example:
         >>> band_edges(2176, 4128, threads=2), band_edges(120, 4128, threads=2)
@@ -92,7 +94,7 @@ def _counts(values: np.ndarray, low: float, step: float, bits: int) -> np.ndarra
 
 
 def _restore(counts: np.ndarray, back: np.ndarray, image: np.ndarray) -> None:
-    """Write (C, rows, W) of whole numbers (rows, W, colors)."""
+    """Convert integers (rows, W, colors) to real values, and write them to (C, rows, W)."""
     for top in range(0, len(counts), ROWS_AT_ONCE):
         rows = slice(top, top + ROWS_AT_ONCE)
         cv2.split(cv2.transform(counts[rows].astype(image.dtype), back), list(image[:, rows]))

@@ -1,4 +1,7 @@
-"""Whether decoded counts can be a picture: header-only files decode without an error, to zeros or to anything."""
+"""Raw validation: tests that decoded counts are a picture and that the white level fits them.
+
+LibRaw decodes truncated files without an error, to zeros or to noise.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +10,19 @@ import warnings
 import numpy as np
 from torch import Tensor
 
-LEAST_BITS = 0.05  # a pixel; lossy compression of an empty picture takes twice as many
-MOST_ABOVE_WHITE = 1e-3  # of the counts: hot pixels may lie there
-# A white level is taken for wrong if more than this share of the counts is above this multiple of it. Noise, and
-# channels that saturate one after the other, stay within 10 % of white; hot pixels are few.
-LIES = ((1e-2, 1.1), (1e-3, 1.5))
+LEAST_BITS = 0.05  # per pixel; lossy compression of an empty picture takes twice as many
+MOST_ABOVE_WHITE = 1e-3  # share of the counts; hot pixels may lie above white
+# (share, factor): a white level is rejected if more than this share of the counts is above this multiple of it. Noise
+# and channels with different saturation levels stay within 10 % of white, and hot pixels are rare.
+WHITE_LIMITS = ((1e-2, 1.1), (1e-3, 1.5))
 C330_ROWS, C330_ROW = 912, 2464  # bytes: Y Cb Y Cr ...
 C330_BLOCK, C330_GAP = 32, 16  # rows, in the longer files
-MOST_LUMA_STEP, MOST_CHROMA_STEP = 32, 16  # on average, from one sample to the next; text and noise have more
-GREY, MOST_COLOR = 128, 64  # of chroma, and how far from it a picture's may lie on average
+MOST_LUMA_STEP, MOST_CHROMA_STEP = 32, 16  # mean difference of adjacent samples; text and noise have more
+GREY, MOST_COLOR = 128, 64  # neutral chroma, and the largest mean deviation of a picture from it
 
 
 def is_c330(data: bytes) -> bool:
-    """Return whether bytes, whole rows, are like those of a Kodak C330: YCbCr, half as many Cb and Cr, no header."""
+    """Return whether bytes (whole rows) look like the headerless 4:2:2 YCbCr data of a Kodak C330."""
     rows = np.frombuffer(data, np.uint8).reshape(-1, C330_ROW).astype(np.int16)
     if len(rows) > C330_ROWS:
         rows = rows[np.arange(len(rows)) % (C330_BLOCK + C330_GAP) < C330_BLOCK]
@@ -30,11 +33,11 @@ def is_c330(data: bytes) -> bool:
     ) and all(abs(plane.mean() - GREY) < MOST_COLOR for plane in (blue, red))
 
 
-def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, length: int) -> None:
-    """Refuse counts that no sensor wrote.
+def check_counts(name: str, counts: Tensor, black: Tensor, white: float, length: int) -> None:
+    """Raise ``ValueError`` if counts and levels cannot come from a sensor.
 
     Args:
-        name: of the file, for the sentence.
+        name: of the file, for the message.
         counts: (C, H, W).
         black: levels without light.
         white: saturation count.
@@ -46,9 +49,7 @@ def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, leng
     """
     height, width = counts.shape[-2:]
     if 8 * length < LEAST_BITS * height * width:
-        raise ValueError(
-            f"cannot read {name}: its {length} bytes cannot hold the {width} x {height} pixels it speaks of"
-        )
+        raise ValueError(f"cannot read {name}: its {length} bytes cannot hold its {width} x {height} pixels")
     low, high = (int(end) for end in counts.aminmax())
     if low == high:
         raise ValueError(f"cannot read {name}: all its {width} x {height} counts are {low}, so it holds no picture")
@@ -62,26 +63,28 @@ def check_plausible(name: str, counts: Tensor, black: Tensor, white: float, leng
         raise ValueError(f"cannot read {name}: all its counts are below its black level {least:g}")
 
 
-def plausible_white(name: str, counts: Tensor, white: float, given: bool) -> float:
-    """Return a white level, or the largest count where a file's level lies: the picture would be all white.
+def validated_white(name: str, counts: Tensor, white: float, given: bool) -> float:
+    """Return the white level, or the largest count if the white level of the file is too low.
+
+    A white level that is too low would make most of the picture white.
 
     Args:
-        name: of the file, for the sentence.
+        name: of the file, for the message.
         counts: (C, H, W).
         white: saturation count.
-        given: by the user, who knows better than the file.
+        given: whether the user gave the white level, which is then kept.
 
     Warns:
-        UserWarning: if a file's level lies, or more than one count in a thousand lies above white.
+        UserWarning: if the level of the file is replaced, or more than one count in a thousand lies above white.
     """
     high = int(counts.max())
 
     def share(level: float) -> float:
         return float((counts > level).float().mean()) if high > level else 0.0
 
-    if not given and any(share(factor * white) > most for most, factor in LIES):
+    if not given and any(share(factor * white) > most for most, factor in WHITE_LIMITS):
         warnings.warn(
-            f"{name}: its white level {white:g} lies, as its counts reach {high}, which is taken for white: "
+            f"{name}: its white level {white:g} is wrong, as its counts reach {high}, which is taken for white: "
             "if you know the right one, give it (white=..., --white N)",
             stacklevel=3,
         )
