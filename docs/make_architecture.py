@@ -23,7 +23,8 @@ PACKAGE = "kornia_tidy"
 CORE = "core"  # the modules at the package's root
 COMMAND_LINE = {"cli": "commands", "__main__": "commands"}
 MADE = "outputs/"  # a folder that make fills and git ignores
-DOCUMENTS = ("docs/architecture.md", "CONTRIBUTING.md")  # in which file names are checked
+MADE_IN = "docs/architecture.md"
+DOCUMENTS = ("CONTRIBUTING.md", "README.md", "docs/*.md")  # in which file names are checked
 
 Arrows = dict[str, set[str]]
 
@@ -34,15 +35,14 @@ def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
     parser = argparse.ArgumentParser(prog="python docs/make_architecture.py", description=description)
     parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 if something is stale")
     check = parser.parse_args(arguments).check
-    document = root / DOCUMENTS[0]
+    document = root / MADE_IN
     before = document.read_text(encoding="utf-8")
     after = filled(before, parts(root))
     if not check:
         document.write_text(after, encoding="utf-8")
     wrong = ["docs/architecture.md is stale: run python docs/make_architecture.py"] if check and after != before else []
-    for name in DOCUMENTS:
-        if (root / name).exists():
-            wrong += [f"{name} names {path}, which is not there" for path in missing(root, root / name)]
+    for named in sorted(path for pattern in DOCUMENTS for path in root.glob(pattern)):
+        wrong += [f"{named.relative_to(root)} names {path}, which is not there" for path in missing(root, named)]
     for sentence in wrong:
         sys.stderr.write(sentence + "\n")
     return int(bool(wrong))

@@ -1,4 +1,4 @@
-"""Learn masks whose average PSF comes close to a point at every depth: the paper's experiment without a network.
+"""Learn masks with an average PSF close to a point at every depth: the paper's experiment without a network.
 
     python examples/learn_point_psf.py --masks 1 2 3 4 5 --trials 3
 

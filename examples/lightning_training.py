@@ -1,4 +1,4 @@
-"""Train a camera and a network of your own with Lightning's trainer, and use what came out.
+"""Train a camera and a network of your own with Lightning's trainer, then load and use both.
 
     python examples/lightning_training.py --epochs 3
 

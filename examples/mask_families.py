@@ -82,7 +82,7 @@ def impulse() -> Tensor:
 
 
 def row(family: str, task: str, goal: float, runs: list[tuple[list[float], float]]) -> str:
-    """Return a line of the table: what the trials of one family came to."""
+    """Return the line of the table for the trials of one family."""
     first, last = (statistics.median(errors[end] for errors, _ in runs) for end in (0, -1))
     step = statistics.median(seconds for _, seconds in runs)
     reached = [steps for errors, _ in runs if (steps := steps_to(goal, errors)) is not None]

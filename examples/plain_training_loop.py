@@ -10,7 +10,7 @@ import torch
 from kornia_tidy import TiDyOptics
 from kornia_tidy.data import DeadLeaves
 from kornia_tidy.inference.heads import PlainHead
-from kornia_tidy.inference.tasks import nearness
+from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.reconstruction.losses import mse_loss
 
 
@@ -26,7 +26,7 @@ def main(arguments: list[str] | None = None) -> list[float]:
     losses = []
     for batch in torch.utils.data.DataLoader(scenes, batch_size=4):
         coded = optics(batch["image"], batch["depth"])  # line 3: the network sees captures, not images
-        loss = mse_loss(network(coded), nearness(optics.camera, batch["depth"]), batch["mask"])
+        loss = mse_loss(network(coded), normalised_inverse_depth(optics.camera, batch["depth"]), batch["mask"])
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

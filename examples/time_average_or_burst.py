@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, list[float]]:
     result: dict[str, list[float]] = {name: [] for name in ways}
     for name, take in ways.items():
         optics.sensor = None
-        psfs = take(point)  # what becomes of a point
+        psfs = take(point)  # the capture of a point is its PSF
         light, readouts = (1.0, 1) if take is single else (collected, options.masks)
         for electrons in options.electrons:
             optics.sensor = SensorNoise(options.read_noise / electrons, full_well=electrons, clip=False)

@@ -1,4 +1,4 @@
-"""Photograph a data set once, then train a network on what lies on the disk: plain PyTorch, no camera in the loop.
+"""Photograph a data set once, then train a network on the captures on disk: plain PyTorch, no camera in the loop.
 
     python examples/train_on_rendered.py --output outputs/captures
 
@@ -21,7 +21,7 @@ from kornia_tidy.inference.heads import PlainHead
 
 
 def main(arguments: Sequence[str] | None = None) -> list[float]:
-    """Render what is not there yet, train, and return the losses."""
+    """Photograph the scenes that are missing, train, and return the losses."""
     options = parse(arguments)
     optics = TiDyOptics.from_preset("tidy-5", generator=torch.Generator().manual_seed(0))
     scenes = DeadLeaves(options.scenes, options.size, options.size, depth_range=(0.3, float("inf")))

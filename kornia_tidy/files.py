@@ -1,4 +1,7 @@
-"""File input and output: errors of one sentence, atomic writes, and locks of folders."""
+"""File input and output: errors of one sentence, atomic writes, and locks of folders.
+
+No package is used for atomic writes: atomicwrites is no longer maintained, and writes no folders.
+"""
 
 from __future__ import annotations
 

@@ -105,10 +105,15 @@ class TestMakeArchitecture(BaseTester):
             "`camera/whole.py` `camera/gone.py` `camera/<name>.py` `kornia_tidy/optics/` [x](docs/architecture.md#a) "
             "[y](gone.md) [z](https://example.org/gone.md)\n```\n`camera/in_a_block.py`\n```\n"
         )
-        (checkout / "CONTRIBUTING.md").write_text(text)
+        for page in ("CONTRIBUTING.md", "docs/page.md"):
+            (checkout / page).write_text(text.replace("docs/", "") if page == "docs/page.md" else text)
         assert script.main([], checkout) == 1
         said = capsys.readouterr().err.splitlines()
-        assert said == [f"CONTRIBUTING.md names {name}, which is not there" for name in ("camera/gone.py", "gone.md")]
+        assert said == [
+            f"{page} names {name}, which is not there"
+            for page in ("CONTRIBUTING.md", "docs/page.md")
+            for name in ("camera/gone.py", "gone.md")
+        ]
 
     @pytest.mark.parametrize("text", ["", MARKERS * 2, "<!-- end: diagram --><!-- made: diagram -->"])
     def test_exception_markers(self, script, checkout, text):

@@ -1,4 +1,7 @@
-"""Data sets rendered once and for all: coded captures on disk, in folders or in shards, and how to train on them."""
+"""Coded data sets: scenes photographed once, stored in folders or shards, and read for training.
+
+A camera and a data set of scenes come in, files and a data set of captures go out. Read ``render_scenes.py`` first.
+"""
 
 from kornia_tidy.coded_datasets.captures import CodedCaptures
 from kornia_tidy.coded_datasets.layout import Layout

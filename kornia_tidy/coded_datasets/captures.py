@@ -1,4 +1,4 @@
-"""Rendered captures as a data set to train on."""
+"""Data set of stored captures, for training."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from kornia_tidy.data.scene_dataset import UnreadableItemError, item_index
 
 
 class CodedCaptures(Dataset[dict[str, Any]]):
-    """The captures that ``kornia-tidy render`` or :func:`render_scenes` wrote, folders and shards alike.
+    """Data set of the captures that ``kornia-tidy render`` or :func:`render_scenes` wrote, in folders or shards.
 
     Args:
         root: the folder.
 
     Raises:
-        FileNotFoundError: if rendering has not ended, or this is no such folder.
+        FileNotFoundError: if the folder has no index, which is written after the last capture.
         ValueError: if the index is damaged.
 
     Convention:
-        - An item is ``{"coded", "image", "depth", "mask", "index", "name"}``, of which only what was rendered is there:
+        - An item is ``{"coded", "image", "depth", "mask", "index", "name"}``, without the maps that were not stored:
           images (3, H, W) float32, depth (1, H, W) float32 in metres, the mask (1, H, W) bool, False where depth was
           unknown and is filled in.
-        - No file stays open between items, so that workers of a data loader may read it, forked or spawned.
+        - No file stays open between items, so that workers of a data loader, forked or spawned, can read it.
 
     Example:
         >>> import tempfile, torch
@@ -54,7 +54,7 @@ class CodedCaptures(Dataset[dict[str, Any]]):
         return len(self._entries)
 
     def name(self, index: int) -> str:
-        """Return what the scene of a capture is called."""
+        """Return the name of the scene of a capture."""
         return self._entries[index]["name"]
 
     def __getitem__(self, index: SupportsIndex) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class CodedCaptures(Dataset[dict[str, Any]]):
 
         Raises:
             IndexError: if there is no such item.
-            UnreadableItemError: if one of its files is damaged or gone.
+            UnreadableItemError: if one of its files is damaged or missing.
         """
         index = item_index(index, len(self))
         entry = self._entries[index]

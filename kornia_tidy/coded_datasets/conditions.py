@@ -1,4 +1,4 @@
-"""Everything that made a rendered data set, as plain values: another run may only go on with the same."""
+"""Conditions of a coded data set: camera, layout and seed, which must be the same when a run is resumed."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ CONDITIONS, FORMAT = "render.json", "kornia_tidy captures 1"
 def conditions(
     optics: TiDyOptics, count: int, layout: Layout, seed: int, made_from: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what captures follow from, as values that JSON holds.
+    """Return all that determines the captures, as plain values for JSON.
 
     Args:
         optics: the camera.
         count: number of scenes.
-        layout: the files.
+        layout: files of the captures.
         seed: of the noise.
-        made_from: what made camera and scenes, in the words of the caller.
+        made_from: description of camera and scenes by the caller.
 
     Convention:
-        - Masks are heights in metres at nine digits, which tell float32 exactly; ``state_sha256`` is of every weight
-          and of the aperture.
-        - Infinity is written as ``"inf"``, for which JSON has no number.
+        - Masks are heights in metres with nine digits, which represent float32 exactly; ``state_sha256`` is the hash of
+          all weights and the aperture.
+        - Infinity, which JSON lacks, is written as ``"inf"``.
     """
     camera = {
         **{name: _part(getattr(optics, name)) for name in ("camera", "masks", "modulator", "sensor")},
@@ -53,14 +53,14 @@ def conditions(
 
 
 def claim(folder: Path, own: Mapping[str, Any]) -> None:
-    """Make a folder that of captures made so, or find that it is.
+    """Write the conditions into an empty folder, or check that they agree with those in it.
 
     Raises:
-        ValueError: if it holds anything else; what differs is named.
+        ValueError: if the folder holds other files or captures; the message names the differences.
     """
     path = folder / CONDITIONS
     others = any(not other.name.startswith(".") for other in folder.iterdir())
-    if not path.exists():  # looked for last: a process that has just begun here writes it before anything else
+    if not path.exists():  # checked after the other files, as another process writes it before them
         if others:
             raise ValueError(f"{folder} holds files that are no captures: choose another folder")
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in own.items())
@@ -77,7 +77,7 @@ def claim(folder: Path, own: Mapping[str, Any]) -> None:
 
 
 def _part(module: nn.Module | None) -> dict[str, Any] | None:
-    """A part of the camera in words, and its numbers to the last digit."""
+    """Return the repr of a part of the camera and its exact numbers."""
     if module is None:
         return None
     numbers = {
@@ -91,14 +91,14 @@ def _part(module: nn.Module | None) -> dict[str, Any] | None:
 def _digest(optics: TiDyOptics) -> str:
     digest = hashlib.sha256()
     for name, value in {**optics.state_dict(), "aperture": optics.pupil.amplitude}.items():
-        if name.endswith(EXTRA_STATE):  # settings, which are written beside it in words
+        if name.endswith(EXTRA_STATE):  # settings, which are written in words
             continue
         digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """The value as JSON gives it back."""
+    """Return a value as JSON reads it back."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

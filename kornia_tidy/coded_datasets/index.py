@@ -1,4 +1,4 @@
-"""The index of a rendered data set: a line for each item that says where in the folder each of its maps lies."""
+"""Index of a coded data set: one line per item with the place of each of its maps."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Entry = dict[str, str]
 
 
 def encode_index(folder: Path, parts: Iterable[Part], layout: Layout) -> bytes:
-    """Return the index of parts that are there: ``key,name,clamped_pixels``, and of each map its place.
+    """Return the index of finished parts as CSV: ``key,name,clamped_pixels`` and the place of each map.
 
     Convention:
-        A place is a path in the folder, or ``shard:offset:size`` in bytes, so that nobody has to look through a shard.
+        A place is a path in the folder, or ``shard:offset:size`` in bytes, so that no shard has to be searched.
     """
     text = io.StringIO()
     names = ("key", "name", "clamped_pixels", *layout.fields)
@@ -36,7 +36,7 @@ def read_index(folder: Path) -> list[Entry]:
     """Return the lines of a folder's index.
 
     Raises:
-        FileNotFoundError: if there is none, as rendering has not ended, or this is no such folder.
+        FileNotFoundError: if there is none; it is written after the last capture.
         ValueError: if it is damaged.
     """
     path = folder / INDEX
@@ -58,7 +58,7 @@ def read_place(folder: Path, place: str) -> bytes:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it ends too early.
+        ValueError: if the file ends too early.
     """
     name, *window = place.split(":")
     if not window:

@@ -1,4 +1,4 @@
-"""One capture as the bytes of its files, and the maps in them again."""
+"""Encoding of a capture to the bytes of its files, and decoding of its maps."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ABOUT = "scene.json"
 
 
 def encode_item(sample: Mapping[str, Any], clamped_pixels: int, layout: Layout) -> dict[str, bytes]:
-    """Return the files of a capture by name.
+    """Encode a capture; return the bytes of its files by name.
 
     Args:
-        sample: what :class:`~kornia_tidy.TiDyOptics` makes of a mapping, with ``"index"``, ``"name"`` and ``"mask"``.
-        clamped_pixels: how many of its pixels lay beyond the camera's range.
-        layout: which files.
+        sample: the mapping that :class:`~kornia_tidy.TiDyOptics` returns, with ``"index"``, ``"name"`` and ``"mask"``.
+        clamped_pixels: number of pixels beyond the camera's range of depth.
+        layout: files of a capture.
 
     Example:
         >>> picture, one = torch.zeros(3, 2, 2), torch.ones(1, 2, 2)
@@ -49,18 +49,18 @@ def encode_item(sample: Mapping[str, Any], clamped_pixels: int, layout: Layout) 
 
 
 def decode_map(name: str, data: bytes, path: str) -> Tensor:
-    """Return a map, (C, H, W), from the bytes of its file.
+    """Decode a map, (C, H, W), from the bytes of its file.
 
     Args:
         name: ``"coded"``, ``"image"``, ``"depth"`` or ``"mask"``.
         data: the bytes.
-        path: how messages call them.
+        path: of the file, for messages.
 
     Returns:
         bool for the mask, else float32.
 
     Raises:
-        ValueError: if they are damaged.
+        ValueError: if the bytes are damaged.
     """
     stored = decode_stored(data, path).transpose(2, 0, 1)
     if name == "mask":
@@ -71,7 +71,7 @@ def decode_map(name: str, data: bytes, path: str) -> Tensor:
 
 
 def _encode_npy(values: Tensor) -> bytes:
-    """Rows, columns and, if there are several, channels."""
+    """Encode (C, H, W) as an NPY file (H, W, C), or (H, W) for one channel."""
     rows = values.detach().float().cpu().numpy().transpose(1, 2, 0)
     data = io.BytesIO()
     np.save(data, np.ascontiguousarray(rows[..., 0] if rows.shape[2] == 1 else rows), allow_pickle=False)

@@ -1,4 +1,4 @@
-"""What captures look like on disk: which files each item has, and which items lie together."""
+"""Layout of captures on disk: the files of an item, and folders or shards of items."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 from kornia_tidy.checks import check_choice
 
-BESIDE = ("image", "depth", "mask")  # what may lie beside the coded image
+BESIDE = ("image", "depth", "mask")  # optional maps beside the coded image
 
 
 class Part(NamedTuple):
-    """What is written as a whole, or not at all."""
+    """A folder or shard, which is written atomically, and its items."""
 
     name: str
     items: range
@@ -19,16 +19,16 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The files of a rendered data set.
+    """Files of a coded data set.
 
-    An item has ``coded``, what is asked for beside it, and ``scene.json``: number, name, and how many pixels lay beyond
-    the camera's range. It is a folder ``000123/coded.png``, or part of a shard, a tar file with members
-    ``000123.coded.png``, as WebDataset reads them.
+    An item has ``coded``, the maps ``beside`` it, and ``scene.json`` with its number, its name, and the number of
+    pixels beyond the camera's range of depth. It is a folder, with files such as ``000123/coded.png``, or part of a
+    shard: a tar file with members such as ``000123.coded.png``, the format of WebDataset.
 
     Args:
         beside: some of ``"image"`` (the all-in-focus image), ``"depth"`` and ``"mask"`` (where depth is known).
-        floats: images as float32 NPY (H, W, 3), as they are. False: PNG of 16 bits, clipped to [0, 1]. Depth is always
-            a float32 NPY (H, W), as infinity belongs to it.
+        floats: store images as float32 NPY (H, W, 3), unclipped. False: as 16-bit PNG, clipped to [0, 1]. Depth is
+            always a float32 NPY (H, W), as it may be infinite.
         shard_items: items in a shard. None: a folder for each item.
 
     Raises:
@@ -53,11 +53,11 @@ class Layout:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The maps that an item has."""
+        """Names of the maps of an item."""
         return ("coded", *self.beside)
 
     def parts(self, count: int) -> list[Part]:
-        """Return the folders or shards of so many items."""
+        """Return the folders or shards of a number of items."""
         if self.shard_items is None:
             return [Part(item_key(index), range(index, index + 1)) for index in range(count)]
         size = self.shard_items
@@ -66,5 +66,5 @@ class Layout:
 
 
 def item_key(index: int) -> str:
-    """Return what an item is called: its number, in six digits or more."""
+    """Return the key of an item: its number in six digits or more."""
     return f"{index:06d}"

@@ -1,7 +1,7 @@
-"""From a data set of scenes to coded captures on disk: stopped anywhere, it goes on; shared by any number of processes.
+"""Photographing of a data set of scenes to captures on disk, resumable and by any number of processes.
 
-What an item becomes follows from camera, scene, seed and number alone. On the CPU the last digit of a capture depends
-on the number of threads, so every process renders with one, and many processes make use of a machine.
+A capture depends on camera, scene, seed and number alone. On the CPU its last digit depends on the number of threads:
+every process uses one thread, and several processes share the work.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Each = Callable[[int, int], None]
 
 
 class Rendered(NamedTuple):
-    """What one process did of its share."""
+    """Numbers of captures of one process."""
 
     made: int
-    """Items rendered now."""
+    """Items photographed in this call."""
     found: int
-    """Items that were there already."""
+    """Items that existed before."""
 
 
 def render_scenes(
@@ -57,33 +57,33 @@ def render_scenes(
     made_from: Mapping[str, Any] | None = None,
     each: Each | None = None,
 ) -> Rendered:
-    """Photograph every scene of a data set and write the captures; what is there already is left as it is.
+    """Photograph every scene of a data set and write the captures that do not exist yet.
 
     Args:
         optics: the camera.
-        scenes: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere. What
-            it draws at random it draws from torch's, NumPy's or Python's global generators.
-        folder: made if missing. It gets ``render.json`` (everything that made the captures), the captures, and when all
-            of them are there ``index.csv``. Read it with :class:`CodedCaptures`.
-        layout: which files. Default: a folder for each item, with everything in it.
+        scenes: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
+            Random scenes must use the global generators of torch, NumPy or Python.
+        folder: made if missing. It gets ``render.json`` (all that determines the captures), the captures and, after the
+            last one, ``index.csv``. :class:`CodedCaptures` reads it.
+        layout: files of the captures. Default: a folder with all maps for each item.
         seed: of the sensor's noise. The capture of item i is that of ``optics.as_transform(seed)`` at index i.
-        jobs: processes that render here.
-        rank: number of this process among those that share the work, here or on other machines that see the folder.
-        world: number of those. They need not run at the same time, nor know of each other.
+        jobs: number of worker processes of this call.
+        rank: number of this call among those that share the work, here or on other machines that see the folder.
+        world: number of those calls. They need not run at the same time.
         made_from: how camera and scenes were made, as plain values, for ``render.json``.
-        each: is told after each item how many of this process's items are done, and how many it has.
+        each: called after each item with the number of finished items and of all items of this call.
 
     Returns:
-        How many items this process has rendered, and found.
+        Numbers of items that this call photographed and found.
 
     Raises:
-        ValueError: if the folder holds other captures, or a scene cannot be used; what is written stays.
-        OSError: if a capture cannot be written, the disk being full for one; what is written stays.
+        ValueError: if the folder holds other captures, or a scene cannot be used; written captures are kept.
+        OSError: if a capture cannot be written, for example because the disk is full; written captures are kept.
 
     Convention:
-        - An item, or a shard of items, appears under its name when it is whole. Killed at any moment, the next run goes
-          on, with whatever number of processes, and ends with the same bytes.
-        - The same bytes on machines of one kind: other processors round the last digit of PSFs and FFTs differently.
+        - An item or shard appears under its name when it is complete. After an interruption at any moment, the next
+          call resumes, with any number of processes, and ends with the same bytes.
+        - Bytes are equal on machines of one kind: other processors round the last digit of PSFs and FFTs differently.
 
     Example:
         >>> import tempfile
@@ -124,12 +124,12 @@ def render_scenes(
 
 
 def shard_items_within(optics: TiDyOptics, scenes: Dataset[Any], layout: Layout, size: int, seed: int = 0) -> int:
-    """Return how many items a shard of a size holds, if all are as large as the first; at least one.
+    """Return the number of items in a shard of a given size, if all are as large as the first; at least one.
 
     Args:
         optics: the camera.
         scenes: the data set.
-        layout: which files; its own ``shard_items`` is not looked at.
+        layout: files of the captures; its ``shard_items`` is ignored.
         size: bytes of a shard.
         seed: of the sensor's noise.
 
@@ -144,15 +144,15 @@ def shard_items_within(optics: TiDyOptics, scenes: Dataset[Any], layout: Layout,
     return max(1, size // (blocks * tarfile.BLOCKSIZE))
 
 
-# ---------------------------------------------------------------------- rendering
+# ---------------------------------------------------------------------- photographing
 
 
 class _Captures(Dataset):
-    """The files of each capture; or a sentence, since a worker's exception would come back as its whole traceback."""
+    """Data set of encoded captures; a failed one is a sentence, as an exception in a worker shows its traceback."""
 
     def __init__(self, scenes: Any, optics: TiDyOptics, layout: Layout, seed: int) -> None:
         self.scenes, self.layout, self.seed = scenes, layout, seed
-        self.optics = copy.deepcopy(optics)  # without the PSFs it remembers, which more threads may have made
+        self.optics = copy.deepcopy(optics)  # without cached PSFs, which more threads may have computed
         self.transform = self.optics.as_transform(seed)
 
     def __getitem__(self, index: int) -> Files | str:
@@ -162,19 +162,19 @@ class _Captures(Dataset):
                 sample.setdefault("mask", torch.ones_like(sample["depth"]))
                 return encode_item(sample, self.optics.clamped_pixels, self.layout)
         except (KeyError, OSError, TypeError, ValueError) as error:
-            reason = error.args[0] if isinstance(error, KeyError) else error  # which would come in quotes
+            reason = error.args[0] if isinstance(error, KeyError) else error  # as str() adds quotes
             return f"scene {index} of the data cannot be used: {reason}"
 
 
 def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[Capture]:
-    """Render items in this order; with several ``jobs``, processes keep some ahead of the one that writes."""
+    """Yield captures in the order of indices; with several ``jobs``, worker processes compute them in advance."""
     loader = DataLoader(
         items,
         batch_size=None,
         sampler=indices,
         num_workers=0 if jobs == 1 else jobs,
         worker_init_fn=_end_with_parent,
-        generator=torch.Generator().manual_seed(0),  # or it would draw from the global one
+        generator=torch.Generator().manual_seed(0),  # else it would draw from the global generator
     )
     for index, files in zip(indices, loader, strict=True):
         if isinstance(files, str):
@@ -183,7 +183,7 @@ def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[C
 
 
 def _end_with_parent(_: int) -> None:
-    """End this process with the one that writes: if that is killed, it would wait for ever to hand over a capture."""
+    """End a worker with its parent: if that is killed, the worker would wait for ever to hand over a capture."""
 
     def watch() -> None:
         if parent := multiprocessing.parent_process():
@@ -213,7 +213,7 @@ def _one_thread() -> Generator[None]:
 
 
 def _write(path: Path, captures: Iterable[Capture], layout: Layout) -> None:
-    """Write a folder or a shard, whole or not at all."""
+    """Write a folder or a shard atomically."""
     if layout.shard_items is None:
         for _, files in captures:
             write_folder(path, files)
@@ -222,16 +222,16 @@ def _write(path: Path, captures: Iterable[Capture], layout: Layout) -> None:
         with tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as shard:
             for key, files in captures:
                 for name, data in files.items():
-                    member = tarfile.TarInfo(f"{key}.{name}")  # of 1970 and nobody: bytes do not tell who and when
+                    member = tarfile.TarInfo(f"{key}.{name}")  # without time and owner, so that bytes are reproducible
                     member.size = len(data)
                     shard.addfile(member, io.BytesIO(data))
         with temporary.open("rb") as written:
-            os.fsync(written.fileno())  # or a power cut could leave the name on data never stored
+            os.fsync(written.fileno())  # else a power cut could leave an incomplete file under the name
 
 
 @contextmanager
 def _told() -> Generator[None]:
-    """Say what a failure to write leaves."""
+    """Add to an ``OSError`` that written captures are kept."""
     try:
         yield
     except (FileExistsError, FileNotFoundError):
@@ -242,7 +242,7 @@ def _told() -> Generator[None]:
 
 @contextmanager
 def _unless_there(path: Path) -> Generator[None]:
-    """Let a failure be where another process has meanwhile written the same, and perhaps tidied up."""
+    """Ignore a failure if another process has meanwhile written the same file or folder."""
     try:
         yield
     except (FileExistsError, FileNotFoundError):
@@ -251,7 +251,7 @@ def _unless_there(path: Path) -> Generator[None]:
 
 
 def _finish(folder: Path, parts: Sequence[Part], layout: Layout) -> None:
-    """Write the index, by whichever process sees the last part come; then nobody writes here any more."""
+    """Write the index and remove temporary files, in the process that finds all parts complete."""
     index = folder / INDEX
     if not index.exists():
         with _unless_there(index), _told():

@@ -25,7 +25,7 @@ from kornia_tidy.figures.explained import explain
 from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.tasks import metres, nearness, split_maps
+from kornia_tidy.inference.tasks import metres, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> None:
             camera = optics.camera
             assert isinstance(camera, ThinLensCamera)  # as in the training of the systems
             scene = _scene(args, camera)
-            near = nearness(camera, scene.depth)
+            near = normalised_inverse_depth(camera, scene.depth)
         estimates = {}
         for name, system in systems.items():
             with step(name):

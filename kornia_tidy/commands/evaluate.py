@@ -16,7 +16,8 @@ from kornia_tidy.commands.train import add_scene_options, given_settings
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.data_sets import make_scenes
-from kornia_tidy.training.evaluation import Looked, draw_scene, evaluate, metric_range, table, write_table
+from kornia_tidy.training.evaluation import SceneResult, draw_scene, evaluate, metric_range, table, write_table
+from kornia_tidy.training.settings import TrainingSettings
 
 DESCRIPTION = """\
 Evaluate a trained camera and network on scenes that were not used for training. FOLDER
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     system = load_trained(args.checkpoint)
-    trained = system.settings
+    trained = TrainingSettings.of(system)
     settings = trained.replace(**{name: value for name, value in given_settings(args).items() if name != "scenes"})
     if settings.data != trained.data and "root" not in args:
         settings = settings.replace(root=None)  # the stored folder belongs to the other data set
@@ -76,9 +77,9 @@ def run(args: argparse.Namespace) -> None:
     numbers = count()
     with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene", disable=None) as progress:
 
-        def each(looked: Looked) -> None:
+        def each(result: SceneResult) -> None:
             if next(numbers) < args.pictures:
-                draw_scene(folder, looked)
+                draw_scene(folder, result)
             progress.update()
 
         rows = evaluate(system, scenes, args.noise_seed, each)

@@ -20,11 +20,11 @@ from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
 from kornia_tidy.files import read_bytes
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import build_optics, load_trained
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.systems.presets import SYSTEMS
 from kornia_tidy.training.data_sets import SPLITS, make_scenes
+from kornia_tidy.training.settings import TrainingSettings
 
 OF_SCENES = ("data", "root", "size", "scenes", "validation_scenes", "depth_range", "seed")
 OF_CAMERA = (
@@ -183,9 +183,10 @@ def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dic
     if args.checkpoint:
         system = load_trained(args.checkpoint)
         digest = hashlib.sha256(read_bytes(args.checkpoint)).hexdigest()
-        if given.get("data", system.settings.data) != system.settings.data:
+        trained = TrainingSettings.of(system)
+        if given.get("data", trained.data) != trained.data:
             given = {"root": None, **given}  # the stored folder belongs to the other data set
-        return system.optics, system.settings.replace(**given), {"checkpoint": str(args.checkpoint), "sha256": digest}
+        return system.optics, trained.replace(**given), {"checkpoint": str(args.checkpoint), "sha256": digest}
     settings = TrainingSettings().replace(**given)
     if not args.preset:
         return build_optics(settings), settings, {"options": {name: getattr(settings, name) for name in OF_CAMERA}}

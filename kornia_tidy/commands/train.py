@@ -13,12 +13,13 @@ from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.inference.heads import HEADS
-from kornia_tidy.inference.settings import PRECISIONS, SCHEDULES, TrainingSettings
-from kornia_tidy.inference.tasks import LOSSES, MAPS
+from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.lightning_extra import require_lightning
+from kornia_tidy.training.settings import PRECISIONS, SCHEDULES, TrainingSettings
+from kornia_tidy.training.task_loss import LOSSES
 
 DESCRIPTION = """\
 Learn the phase masks of a camera together with the network that reads its captures:

@@ -1,4 +1,7 @@
-"""Scenes with depth: readers for files, data sets, and scenes made by the library."""
+"""Scenes with depth: readers for image and depth files, published data sets, and dead leaves, painted at random.
+
+Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first.
+"""
 
 from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
 from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth

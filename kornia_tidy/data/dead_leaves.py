@@ -1,4 +1,4 @@
-"""Dead leaves: endless procedural scenes with exact depth and the statistics of natural images."""
+"""Dead leaves: procedural scenes with exact depth and the statistics of natural images."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.seeds import keyed_seed
 
-PIXELS_A_LEAF, MOST_LEAVES = 256, 3000  # in scenes of a data set: things of sizes as in photographs, with depth to see
-COVERAGE = 3.0  # how many leaves lie over a pixel on average; exp(-3) = 5 % of the picture shows the background
+PIXELS_A_LEAF, MOST_LEAVES = 256, 3000  # of scenes in a data set: sizes as in photographs
+COVERAGE = 3.0  # mean number of leaves over a pixel; exp(-3) = 5 % of the picture shows the background
 LARGEST_RADIUS = 0.5  # of the picture's geometric mean side
 SMALLEST_LEAF = 1.0  # px: a smaller leaf would fall between pixels
-MOST_FAR = 3.0  # exponent on nearness, from 1 in some scenes to this in others, every factor alike
-LARGEST_SLANT = 0.08  # of the dioptre range, from a leaf's middle to its edge
-OUTLINE_POINTS = 120  # divisible by 3, 4, 5 and 6: every corner of a polygon is hit
+MOST_FAR = 3.0  # largest exponent of normalised inverse depth; drawn from 1 to this, uniform in its logarithm
+LARGEST_SLANT = 0.08  # fraction of the dioptre range, from the middle of a leaf to its edge
+OUTLINE_POINTS = 120  # divisible by 3, 4, 5 and 6, so that every corner of a polygon is a point
 PEN = 0.6  # px by which cv2.fillPoly grows a shape: it fills every pixel that the outline touches
 SUBPIXEL_BITS = 4  # cv2 draws with fixed-point coordinates
 
 
 class _Leaves(NamedTuple):
-    """One entry per leaf, sorted from far to near; entry 0 is the background."""
+    """Leaves sorted from far to near; entry 0 is the background."""
 
     center: NDArray[np.float64]  # (N, 2) x, y in px
     radius: NDArray[np.float64]  # (N,) px, of the disc with the same area
     angle: NDArray[np.float64]  # (N,) rad
-    nearness: NDArray[np.float64]  # (N,) inverse depth at the centre, 0 = far end, 1 = near end of the range
-    slant: NDArray[np.float64]  # (N, 2) change of nearness per px along x and y
+    inverse_depth: NDArray[np.float64]  # (N,) normalised inverse depth at the centre, 0 = far, 1 = near end
+    slant: NDArray[np.float64]  # (N, 2) gradient of inverse_depth per px along x and y
     outline: NDArray[np.float64]  # (N, OUTLINE_POINTS, 2) px
 
 
@@ -49,24 +49,24 @@ def dead_leaves(
     num_leaves: int = 3000,
     seed: int = 0,
 ) -> tuple[Tensor, Tensor]:
-    r"""Paint one dead-leaves scene: textured shapes that occlude each other, with the depth of every pixel.
+    r"""Paint a dead-leaves scene: textured shapes that occlude each other, with the depth of every pixel.
 
-    Shapes (ellipses, pebbles, polygons, leaves) have radii with density :math:`\propto r^{-3}`, which gives the power
-    spectrum (:math:`1/f^2`) and the heavy-tailed gradients of natural images. Their inverse depths are
-    :math:`u^\gamma` of the way from the far end to the near one. u has the density :math:`\propto 1 / (b + (1 - b) u)`,
-    where b is the share of the picture that shows the background: this undoes the advantage of near leaves, so that
-    what is *seen* is uniform in u. Where :math:`\gamma` is 1, it is uniform in dioptres, and with it in defocus; from
-    scene to scene it varies up to 3, as most scenes hold more that is far (the mean is 0.35 of the range here, and 0.36
-    on 35 photographs with known depth).
+    Shapes (ellipses, pebbles, polygons, leaves) have radii of density :math:`\propto r^{-3}`, which gives the power
+    spectrum (:math:`1/f^2`) and the heavy-tailed gradients of natural images. Their normalised inverse depth is
+    :math:`u^\gamma`. u has the density :math:`\propto 1 / (b + (1 - b) u)`, where b is the fraction of the picture that
+    shows the background: near leaves hide far ones, and with this density visible pixels are uniform in u. With
+    :math:`\gamma = 1` they are uniform in dioptres and so in defocus. :math:`\gamma` varies from scene to scene
+    between 1 and 3, as most of a natural scene is far: the mean of the normalised inverse depth is 0.35 here and 0.36
+    in 35 photographs with known depth.
 
-    Size, colour and texture do not depend on depth: besides occlusion, nothing but defocus tells how far a leaf is.
+    Size, colour and texture do not depend on depth: only occlusion and defocus tell the depth of a leaf.
 
     Args:
         height: rows in pixels.
         width: columns in pixels.
         depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
-        num_leaves: number of shapes. They always cover the picture equally: more leaves are smaller ones.
-        seed: everything follows from it, whatever the global random state and the number of threads.
+        num_leaves: number of shapes. Their total area is fixed, so that more leaves are smaller.
+        seed: of all that is random. The scene does not depend on the global generators or the number of threads.
 
     Returns:
         The image, :math:`(3, H, W)` float32, sRGB-encoded in [0, 1], and the depth, :math:`(1, H, W)` float32, metres.
@@ -76,10 +76,10 @@ def dead_leaves(
             range is not 0 < near < far.
 
     Convention:
-        - Every pixel shows one surface: nothing is anti-aliased across outlines, so an edge in depth lies exactly on
-          the edge in the image. For soft edges paint at twice the size and average the image.
-        - Leaves are planes, a third of them slanted (inverse depth is affine in x and y, as perspective has it); where
-          two cross, the nearer one is seen. The background is a plane at the far end.
+        - Every pixel shows one surface: outlines are not anti-aliased, so that edges in depth and image coincide. For
+          soft edges paint at twice the size and average the image.
+        - Leaves are planes, a third of them slanted (inverse depth is affine in x and y, as in perspective). Where two
+          planes cross, the nearer one is visible. The background is a plane at the far end.
 
     Source: Matheron, Random Sets and Integral Geometry (1975); Lee, Mumford and Huang, Occlusion models for natural
     images, IJCV 41 (2001).
@@ -95,10 +95,10 @@ def dead_leaves(
     near, far = depth_range
     rng = np.random.default_rng(seed)
     leaves = _scatter_leaves(height, width, num_leaves, rng)
-    index, nearness = _rasterise(height, width, leaves)
+    index, inverse_depth = _rasterise(height, width, leaves)
     image = paint_leaves(index, leaves.center, leaves.radius, leaves.angle, rng)
 
-    dioptres = 1 / far + (1 / near - 1 / far) * nearness
+    dioptres = 1 / far + (1 / near - 1 / far) * inverse_depth
     depth = np.full_like(dioptres, np.inf)
     np.divide(1.0, dioptres, out=depth, where=dioptres > 0)
     depth = depth.astype(np.float32).clip(near, far)
@@ -106,7 +106,7 @@ def dead_leaves(
 
 
 class DeadLeaves(SceneDataset):
-    """Scenes painted when they are asked for: as many as one likes, none of them stored. See :func:`dead_leaves`.
+    """Data set of dead-leaves scenes, painted on access and not stored. See :func:`dead_leaves`.
 
     Args:
         length: number of scenes.
@@ -114,8 +114,8 @@ class DeadLeaves(SceneDataset):
         width: columns in pixels.
         depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
         num_leaves: number of shapes in a scene. Default: one for 256 pixels, and 3000 at most.
-        seed: data sets of different seeds share no scene: train with one, test with another.
-        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+        seed: data sets of different seeds share no scene: use one for training and another for testing.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
         ValueError: if the length is not a positive integer, or as :func:`dead_leaves` does.
@@ -155,7 +155,7 @@ class DeadLeaves(SceneDataset):
         return f"dead leaves {self.seed}/{index}"
 
     def read(self, index: int) -> Scene:
-        """Paint a scene; its depth is known everywhere."""
+        """Paint a scene."""
         seed = keyed_seed(self.seed, "scene", index)
         image, depth = dead_leaves(
             self.height, self.width, depth_range=self.depth_range, num_leaves=self.num_leaves, seed=seed
@@ -179,17 +179,17 @@ def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Lea
     largest = max(LARGEST_RADIUS * math.sqrt(height * width), 2 * SMALLEST_LEAF)
     smallest = _smallest_radius(height, width, count, largest)
     radius = _radius_at(rng.random(count), height, width, smallest, largest)
-    # A leaf may lie anywhere that touches the picture, so that the border is covered like the middle.
+    # Centres lie wherever a leaf touches the picture, so that the border is covered like the middle.
     center = rng.uniform(-1, 1, (count, 2)) * (np.array([width, height]) / 2 + radius[:, None])
     center += np.array([width - 1, height - 1]) / 2
 
     background = math.exp(-_coverage(height, width, count, smallest, largest))
-    visible_below = background ** rng.random(count)  # wanted share of the picture that lies farther than the leaf
-    nearness = np.sort((visible_below - background) / (1 - background)) ** (MOST_FAR ** rng.random())
+    visible_below = background ** rng.random(count)  # fraction of the picture that is to show farther leaves
+    inverse_depth = np.sort((visible_below - background) / (1 - background)) ** (MOST_FAR ** rng.random())
 
     angle = rng.uniform(0, 2 * math.pi, count)
     slant = np.where(rng.random(count) < 1 / 3, rng.uniform(0, LARGEST_SLANT, count), 0.0)
-    slant = np.minimum(slant, np.minimum(nearness, 1 - nearness)) / radius  # a leaf stays inside the range ...
+    slant = np.minimum(slant, np.minimum(inverse_depth, 1 - inverse_depth)) / radius  # stays within the depth range
     direction = rng.uniform(0, 2 * math.pi, count)
     outline = _outlines(angle, radius, rng) + center[:, None]
 
@@ -199,14 +199,14 @@ def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Lea
         center=np.concatenate([middle, center]),
         radius=np.concatenate([[math.hypot(height, width) / 2], radius]),
         angle=np.concatenate([[0.0], angle]),
-        nearness=np.concatenate([[0.0], nearness]),
+        inverse_depth=np.concatenate([[0.0], inverse_depth]),
         slant=np.concatenate([np.zeros((1, 2)), slant[:, None] * np.stack([np.cos(direction), np.sin(direction)], 1)]),
         outline=np.concatenate([frame, outline]),
     )
 
 
 def _coverage(height: int, width: int, count: int, smallest: float, largest: float) -> float:
-    """Mean number of leaves over a pixel, if radii have density r^-3 and centres lie wherever a leaf can touch."""
+    """Return the mean number of leaves over a pixel, for radii of density r^-3 and centres wherever a leaf touches."""
     centers = (
         height * width * (smallest**-2 - largest**-2) / 2
         + 2 * (height + width) * (1 / smallest - 1 / largest)
@@ -216,7 +216,7 @@ def _coverage(height: int, width: int, count: int, smallest: float, largest: flo
 
 
 def _smallest_radius(height: int, width: int, count: int, largest: float) -> float:
-    """The smallest radius for which ``count`` leaves give the wanted coverage, by bisection."""
+    """Return the smallest radius for which ``count`` leaves give the wanted coverage, by bisection."""
     low, high = SMALLEST_LEAF, 0.99 * largest
     for _ in range(50):
         middle = math.sqrt(low * high)
@@ -227,7 +227,7 @@ def _smallest_radius(height: int, width: int, count: int, largest: float) -> flo
 def _radius_at(
     rank: NDArray[np.float64], height: int, width: int, smallest: float, largest: float
 ) -> NDArray[np.float64]:
-    """Quantiles of the radii: density r^-3 on the picture, so r^-3 times the area from which a leaf can reach it."""
+    """Return quantiles of the radii: density r^-3 on the picture, times the area from which a leaf reaches it."""
     grid = np.geomspace(smallest, largest, 1025)
     density = grid**-3 * (width + 2 * grid) * (height + 2 * grid)
     share = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(grid))])
@@ -235,7 +235,7 @@ def _radius_at(
 
 
 def _outlines(angle: NDArray[np.float64], radius: NDArray[np.float64], rng: Generator) -> NDArray[np.float64]:
-    """Closed outlines (N, OUTLINE_POINTS, 2) around the origin; filled, each has the area of a disc of its radius."""
+    """Return closed outlines (N, OUTLINE_POINTS, 2) around the origin, of the area of a disc of their radius."""
     count = len(angle)
     turn = np.linspace(0, 2 * math.pi, OUTLINE_POINTS, endpoint=False)
     pebble = np.ones((count, OUTLINE_POINTS))
@@ -258,14 +258,14 @@ def _outlines(angle: NDArray[np.float64], radius: NDArray[np.float64], rng: Gene
 
 
 def _rasterise(height: int, width: int, leaves: _Leaves) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Which leaf each pixel sees, and its nearness there: painted from far to near, crossing planes compared."""
+    """Return the visible leaf of each pixel and its normalised inverse depth, painted from far to near."""
     index = np.zeros((height, width), np.int32)
-    nearness = np.full((height, width), -1.0)
+    inverse_depth = np.full((height, width), -1.0)
     corner = np.floor(leaves.outline.min(1)).astype(int).clip(0)
     end = np.ceil(leaves.outline.max(1)).astype(int) + 1
     end = np.minimum(end, [width, height])
     points = np.rint((leaves.outline - corner[:, None]) * 2**SUBPIXEL_BITS).astype(np.int32)
-    at_corner = leaves.nearness + ((corner - leaves.center) * leaves.slant).sum(1)
+    at_corner = leaves.inverse_depth + ((corner - leaves.center) * leaves.slant).sum(1)
     columns, rows = np.arange(width, dtype=float), np.arange(height, dtype=float)[:, None]
     boxes = np.concatenate([corner, end], 1).tolist()
     for leaf, (x0, y0, x1, y1) in enumerate(boxes):
@@ -275,8 +275,8 @@ def _rasterise(height: int, width: int, leaves: _Leaves) -> tuple[NDArray[np.int
         cv2.fillPoly(mask, [points[leaf]], 1, shift=SUBPIXEL_BITS)
         slant_x, slant_y = leaves.slant[leaf]
         plane = at_corner[leaf] + slant_x * columns[: x1 - x0] + slant_y * rows[: y1 - y0]
-        below = nearness[y0:y1, x0:x1]
+        below = inverse_depth[y0:y1, x0:x1]
         seen = mask.view(bool) & (plane > below)
         np.copyto(below, plane, where=seen)
         np.copyto(index[y0:y1, x0:x1], leaf, where=seen)
-    return index, nearness.clip(0, 1)  # ... and an outline that reaches beyond its radius is held at the ends
+    return index, inverse_depth.clip(0, 1)  # an outline can reach beyond its radius

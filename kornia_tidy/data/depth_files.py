@@ -1,4 +1,4 @@
-"""Depth files: metres with a mask of what is known, from stored depth or stored disparity."""
+"""Depth files: depth in metres and a validity mask, from stored depth or disparity."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
 from kornia_tidy.optics.units import tell_once
 
-UNKNOWN = 65535  # the largest number of 16 bits: how many data sets mark what no sensor saw
-NEAR_DISPARITY = 5.0  # pixels of disparity are more than this, metres of a room less
+UNKNOWN = 65535  # the largest 16-bit number, by which many data sets mark unknown depth
+NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
 
 
 class DepthMap(NamedTuple):
-    """Depth that a camera can render, and where it was measured."""
+    """Depth without holes, and the mask of measured pixels."""
 
     depth: Tensor
-    """(1, H, W) float32 in metres, positive everywhere; may be infinite. Holes carry their nearest known neighbour."""
+    """(1, H, W) float32 in metres, positive, maybe infinite. Holes have the value of the nearest known pixel."""
     valid: Tensor
     """(1, H, W) bool, False in holes."""
 
@@ -43,15 +43,15 @@ def read_depth(
     baseline_m: float | None = None,
     doffs_px: float = 0.0,
 ) -> DepthMap:
-    r"""Read a depth map in metres; holes are marked, then filled from their nearest neighbour.
+    r"""Read a depth map in metres, with holes marked in a mask and filled from the nearest known pixel.
 
     Stored values v are depth, :math:`z = s v`, or disparity, :math:`z = f B / (s v + d)`.
 
     Args:
         path: a PNG, TIFF, PGM, PFM or NPY file with one channel; an NPY file is (H, W) and is never unpickled.
         scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres.
-        kind: what is stored.
-        invalid: stored values that mean *unknown*, besides those named below.
+        kind: quantity that is stored.
+        invalid: stored values that mean *unknown*, besides those under Convention.
         focal_px: f, focal length in pixels; disparity only.
         baseline_m: B, distance between the two cameras in metres; disparity only.
         doffs_px: d, difference of the principal points in pixels; disparity only.
@@ -61,16 +61,16 @@ def read_depth(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is no image, cut short or damaged, has several channels or no valid pixel, if disparity comes
-            without calibration or depth with one, or if a number is not positive.
+        ValueError: if the file is no image, cut short or damaged, or has several channels or no valid pixel; if
+            disparity comes without calibration or depth with one; or if a number is not positive.
 
     Convention:
         - Always unknown: NaN, a stored integer 0 (as Kinect, KITTI and Middlebury mean it), depth of 0 or less, and
           disparity that is infinite or, with d added, negative.
-        - Infinite depth is a valid sky, and so is a floating-point disparity that is 0 with d added. Name them in
-          ``invalid`` where a data set means *unknown* by them.
-        - What looks like an unknown that was not named is warned of once a folder: a 65535 that stands alone, and in a
-          PFM file infinity that lies below numbers as large as disparities.
+        - Infinite depth is valid, such as a sky, and so is a floating-point disparity that is 0 with d added. List
+          them in ``invalid`` for a data set that means *unknown* by them.
+        - A warning, once per folder, names values that look like *unknown* and are not listed: 65535 far above all
+          other values, and in a PFM file infinity below values as large as disparities.
         - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
 
     Example:
@@ -102,13 +102,13 @@ def read_depth(
 
 
 def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: str, invalid: Collection[float]) -> None:
-    """Warn once a folder of values that usually mean *unknown* and would be read as depths."""
+    """Warn once per folder of values that usually mean *unknown* and would be read as depth."""
     if kind != "depth":
         return
     path = Path(path)
     if stored.dtype == np.uint16 and UNKNOWN not in invalid and bool((full := stored == UNKNOWN).any()):
         others = int(stored[~full].max(initial=0))
-        # Where depths go on up to the end, or the file says what its end means, it is one of them.
+        # It is a depth if other depths reach up to it, or if write_depth wrote the file.
         if others < 0.9 * UNKNOWN and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
             tell_once(
                 None,
@@ -119,7 +119,7 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
             )
     if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):
         endless = np.isinf(stored)
-        # A sky reaches up to the top of the picture, holes of stereo lie below something: 96 to 100 % in Middlebury's.
+        # A sky reaches the top of the picture; 96 to 100 % of the holes in Middlebury's files lie below known pixels.
         holes = endless & np.maximum.accumulate(~endless, axis=0)
         known = stored[np.isfinite(stored)]
         if 2 * holes.sum() > endless.sum() and np.median(known) > NEAR_DISPARITY:
@@ -141,7 +141,7 @@ def check_depth_options(
     baseline_m: float | None = None,
     doffs_px: float = 0.0,
 ) -> None:
-    """Raise as :func:`read_depth` does if its options contradict each other, before there is a file.
+    """Raise ``ValueError`` if options of :func:`read_depth` contradict each other.
 
     Raises:
         ValueError: if disparity comes without calibration or depth with one, or if a number is not positive.
@@ -164,15 +164,15 @@ def check_depth_options(
 
 
 def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0, *, saturate: bool = False) -> None:
-    """Write a depth map so that :func:`read_depth` with the same ``scale`` reads it back; whole or not at all.
+    """Write a depth map that :func:`read_depth` with the same ``scale`` reads back. The write is atomic.
 
     Args:
-        path: ``.pfm`` and ``.npy`` (H, W) keep float32; ``.png`` keeps 16-bit multiples of ``scale`` and says the
-            scale in a text.
+        path: ``.pfm`` and ``.npy`` (H, W) keep float32; ``.png`` keeps 16-bit multiples of ``scale`` and holds the
+            scale as a text.
         depth: :math:`(1, H, W)` in metres, positive, may be infinite.
         scale: metres per stored unit; 0.001 lets a PNG hold 1 mm to 65.535 m.
-        saturate: let the largest number of a PNG mean *so far or farther*, infinity too, and the smallest, 1, *so near
-            or nearer*. Else depths that it cannot hold are an error.
+        saturate: clip depths to what a PNG can hold: its largest number then means *this far or farther*, infinity
+            included, and its smallest, 1, *this near or nearer*. False: other depths raise ``ValueError``.
 
     Raises:
         TypeError: if the depth is not a floating-point tensor.
@@ -215,7 +215,7 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
 
 
 def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -> NDArray[np.float64]:
-    """Depth in metres; infinite at zero disparity, NaN (unknown) at negative and 0 (unknown) at infinite disparity."""
+    """Return depth: infinite at zero disparity, NaN (unknown) at negative and 0 (unknown) at infinite disparity."""
     depth = np.full_like(disparity, np.nan)
     depth[disparity == 0] = np.inf
     with np.errstate(over="ignore"):
@@ -224,7 +224,7 @@ def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -
 
 
 def fill_holes(depth: NDArray[np.float32], known: NDArray[Any]) -> NDArray[np.float32]:
-    """Give every hole of a map (H, W) the value of its nearest known pixel; at least one must be known."""
+    """Fill every hole of a map (H, W) with the value of the nearest known pixel; at least one must be known."""
     if known.all():
         return depth
     _, label = cv2.distanceTransformWithLabels(

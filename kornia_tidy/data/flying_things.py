@@ -1,4 +1,4 @@
-"""FlyingThings3D: synthetic stereo frames with exact disparity, whole or as the patches on which the paper trains."""
+"""FlyingThings3D: synthetic stereo frames with exact disparity, as whole frames or as patches like the paper's."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 
 FOCAL_PX = 1050.0  # 35 mm on a sensor 32 mm and 960 pixels wide
-NEAREST = 160.0  # px of disparity, which holds what was seen: 1.1 to 152
+NEAREST = 160.0  # px of disparity; values found range from 1.1 to 152
 SOURCE = "https://lmb.informatik.uni-freiburg.de/resources/datasets/SceneFlowDatasets.en.html"
 
-PATCH_SIZE = 278  # px: 256 remain where a PSF of 23 pixels sees no border
+PATCH_SIZE = 278  # px; 256 of them lie half a PSF of 23 pixels or more from the border
 PATCH_COUNTS = {"train": 5077, "val": 553, "test": 419}
-HELD_OUT = 10  # every tenth sequence of TRAIN is for validation: 553 of 5630 patches are one in ten
+HELD_OUT = 10  # every tenth sequence of TRAIN is for validation, as 553 of 5630 patches are in the paper
 
 
 class FlyingThings3D(SceneDataset):
-    r"""The frames of FlyingThings3D with depth, :math:`z = f B / d` from disparity d, or with normalised disparity.
+    r"""Frames of FlyingThings3D, with depth :math:`z = f B / d` from disparity d or with normalised disparity.
 
     Args:
         root: the folder that holds ``frames_cleanpass`` (PNG) or ``frames_cleanpass_webp``, and ``disparity``, as
             published.
-        split: the published halves; they share no object and no texture.
-        frames: ``"cleanpass"`` is sharp everywhere. ``"finalpass"`` has motion blur and defocus of its own.
+        split: the published split; its parts share no object and no texture.
+        frames: ``"cleanpass"`` is sharp everywhere. ``"finalpass"`` has motion blur and defocus.
         view: which of the two cameras.
-        subsets: which of the parts A, B and C; they differ in how things and camera move.
-        baseline_m: B, how many metres the two cameras are taken to be apart. Default: 1.
-        disparity_range: (far, near) in pixels: depth is then the disparity, scaled to 0 at the first and 1 at the
-            second, for a camera of :class:`~kornia_tidy.DefocusRange`. What lies outside is clamped, and False in the
+        subsets: which of the parts A, B and C; they differ in the motion of objects and camera.
+        baseline_m: B, assumed distance between the two cameras in metres. Default: 1.
+        disparity_range: (far, near) in pixels: depth is then the disparity, scaled to 0 at far and 1 at near,
+            for a camera of :class:`~kornia_tidy.DefocusRange`. Disparities outside are clamped, and False in the
             mask.
-        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
-        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
         ValueError: if frames have no disparity, or an argument is not as above.
 
     Convention:
-        - The data have no size: the cameras are 1 unit apart. Taken as a metre, the median disparities of frames seen
-          (26 to 46 pixels) are 23 to 40 m; ``baseline_m=0.05`` brings them to 1.1 to 2.0 m.
+        - The data have no metric scale: the cameras are 1 unit apart. With a unit of one metre the median disparities
+          of the frames examined (26 to 46 pixels) are 23 to 40 m; with ``baseline_m=0.05`` they are 1.1 to 2.0 m.
         - A name is the published path without its suffix, ``"TRAIN/A/0000/left/0006"``.
 
     Source: Mayer et al., A Large Dataset to Train Convolutional Networks for Disparity, Optical Flow, and Scene Flow
@@ -107,7 +107,7 @@ class FlyingThings3D(SceneDataset):
         return Scene(scene.image, level.clamp(0, 1), scene.valid & (level >= 0) & (level <= 1))
 
     def _check_disparities(self, split: str, view: str, subsets: str) -> None:
-        """A frame without disparity is found here, not hours into an epoch."""
+        """Raise ``ValueError`` if a frame has no disparity file."""
         disparity = self.root / "disparity"
         parts = [f"{split.upper()}/{subset}" for subset in sorted(set(subsets))]
         known = {name for part in parts for name in _list_names(disparity, part, view, ".pfm")}
@@ -122,7 +122,7 @@ class FlyingThings3D(SceneDataset):
 def split_frames(
     root: str | os.PathLike[str], split: Literal["train", "val", "test"] = "train", **options: Any
 ) -> Subset[Any]:
-    """The frames of FlyingThings3D in three parts: every tenth sequence of the published TRAIN is for validation.
+    """Return a split of FlyingThings3D in which every tenth sequence of the published TRAIN is for validation.
 
     Args:
         root: see :class:`FlyingThings3D`.
@@ -155,25 +155,25 @@ def paper_patches(
     seed: int = 0,
     transform: Transform | None = None,
 ) -> Patches:
-    """Patches of 278x278 pixels from FlyingThings3D with normalised disparity, on which the paper trains.
+    """Return patches of 278x278 pixels from FlyingThings3D with normalised disparity, like those of the paper.
 
-    The paper takes 5077 patches for training and 419 for testing, which others cut, with 553 for validation; from which
-    frames, and how disparity was normalised, is not published. These are as many, drawn by the seed from the left clean
-    frames: results compare with the paper's in kind, not to the digit.
+    The paper uses 5077 patches for training and 419 for testing from an earlier work, which has 553 for validation.
+    Neither their frames nor the normalisation of disparity are published. These patches are equal in number, drawn by
+    the seed from the left clean frames, so that results are comparable to the paper's but not equal.
 
     Args:
         root: see :class:`FlyingThings3D`.
         split: training and validation are from different sequences of the published TRAIN, testing from TEST.
-        count: how many patches. Default: as many as in the paper.
-        disparity_range: (far, near) in pixels that become 0 and 1.
-        seed: another one cuts other patches.
+        count: number of patches. Default: that of the paper.
+        disparity_range: (far, near) in pixels, which become 0 and 1.
+        seed: of the choice of frames and places.
         transform: called with each patch.
 
     Returns:
         A data set for a camera of ``DefocusRange(-20, 20)``.
 
     Raises:
-        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
         ValueError: if frames have no disparity, or an argument is not as above.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 3; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
@@ -199,7 +199,7 @@ def _check_disparity_range(disparity_range: tuple[float, float], baseline_m: flo
 
 
 def _frames_folder(root: Path, frames: str) -> tuple[Path, str]:
-    """Where the frames lie and how they end; PNG where both are."""
+    """Return the folder of the frames and their suffix; PNG, if WebP is there too."""
     for folder, suffix in ((root / f"frames_{frames}", ".png"), (root / f"frames_{frames}_webp", ".webp")):
         if folder.is_dir() and (root / "disparity").is_dir():
             return folder, suffix
@@ -212,7 +212,7 @@ def _frames_folder(root: Path, frames: str) -> tuple[Path, str]:
 
 
 def _list_names(folder: Path, part: str, view: str, suffix: str) -> list[str]:
-    """Published paths in a part, without suffix, in order; names are numbers, which leaves out what systems add."""
+    """Return the published paths in a part, sorted, without suffix; other files than numbered ones are left out."""
     if not (folder / part).is_dir():
         raise FileNotFoundError(
             f"{folder} has no {part}: unpack the whole archive, or name the parts that are there with subsets="

@@ -1,4 +1,4 @@
-"""Image files: encoded pictures as tensors in [0, 1], and back."""
+"""Image files: reading and writing pictures as tensors in [0, 1]."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 
 
 def read_image(path: str | os.PathLike[str]) -> Tensor:
-    """Read a picture.
+    """Read a picture as a tensor in [0, 1].
 
     Args:
         path: an 8- or 16-bit PNG, TIFF, JPEG, PGM or PPM, or a TIFF, PFM or NPY of floats that lie in [0, 1];
-            an NPY file is laid out (H, W) or (H, W, C), is never unpickled, and has its channels as R, G, B.
+            an NPY file has the layout (H, W) or (H, W, C) with channels R, G, B, and is never unpickled.
 
     Returns:
-        :math:`(3, H, W)`, or :math:`(1, H, W)` if the file is grey, float32 in [0, 1], encoded as stored (as a rule
+        :math:`(3, H, W)`, or :math:`(1, H, W)` for a grey file, float32 in [0, 1], encoded as in the file (usually
         sRGB).
 
     Raises:
@@ -37,8 +37,8 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ValueError: if it is no image, cut short or damaged, or has other channels, types or floats outside [0, 1].
 
     Convention:
-        Alpha is dropped. An orientation written in EXIF is ignored: a depth map of the same camera has none, and
-        calibrations belong to the sensor's own grid of pixels.
+        Alpha is dropped. The orientation in EXIF is ignored: a depth map of the same camera has none, and calibrations
+        refer to the pixels of the sensor.
 
     Example:
         >>> import tempfile
@@ -67,13 +67,13 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
 def write_image(
     path: str | os.PathLike[str], image: Tensor, bits: int = 8, info: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a picture as PNG, TIFF or JPEG, by the suffix of the path; whole or not at all.
+    """Write a picture as PNG, TIFF or JPEG, by the suffix of the path. The write is atomic.
 
     Args:
-        path: where to; an existing file is replaced.
+        path: of the file; an existing one is replaced.
         image: :math:`(3, H, W)` or :math:`(1, H, W)`, encoded, in [0, 1]; values outside are clipped.
         bits: 8, or 16 for PNG and TIFF.
-        info: camera and exposure, which become EXIF; see :func:`~kornia_tidy.data.metadata.with_exif`.
+        info: camera and exposure, written as EXIF; see :func:`~kornia_tidy.data.metadata.with_exif`.
 
     Raises:
         TypeError: if the image is not a floating-point tensor.

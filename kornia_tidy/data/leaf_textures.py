@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
-TILE = 480  # side of the tiles that noise and script are read from, px
+TILE = 480  # px; side of the tiles of noise and script
 GLYPH = (16, 12)  # rows and columns of one glyph in the script tile, px; both divide TILE
 
 PALETTES = (
@@ -23,9 +23,9 @@ PALETTES = (
     ("3b3a38", "6b6862", "9a958a", "c7c0b2", "e6e0d4", "7d6a55", "a3795a", "4a5560"),  # stone
     ("5c3a4a", "b05f7a", "e5a4b4", "f6dfe0", "8aa36a", "51663f", "d7b98e", "fffaf0"),  # blossom
 )
-SMOOTH = 0.35  # share of leaves without a pattern, as walls and skies: no blur tells how far they are
-ROUGHEST = 0.05  # deviation of the grain, of the light; on most leaves much less
-STRAY_COLOURS = 0.12  # share of leaves whose colour is from another palette
+SMOOTH = 0.35  # fraction of leaves without a pattern, as walls and skies, on which defocus is invisible
+ROUGHEST = 0.05  # largest standard deviation of the grain, relative to the light; most leaves have much less
+STRAY_COLOURS = 0.12  # fraction of leaves with colours of another palette
 
 
 def paint_leaves(
@@ -35,26 +35,26 @@ def paint_leaves(
     angle: NDArray[np.float64],
     rng: Generator,
 ) -> Array:
-    """Shade the picture whose pixels show the leaves ``index``.
+    """Return the shaded and textured picture of leaves.
 
     Args:
-        index: which leaf a pixel shows, (H, W).
+        index: number of the leaf that each pixel shows, (H, W).
         center: x and y of the leaves in pixels, (N, 2).
         radius: of the leaves in pixels, (N,).
         angle: of the leaves' main axes in radians from +x towards +y, (N,).
-        rng: colours and textures are drawn from it.
+        rng: generator of colours and textures.
 
     Returns:
-        The image, (H, W, 3) RGB, sRGB-encoded in [0, 1]. Textures are no finer than the pixels can carry.
+        The image, (H, W, 3) RGB, sRGB-encoded in [0, 1]. Textures are not finer than the pixels resolve.
     """
     height, width = index.shape
     count = len(radius)
     colours = _colours(count, rng)
     kind = rng.integers(0, len(TEXTURES), count)
     contrast = (rng.beta(2, 3, count) * (rng.random(count) > SMOOTH)).astype(np.float32)
-    contrast[kind == TEXTURES.index(_script)] = 1  # writing is there to be read
+    contrast[kind == TEXTURES.index(_script)] = 1  # writing has full contrast
     rough = (ROUGHEST * rng.random(count) ** 2).astype(np.float32)
-    style = rng.random((3, count), dtype=np.float32)  # three numbers that each texture reads in its own way
+    style = rng.random((3, count), dtype=np.float32)  # three numbers, whose meaning depends on the texture
     noise_tile, script_tile = _noise_tile(rng), _script_tile(rng)
 
     # Position on the leaf in pixels: along the picture and along the axes of the leaf.
@@ -84,7 +84,7 @@ def paint_leaves(
 
 
 def _colours(count: int, rng: Generator) -> tuple[Array, Array]:
-    """Ground and pattern colour of each leaf, (N, 3) each: mixtures within one palette a scene, a few of any other."""
+    """Return ground and pattern colours, (N, 3) each: mixtures within one palette per scene, a few of others."""
     table = np.array([[[int(c[i : i + 2], 16) for i in (0, 2, 4)] for c in p] for p in PALETTES], np.float32) / 255
     palette = np.full(count, rng.integers(len(table)))
     stray = rng.random(count) < STRAY_COLOURS
@@ -100,7 +100,7 @@ def _colours(count: int, rng: Generator) -> tuple[Array, Array]:
 
 
 def _noise_tile(rng: Generator) -> Array:
-    """Fractal noise of unit deviation with a 1/f amplitude; its left edge continues its right, its top its bottom."""
+    """Return periodic fractal noise of unit standard deviation with an amplitude of 1/f."""
     frequency = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None])
     frequency[0, 0] = np.inf
     noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((TILE, TILE))) / frequency)
@@ -108,7 +108,7 @@ def _noise_tile(rng: Generator) -> Array:
 
 
 def _script_tile(rng: Generator) -> Array:
-    """Lines of invented writing, 1 on 0: strokes between the points of a 3x3 grid, with gaps between words."""
+    """Return lines of invented writing, 1 on 0: strokes between points of a 3x3 grid, with gaps between words."""
     tile = np.zeros((TILE, TILE), np.uint8)
     corners = np.indices((TILE // GLYPH[1], TILE // GLYPH[0])).T.reshape(-1, 1, 1, 2) * [GLYPH[1], GLYPH[0]]
     strokes = corners + [3, 4] + [3, 4] * rng.integers(0, 3, (len(corners), 2, 3, 2))
@@ -118,8 +118,8 @@ def _script_tile(rng: Generator) -> Array:
 
 
 def _read_tile(tile: Array, x: Array, y: Array) -> Array:
-    """Values of a tile that repeats without end, interpolated linearly at pixel positions."""
-    side = 1024  # cv2.remap wants a picture, not a list, of less than 32768 rows
+    """Return values of a periodic tile, interpolated linearly at pixel positions."""
+    side = 1024  # cv2.remap takes pictures of less than 32768 rows
     rows = -(-x.size // side)
     at = np.zeros((2, rows * side), np.float32)
     at[0, : x.size], at[1, : x.size] = x % TILE, y % TILE
@@ -130,19 +130,19 @@ def _read_tile(tile: Array, x: Array, y: Array) -> Array:
 
 
 def _wave(position: Array, period: Array) -> Array:
-    """Stripes between 0 and 1: a sine at fine periods, wider ones with edges of about a pixel."""
+    """Return stripes between 0 and 1: a sine at fine periods, wider stripes with edges of about a pixel."""
     steepness = np.maximum(period / 5, 1)
     return (0.5 + 0.5 * steepness * np.sin(position * (2 * math.pi / period))).clip(0, 1)
 
 
 def _period(style: Array, size: Array) -> Array:
-    """From 4 pixels to about half a radius, every octave alike."""
+    """Return a period from 4 pixels to about half a radius, uniform in its logarithm."""
     return 4 * np.maximum(size / 8, 1) ** style
 
 
 def _plain(along: Array, across: Array, size: Array, style: Array, _tile: Array) -> Array:
-    slope = (style[0] - 0.5) * along + (style[1] - 0.5) * across
-    return (0.5 + slope / size).clip(0, 1)
+    ramp = (style[0] - 0.5) * along + (style[1] - 0.5) * across
+    return (0.5 + ramp / size).clip(0, 1)
 
 
 def _stripes(along: Array, across: Array, size: Array, style: Array, _tile: Array) -> Array:
@@ -169,13 +169,13 @@ def _veins(along: Array, across: Array, size: Array, style: Array, _tile: Array)
 
 
 def _script(along: Array, across: Array, _size: Array, style: Array, tile: Array) -> Array:
-    zoom = 1 + 0.6 * style[0]  # small print, so that a little blur makes it unreadable
+    zoom = 1 + 0.6 * style[0]  # small print, which little blur makes unreadable
     return _read_tile(tile, along / zoom + TILE * style[1], across / zoom + TILE * style[2])
 
 
 def _spots(along: Array, across: Array, size: Array, style: Array, _tile: Array) -> Array:
     period = 2 * _period(style[0], size)
-    shifted = along + period / 2 * (np.floor(across / period) % 2)  # every second row between the dots of the last
+    shifted = along + period / 2 * (np.floor(across / period) % 2)  # every second row is shifted by half a period
     off = np.hypot(shifted % period - period / 2, across % period - period / 2)
     return (period * (0.2 + 0.2 * style[1]) - off + 0.5).clip(0, 1)
 

@@ -1,4 +1,7 @@
-"""What a picture file says beside its picture: camera and exposure as EXIF, and texts in a PNG."""
+"""Metadata in picture files: camera and exposure as EXIF, and texts in a PNG.
+
+OpenCV writes EXIF from a block that is encoded already, from version 4.12 on, and no texts.
+"""
 
 from __future__ import annotations
 
@@ -11,28 +14,28 @@ from typing import Any
 
 from kornia_tidy.data.picture_header import JPEG, PNG
 
-ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # types of a TIFF field
+ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # types of TIFF fields
 SIZES = {1: 1, ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, 6: 1, UNDEFINED: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes
 EXIF_POINTER = 0x8769
 TIFF = b"II*\0"
 
 Field = tuple[int, int, int, bytes]
-"""Tag, type, number of values, and the values as they are stored."""
+"""Tag, type, number of values, and the bytes of the values."""
 
 
 def with_exif(file: bytes, info: Mapping[str, Any]) -> bytes:
-    """Return a PNG, JPEG or TIFF file with camera and exposure in it; the picture is not touched.
+    """Return a PNG, JPEG or TIFF file with EXIF added; the picture is not changed.
 
     Args:
-        file: the bytes of a file without EXIF.
+        file: bytes of a file without EXIF.
         info: any of ``make``, ``model``, ``lens`` (texts), ``exposure`` (seconds), ``aperture`` (f-number), ``iso``,
-            ``focal_length`` (metres), ``timestamp`` (a datetime); None is left out, as are other names.
+            ``focal_length`` (metres), ``timestamp`` (a datetime); None and other names are left out.
 
     Returns:
-        The file; the same if nothing is known.
+        The file, unchanged if ``info`` has none of these.
 
     Raises:
-        ValueError: if it is none of the three formats, or a TIFF of the byte order OpenCV does not write.
+        ValueError: if it is none of the three formats, or a big-endian TIFF.
 
     Source: CIPA DC-008, Exif 2.32, section 4.6; PNG 1.2 extensions 1.5 (``eXIf``); JPEG's APP1; TIFF 6.0, section 2.
     """
@@ -50,7 +53,7 @@ def with_exif(file: bytes, info: Mapping[str, Any]) -> bytes:
 
 
 def with_text(png: bytes, texts: Mapping[str, str]) -> bytes:
-    """Return a PNG file with texts in it, by keyword; of Latin letters.
+    """Return a PNG file with texts added by keyword, in Latin-1.
 
     Source: PNG specification, 11.3.4.3 (``tEXt``).
     """
@@ -60,7 +63,7 @@ def with_text(png: bytes, texts: Mapping[str, str]) -> bytes:
 
 
 def _fields(info: Mapping[str, Any]) -> tuple[list[Field], list[Field]]:
-    """The fields of a picture's directory, and those of its EXIF directory; both are empty if nothing is known."""
+    """Return the fields of the picture's directory and of its EXIF directory; both are empty without metadata."""
 
     def known(name: str) -> Any:
         return info.get(name)
@@ -93,7 +96,7 @@ def _rational(value: float) -> bytes:
 
 
 def _exif_block(picture: list[Field], photo: list[Field]) -> bytes:
-    """A TIFF file without a picture: header, directory, EXIF directory."""
+    """Return a TIFF file without a picture: header, directory, EXIF directory."""
     pointer: Field = (EXIF_POINTER, LONG, 1, b"\0\0\0\0")
     behind = 8 + len(_directory([*picture, pointer], 8))
     first = _directory([*picture, (EXIF_POINTER, LONG, 1, struct.pack("<I", behind))], 8)
@@ -101,7 +104,7 @@ def _exif_block(picture: list[Field], photo: list[Field]) -> bytes:
 
 
 def _with_directories(file: bytes, picture: list[Field], photo: list[Field]) -> bytes:
-    """A TIFF file whose directory is written anew behind it, with more in it; what it points to stays."""
+    """Return a TIFF file with a second, extended directory appended; the data it refers to stay in place."""
     (place,) = struct.unpack_from("<I", file, 4)
     (count,) = struct.unpack_from("<H", file, place)
     fields: list[Field] = []
@@ -118,7 +121,7 @@ def _with_directories(file: bytes, picture: list[Field], photo: list[Field]) -> 
 
 
 def _directory(fields: list[Field], place: int) -> bytes:
-    """A directory that will lie at a place of the file; values longer than four bytes follow it."""
+    """Return the bytes of a directory at an offset of the file, followed by its values longer than four bytes."""
     behind = place + 2 + 12 * len(fields) + 4
     table, longer = struct.pack("<H", len(fields)), b""
     for tag, kind, number, data in sorted(fields):
@@ -129,6 +132,6 @@ def _directory(fields: list[Field], place: int) -> bytes:
 
 
 def _with_chunk(png: bytes, kind: bytes, data: bytes) -> bytes:
-    """A PNG file with a chunk behind its header, which is 25 bytes long and comes after 8 of the signature."""
+    """Return a PNG file with a chunk inserted after its signature (8 bytes) and header (25 bytes)."""
     chunk = struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
     return png[:33] + chunk + png[33:]

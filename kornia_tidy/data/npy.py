@@ -1,4 +1,4 @@
-"""NPY, NumPy's file of one array: read without trust in its header."""
+"""NPY files, read without trusting their header: ``numpy.load`` evaluates it and allocates memory for its size."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _MOST_AXES = 8
 
 
 def decode_npy(data: bytes) -> NDArray[Any]:
-    """Turn the bytes of an NPY file into its array.
+    """Decode an NPY file.
 
-    The header is not evaluated, and nothing is unpickled. The number of bytes must be what it promises, which is known
-    before memory is taken.
+    The header is not evaluated, and nothing is unpickled. The number of bytes is compared with the header before memory
+    is allocated.
 
     Args:
-        data: the whole file.
+        data: bytes of the file.
 
     Returns:
-        The array, of truths, whole, real or complex numbers, in the byte order of this machine.
+        The array of booleans, integers, real or complex numbers, in the byte order of this machine.
 
     Raises:
         ValueError: if the header or the length is wrong, or the values are not numbers.

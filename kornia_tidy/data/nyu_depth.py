@@ -1,4 +1,4 @@
-"""NYU Depth v2: the 1449 labelled indoor frames of a Kinect, from the one MATLAB file in which they are published."""
+"""NYU Depth v2: 1449 labelled indoor frames of a Kinect, from the published MATLAB file."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ SOURCES = {
     SPLITS: "http://horatio.cs.nyu.edu/mit/silberman/indoor_seg_sup/splits.mat",
 }
 FRAME = (480, 640)
-INSIDE = slice(44, 471), slice(40, 601)  # rows and columns that the toolbox keeps, MATLAB's 45:471 and 41:601
+INSIDE = slice(44, 471), slice(40, 601)  # rows and columns that the toolbox evaluates, MATLAB's 45:471 and 41:601
 
 
 class NYUDepthV2(SceneDataset):
-    """The labelled frames of NYU Depth v2, with depth in metres. Needs h5py: ``pip install 'kornia-tidy[data]'``.
+    """Labelled frames of NYU Depth v2 with depth in metres. They need ``pip install 'kornia-tidy[data]'``.
 
     Args:
         root: the folder that holds ``nyu_depth_v2_labeled.mat`` and ``splits.mat``, as published.
-        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``, for which SciPy is needed; ``"all"``; or
-            the path of a text file with the numbers of frames, from 1, one a line.
-        raw: take the depth that the Kinect measured, with holes filled from their nearest neighbour and False in the
-            mask. Default: the published depth, whose holes were filled by colour (Levin et al.).
-        crop_border: cut the frame to the 427x561 pixels on which the set is evaluated, without its white border.
-        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
+        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``; ``"all"``; or
+            the path of a text file with the numbers of frames, from 1, one per line.
+        raw: the depth that the Kinect measured, with holes filled from the nearest known pixel and False in the mask.
+            Default: the published depth, whose holes were filled by colour (Levin et al.).
+        crop_border: crop the frame to the 427x561 pixels on which methods are evaluated, without its white border.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
-        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
         ImportError: if h5py is missing, or SciPy where it is needed.
-        ValueError: if a file is damaged or does not hold what it should.
+        ValueError: if a file is damaged or has other contents.
 
     Convention:
         - A name is the published number of the frame, from ``"0001"`` to ``"1449"``.
-        - The file is opened for each item and closed again: an open HDF5 file does not survive a fork. It takes half a
-          millisecond of ten.
+        - The file is opened and closed for each item, as an open HDF5 file does not survive a fork. This takes 0.5 ms
+          of the 10 ms for an item.
 
     Source: Silberman et al., Indoor Segmentation and Support Inference from RGBD Images, ECCV 2012.
     """
@@ -84,7 +84,7 @@ class NYUDepthV2(SceneDataset):
                 image, depth = file["images"][row], file[self.depths][row]
             except OSError as error:
                 raise ValueError(f"cannot read {self.path}: {error}") from error
-        # MATLAB keeps columns together and HDF5 rows: (480, 640, 3) arrives as (3, 640, 480).
+        # MATLAB stores columns, HDF5 rows: (480, 640, 3) is read as (3, 640, 480).
         window = INSIDE if self.crop_border else (slice(None), slice(None))
         image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
         known = depth > 0  # False for NaN too
@@ -97,7 +97,7 @@ class NYUDepthV2(SceneDataset):
         )
 
     def _count(self) -> int:
-        """The number of frames, once everything that items will take is known to be there."""
+        """Return the number of frames; raise ``ValueError`` if images or depths are missing or of another shape."""
         with _open(self.path) as file:
             shapes = {key: getattr(file.get(key), "shape", None) for key in ("images", self.depths)}
         images = shapes["images"]
@@ -110,7 +110,7 @@ class NYUDepthV2(SceneDataset):
 
 
 def _published(root: Path, name: str) -> Path:
-    """The path of a published file; says where to find it if it is not there."""
+    """Return the path of a published file; if it is missing, raise an error with its source."""
     if not (root / name).is_file():
         raise FileNotFoundError(f"NYU Depth v2 is not in {root}: download {SOURCES[name]} and keep it as {root / name}")
     return root / name
@@ -157,10 +157,10 @@ def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
         from scipy.io import loadmat  # noqa: PLC0415 - only this needs it
     except ImportError:
         raise ImportError(
-            f"{path} is a MATLAB 5 file, which needs SciPy: pip install scipy, or give split= a text file with the "
-            "numbers of the frames, one a line"
+            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text "
+            "file with the numbers of the frames, one per line"
         ) from None
     try:
         return loadmat(path)[key].ravel().astype(int)
-    except Exception as error:  # loadmat raises whatever its parser trips over
+    except Exception as error:  # of any type, for damaged files
         raise ValueError(f"cannot read {path}: it should hold trainNdxs and testNdxs: {error!r}") from error

@@ -1,4 +1,4 @@
-"""Pictures as OpenCV holds them, (H, W, C) in BGR and whole numbers, and as tensors: there and back."""
+"""Conversion between OpenCV's pictures, integer arrays (H, W, C) in BGR, and tensors."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_finite, check_float_tensor
 
-_ROWS = 256  # converted at a time, so that a large picture is not held in float64
+_ROWS = 256  # converted at a time, so that the float64 copy stays small
 
 
 def from_opencv(picture: NDArray[Any]) -> Tensor:
-    """Return a picture of OpenCV's as a tensor.
+    """Convert an OpenCV picture to a tensor.
 
     Args:
         picture: (H, W), (H, W, 1), (H, W, 3) in BGR or (H, W, 4) with alpha, which is dropped; uint8 or uint16.
@@ -24,7 +24,7 @@ def from_opencv(picture: NDArray[Any]) -> Tensor:
         (1, H, W), or (3, H, W) in RGB; float32 in [0, 1].
 
     Raises:
-        TypeError: if it is no array, or of another type.
+        TypeError: if it is no array, or of another data type.
         ValueError: if it is of another shape.
 
     Example:
@@ -48,7 +48,7 @@ def from_opencv(picture: NDArray[Any]) -> Tensor:
 
 
 def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
-    """Return a tensor as OpenCV holds pictures.
+    """Convert a tensor to an OpenCV picture.
 
     Args:
         image: (3, H, W) in RGB or (1, H, W); values outside [0, 1] are clipped.
@@ -58,7 +58,7 @@ def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
         (H, W, 3) in BGR, or (H, W); rounded to the nearest.
 
     Raises:
-        TypeError: if the image is not a floating-point tensor, or the type is another.
+        TypeError: if the image is not a floating-point tensor, or the data type is another.
         ValueError: if its shape or a value (NaN, infinity) is not as above.
 
     Example:

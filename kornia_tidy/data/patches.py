@@ -1,4 +1,4 @@
-"""Patches: crops of one size, cut alike from image, depth and mask."""
+"""Patches: crops of one size, with the same window for image, depth and mask."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from kornia_tidy.data.scene_dataset import Transform, UnreadableItemError, item_
 
 
 class Patches(Dataset[Any]):
-    """One random patch from each scene of a data set, always the same: it follows from the seed and the index.
+    """Data set of random patches, whose scenes and places depend on the seed and the index alone.
 
     Args:
         scenes: a map-style data set whose items are mappings with an ``"image"``: one of this library, or a ``Subset``.
         size: side of a patch in pixels, or (height, width).
-        count: how many patches. Up to ``len(scenes)`` all come from different scenes, in an order drawn by the seed;
-            after that scenes are taken again, at other places. Default: one a scene.
-        seed: another one gives other places and another order.
-        transform: called with each patch. Put the camera here, not into ``scenes``, or it pictures what is cut away.
+        count: number of patches. Up to ``len(scenes)`` all are from different scenes, in an order drawn by the seed;
+            after that scenes are used again, with other windows. Default: one per scene.
+        seed: of the windows and of the order of scenes.
+        transform: called with each patch. A camera belongs here: as a transform of ``scenes`` it would also photograph
+            what is cropped away.
 
     Raises:
         ValueError: if there are no scenes, or a size or the count is not positive.
         UnreadableItemError: from an item, if its scene cannot be read or is smaller than the patch.
 
     Convention:
-        - A patch is a sample of its own: ``"index"`` counts patches, ``"name"`` is the scene's with the top left
-          corner, ``"TRAIN/A/0000/left/0006@131,402"`` for row 131 and column 402.
-        - Every tensor of the sample that is as high and wide as the image is cut with it.
+        - ``"index"`` is the number of the patch; ``"name"`` is that of the scene with the top left corner,
+          ``"TRAIN/A/0000/left/0006@131,402"`` for row 131 and column 402.
+        - Every tensor of the sample with the height and width of the image is cropped.
 
     Example:
         >>> from kornia_tidy.data.dead_leaves import DeadLeaves
@@ -60,7 +61,7 @@ class Patches(Dataset[Any]):
             raise ValueError(f"count must be a positive number of patches, got {count}")
         self.seed = seed
         self.transform = transform
-        # Patches have the generators 0, 1, ...; the order of the scenes has one of its own.
+        # Patch i has generator i, and the order of scenes generator -1.
         self.order = torch.randperm(len(scenes), generator=item_generator(seed, -1)).tolist()
 
     def __len__(self) -> int:
@@ -82,16 +83,16 @@ class Patches(Dataset[Any]):
 def random_crop(
     sample: dict[str, Any], size: int | tuple[int, int], generator: torch.Generator | None = None
 ) -> dict[str, Any]:
-    """Cut a window of a given size, at a random place, from all maps of a sample alike.
+    """Crop all maps of a sample to the same random window.
 
     Args:
         sample: a mapping with an ``"image"`` :math:`(..., H, W)`.
         size: side of the window in pixels, or (height, width).
-        generator: where the place is drawn. Default: torch's global generator.
+        generator: of the window. Default: torch's global generator.
 
     Returns:
-        A new mapping: every tensor as high and wide as the image is cut, and holds no more memory than its window;
-        everything else is passed on.
+        A new mapping with a cropped copy of every tensor that has the height and width of the image; all other
+        entries are passed on.
 
     Raises:
         KeyError: if there is no image.
@@ -107,7 +108,7 @@ def random_crop(
 
 
 def central_crop(sample: dict[str, Any], size: int | tuple[int, int]) -> dict[str, Any]:
-    """Cut the window in the middle from all maps of a sample alike. See :func:`random_crop`.
+    """Crop all maps of a sample to the window in the middle. See :func:`random_crop`.
 
     Example:
         >>> central_crop({"image": torch.arange(25).view(1, 5, 5)}, (1, 3))["image"]
@@ -119,7 +120,7 @@ def central_crop(sample: dict[str, Any], size: int | tuple[int, int]) -> dict[st
 
 
 def crop(sample: dict[str, Any], top: int, left: int, height: int, width: int) -> dict[str, Any]:
-    """Cut the window that starts at row ``top`` and column ``left`` from all maps of a sample. See :func:`random_crop`.
+    """Crop all maps of a sample to the window at row ``top`` and column ``left``. See :func:`random_crop`.
 
     Raises:
         KeyError: if there is no image.
@@ -148,7 +149,7 @@ def _random_crop(
 
 
 def _fitting(size: tuple[int, int], sample: dict[str, Any]) -> tuple[int, int]:
-    """Height and width of a sample, into which a patch must fit."""
+    """Return height and width of a sample; raise ``ValueError`` if a patch does not fit."""
     height, width = sample["image"].shape[-2:]
     if size[0] > height or size[1] > width:
         raise ValueError(f"a patch of {size[0]} x {size[1]} pixels does not fit into an image of {height} x {width}")

@@ -1,6 +1,7 @@
-"""What a picture file says of its size before anything is decoded, and whether all of it is there.
+"""Size and completeness of a picture file, checked before it is decoded.
 
-Decoders take memory for what a header promises; and some fill up what is missing with grey, and say nothing.
+Decoders allocate memory for the size in the header, and some fill missing parts with grey without an error. OpenCV
+cannot read a header alone.
 
 Source: PNG 1.2, sections 3 and 4.1; ITU-T T.81 (JPEG), annex B; TIFF 6.0, section 2; Netpbm's ppm(5); Microsoft's
 BITMAPINFOHEADER; RFC 9649 (WebP).
@@ -20,9 +21,9 @@ LARGEST = 1 << 28  # pixels
 VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
 FORMATS = "PNG, JPEG, TIFF, PGM, PPM, PFM, BMP, WebP or NPY"
 
-_STARTS_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # which are tables, reserved, and arithmetic conditions
+_STARTS_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # tables, reserved, arithmetic conditioning
 _START_OF_SCAN, _END = 0xDA, 0xD9
-_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length: restarts and the start
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length: TEM, restarts and the start of the image
 _NETPBM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})\s")
 
 Size = tuple[int, int]
@@ -30,10 +31,10 @@ Size = tuple[int, int]
 
 
 def check_header(data: bytes) -> None:
-    """Refuse a picture file that is of no known format, that is cut short, or whose header promises too many pixels.
+    """Raise ``ValueError`` for a picture file of unknown format, cut short, or with too many pixels.
 
     Raises:
-        ValueError: if so.
+        ValueError: if the file is such.
     """
     for beginnings, size_of in _READERS:
         if data.startswith(beginnings):
@@ -47,12 +48,12 @@ def check_header(data: bytes) -> None:
 
 
 def check_pixels(name: str, rows: int, columns: int) -> None:
-    """Refuse a size that no memory would hold, before any is taken.
+    """Raise ``ValueError`` for a picture with too many pixels, before memory is allocated.
 
-    The limit is 2^28 pixels (16384 x 16384), or what ``KORNIA_TIDY_MAX_PIXELS`` says in the environment.
+    The limit is 2^28 pixels (16384 x 16384), or the environment variable ``KORNIA_TIDY_MAX_PIXELS``.
 
     Raises:
-        ValueError: if the size is beyond it.
+        ValueError: if the size is beyond the limit.
 
     Example:
         >>> check_pixels("the scene", 10**6, 10**6)
@@ -67,7 +68,7 @@ def check_pixels(name: str, rows: int, columns: int) -> None:
 
 
 def _png(data: bytes) -> Size:
-    """The size; every chunk that counts must be there and undamaged, to the last."""
+    """Return the size of a PNG; raise ``ValueError`` unless all critical chunks are complete and undamaged."""
     last, size = b"", (0, 0)
     place = len(PNG)
     while last != b"IEND":
@@ -87,7 +88,10 @@ def _png(data: bytes) -> Size:
 
 
 def _jpeg(data: bytes) -> Size:
-    """The size; an end marker must follow the last start of a scan, as the data of a scan cannot look like either."""
+    """Return the size of a JPEG; raise ``ValueError`` unless an end marker follows the last start of a scan.
+
+    Entropy-coded data cannot contain either marker.
+    """
     size, scan = None, None
     for marker, place in _segments(data):
         if marker in _STARTS_OF_FRAME and size is None:
@@ -101,13 +105,13 @@ def _jpeg(data: bytes) -> Size:
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """Each marker and where it stands, up to the end of the picture or of the file."""
+    """Yield each marker and its offset, up to the end of the image or of the file."""
     place = 2
     while (place := data.find(b"\xff", place)) >= 0 and place + 1 < len(data):
         marker = data[place + 1]
         if marker == _END:
             return
-        if marker in {0x00, 0xFF} or marker in _ALONE:  # a byte of the data, filling, or nothing behind it
+        if marker in {0x00, 0xFF} or marker in _ALONE:  # a data byte, a fill byte, or a marker without a length
             place += 1 if marker == 0xFF else 2
             continue
         yield marker, place
@@ -115,7 +119,7 @@ def _segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _tiff(data: bytes) -> Size:
-    """The size in the first directory, which is the one decoded."""
+    """Return the size in the first directory of a TIFF, which is the one decoded."""
     order, big = "<" if data[:2] == b"II" else ">", data[2 if data[:2] == b"II" else 3] == 0x2B
     count_form, entry_form, entry_size = ("Q", "HHQ", 20) if big else ("H", "HHI", 12)
     (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
@@ -142,11 +146,11 @@ def _netpbm(data: bytes) -> Size:
 def _bmp(data: bytes) -> Size:
     form = "<HH" if struct.unpack_from("<I", data, 14)[0] == 12 else "<ii"
     columns, rows = struct.unpack_from(form, data, 18)
-    return abs(rows), abs(columns)  # rows below zero: from the top
+    return abs(rows), abs(columns)  # negative rows: stored from the top
 
 
 def _webp(data: bytes) -> Size:
-    """Its three kinds: with more than a picture, lossless, and lossy."""
+    """Return the size of a WebP in its three forms: extended, lossless and lossy."""
     kind = data[12:16]
     if data[8:12] != b"WEBP" or kind not in {b"VP8X", b"VP8L", b"VP8 "}:
         raise ValueError("it is not an image in a known format, or its header is damaged")

@@ -1,4 +1,4 @@
-"""What image libraries print to stderr from C, where no warning filter reaches it: caught, for the caller to judge."""
+"""Capture of messages that image libraries print to stderr from C, beyond the reach of Python's warning filters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PIPE_HOLDS = 1 << 16
 
 
 class _Catch:
-    """One at a time: stderr belongs to the process. A fork in the meantime gets its stderr and a lock of its own."""
+    """Lock for the redirection of the process's stderr; a process forked meanwhile gets stderr back and a new lock."""
 
     def __init__(self) -> None:
         self.lock, self.saved = threading.Lock(), None
@@ -37,9 +37,9 @@ _catch = _Catch()
 
 @contextmanager
 def caught() -> Generator[list[str]]:
-    """Give a list that holds, after the block, the lines that image libraries printed in it to stderr.
+    """Yield a list that holds, after the block, the lines that image libraries printed to stderr in it.
 
-    Lines of others, such as another thread's, are printed when the block has ended.
+    All other lines, such as those of another thread, are printed after the block.
 
     Example:
         >>> with caught() as said:
@@ -51,13 +51,13 @@ def caught() -> Generator[list[str]]:
     with _catch.lock:
         try:
             saved = os.dup(_ERROR)
-        except OSError:  # closed: nobody can print there
+        except OSError:  # stderr is closed
             yield said
             return
         _catch.saved = saved
         read, write = os.pipe()
         try:
-            os.set_blocking(write, False)  # who prints more than a pipe holds need not wait for us
+            os.set_blocking(write, False)  # a writer does not wait when the pipe is full
             os.dup2(write, _ERROR)
             yield said
         finally:
@@ -75,7 +75,7 @@ def caught() -> Generator[list[str]]:
 
 
 def _all(pipe: int) -> bytes:
-    """What a pipe holds; another process that was forked meanwhile may still have its other end."""
+    """Return the contents of a pipe, without waiting for its end: a forked process may hold the other end."""
     parts = []
     try:
         while part := os.read(pipe, _PIPE_HOLDS):

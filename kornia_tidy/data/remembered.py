@@ -1,4 +1,4 @@
-"""Scenes that are dear to make and small to keep."""
+"""Cache of the items of a data set in memory."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from torch.utils.data import Dataset
 
 
 class Remembered(Dataset):
-    """A data set whose items are kept once they have been made, as many as fit into some memory.
+    """Data set that caches the items of another one, up to a limit of memory.
 
-    For items that follow from their index alone, such as painted scenes. Each worker of a loader remembers its own.
+    For items that depend on their index alone, such as painted scenes. Each worker of a loader has its own cache.
 
     Args:
         scenes: a map-style data set of mappings.
-        limit: bytes of tensors that are kept; what comes later is made each time.
+        limit: largest size of all cached tensors in bytes; further items are not cached.
 
     Example:
         >>> from kornia_tidy.data.dead_leaves import DeadLeaves
@@ -34,7 +34,7 @@ class Remembered(Dataset):
         return len(cast("Any", self.scenes))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return one scene: a mapping of its own, with tensors that others hold too and that nobody should change."""
+        """Return one scene: a new mapping of cached tensors, which must not be changed."""
         if index in self._kept:
             return dict(self._kept[index])
         item = self.scenes[index]

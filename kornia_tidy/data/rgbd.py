@@ -1,4 +1,4 @@
-"""RGB-D files: a picture and the depth of its pixels, read together."""
+"""RGB-D files: reading a picture together with its depth map."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Scene(NamedTuple):
     depth: Tensor
     """(1, H, W) float32 in metres, positive everywhere."""
     valid: Tensor
-    """(1, H, W) bool, False where depth was unknown and has been filled in."""
+    """(1, H, W) bool, False where depth was unknown and is filled in."""
 
 
 def read_rgbd(image_path: str | os.PathLike[str], depth_path: str | os.PathLike[str], **depth_options: Any) -> Scene:

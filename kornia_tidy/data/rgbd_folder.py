@@ -1,4 +1,4 @@
-"""Folders of pictures with depth: pairs of files found by the patterns of their names."""
+"""Folders of pictures with depth, paired by patterns of file names."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m",
 
 
 class RGBDFolder(SceneDataset):
-    """Pairs of image and depth files in a folder.
+    """Data set of image and depth files in a folder, paired by their names.
 
     Args:
         root: the folder.
-        image: pattern of the images' paths in it. Each ``*`` stands for a part of the name, of at least one character,
-            within one folder; everything else is literal.
-        depth: pattern of the depth files. Image and depth are a pair if every ``*`` stands for the same in both.
-        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also says what an item is.
-        **depth_options: how depth is stored: passed on to :func:`~kornia_tidy.data.depth_files.read_depth`.
+        image: pattern of the images' paths in the folder. Each ``*`` matches one or more characters other than ``/``;
+            everything else is literal.
+        depth: pattern of the depth files. Image and depth are a pair if every ``*`` matches the same in both.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
+        **depth_options: how depth is stored, see :func:`~kornia_tidy.data.depth_files.read_depth`.
 
     Raises:
         FileNotFoundError: if there is no folder, or no file fits a pattern.
-        ValueError: if a file has no partner, a pattern has no ``*`` or not as many as the other, or leads out of the
-            folder, or the options contradict each other.
+        ValueError: if a file has no partner; if a pattern has no ``*``, another number of them than the other one, or
+            leads out of the folder; or if the options contradict each other.
 
     Convention:
-        - Items are in the order of their names; a name is what the ``*`` stand for, joined by ``/``.
-        - A file that fits both patterns belongs to the longer one: ``"*.png"`` and ``"*_depth.png"`` may lie together.
+        - Items are sorted by name; a name is what the ``*`` match, joined by ``/``.
+        - A file that matches both patterns belongs to the longer one, so that ``"*.png"`` and ``"*_depth.png"`` may lie
+          in one folder.
 
     Example:
         >>> import tempfile, torch
@@ -71,20 +72,20 @@ class RGBDFolder(SceneDataset):
         return len(self.pairs)
 
     def name(self, index: int) -> str:
-        """Return what the patterns' ``*`` stand for."""
+        """Return the name of a pair: the parts that ``*`` matches."""
         return self.pairs[index][0]
 
     def read(self, index: int) -> Scene:
-        """Read a pair."""
+        """Read image and depth of a pair."""
         _, image, depth = self.pairs[index]
         return read_rgbd(self.root / image, self.root / depth, **self.depth_options)
 
 
 def described_folder(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
-    """Return the scenes of a folder that tells in ``rgbd.json`` which files are pairs and how depth is stored.
+    """Return the scenes of a folder by the description in its file ``rgbd.json``.
 
     Args:
-        root: the folder. The file in it holds arguments of :class:`RGBDFolder` as JSON, such as
+        root: the folder. ``rgbd.json`` in it holds arguments of :class:`RGBDFolder` as JSON, such as
             ``{"image": "*.png", "depth": "*_depth.png", "scale": 0.001}``.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
@@ -126,7 +127,7 @@ def _kind(name: str) -> str:
 
 
 def _fits(name: str, value: Any) -> bool:
-    """Whether a value of the description is of the type that the option wants."""
+    """Return whether a value of the description has the type of its option."""
     if _kind(name) == "a text":
         return isinstance(value, str)
     if name == "invalid":
@@ -135,12 +136,12 @@ def _fits(name: str, value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    """Of a size that floats have; JSON's whole numbers have no end."""
+    """Return whether a value is a number that a float can hold; integers in JSON may be larger."""
     return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 1000)
 
 
 def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
-    """Name, image and depth file of each pair, in the order of names; paths are within the root."""
+    """Return name, image and depth file of each pair, sorted by name; paths are relative to the root."""
     if image.count("*") != depth.count("*") or "*" not in image:
         raise ValueError(
             f"patterns must have a * and equally many of them, got image={image!r:.80}, depth={depth!r:.80}"
@@ -168,7 +169,7 @@ def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
 
 
 def _matches(root: Path, pattern: str) -> dict[tuple[str, ...], str]:
-    """What fits a pattern: from what the ``*`` stand for to the path within the root."""
+    """Return the files that match a pattern: path relative to the root by the parts that ``*`` matches."""
     parts = pattern.split("*")
     fits = re.compile("([^/]+)".join(map(re.escape, parts)))
     found = (

@@ -1,4 +1,4 @@
-"""What every data set of scenes gives: one mapping an item, read when it is asked for."""
+"""Base class of data sets of scenes: items are mappings of image, depth and mask, read on access."""
 
 from __future__ import annotations
 
@@ -15,33 +15,34 @@ Transform = Callable[[dict[str, Any]], Any]
 
 
 class UnreadableItemError(ValueError):
-    """An item of a data set that cannot be read; the message names the item, its file and what is wrong with it.
+    """Error of an unreadable item of a data set; the message names the item, its file and the fault.
 
-    Training code catches this, and nothing wider, to skip an item.
+    Training code can skip an item by catching this error.
     """
 
 
 class SceneDataset(Dataset[Any]):
-    """Pictures with depth, by number. Base class of the data sets of this library.
+    """Base class of the data sets of scenes.
 
-    A subclass says how many scenes there are (``__len__``), what a scene is called (:meth:`name`) and how it is read
-    (:meth:`read`). Items follow from their index alone: the same in every epoch, whatever the number of workers, forked
-    or spawned. No file stays open between items.
+    A subclass defines the number of scenes (``__len__``), the name of a scene (:meth:`name`) and how it is read
+    (:meth:`read`). Items depend on their index alone: they are the same in every epoch and for any number of workers,
+    forked or spawned. No file stays open between items.
 
     Args:
-        transform: called with each sample, for example ``optics.as_transform(seed=0)``. Default: nothing is done.
+        transform: called with each sample, for example ``optics.as_transform(seed=0)``. Default: samples are
+            returned as they are.
 
     Convention:
-        An item is a mapping that :class:`~kornia_tidy.TiDyOptics` takes, and that a data loader collates:
+        An item is a mapping that :class:`~kornia_tidy.TiDyOptics` takes and a data loader collates:
 
         - ``"image"``: :math:`(3, H, W)` float32 in [0, 1], sRGB-encoded; a grey picture is repeated.
-        - ``"depth"``: :math:`(1, H, W)` float32, metres, positive and maybe infinite; a normalised disparity in [0, 1],
-          1 nearest, where a data set says so.
+        - ``"depth"``: :math:`(1, H, W)` float32, metres, positive and maybe infinite; for some data sets a normalised
+          disparity in [0, 1], 1 nearest.
         - ``"mask"``: :math:`(1, H, W)` bool, False where depth was unknown and is filled in.
         - ``"index"``: int; ``"name"``: str.
 
-        kornia's containers warp ``"mask"`` with the image, and what is called ``"depth"`` not at all: rename it to
-        ``"mask_depth"`` first, which the camera takes as well. :class:`~kornia_tidy.data.Patches` needs no renaming.
+        kornia's containers transform ``"mask"`` like the image, but not ``"depth"``: rename it to ``"mask_depth"``
+        before, which the camera also takes. :class:`~kornia_tidy.data.Patches` needs no renaming.
     """
 
     def __init__(self, transform: Transform | None = None) -> None:
@@ -53,18 +54,18 @@ class SceneDataset(Dataset[Any]):
 
     @abstractmethod
     def name(self, index: int) -> str:
-        """Return what the scene is called, without reading it."""
+        """Return the name of a scene without reading it."""
 
     @abstractmethod
     def read(self, index: int) -> Scene:
-        """Read one scene; a ``ValueError`` or ``OSError`` names the file."""
+        """Read one scene; raise ``ValueError`` or ``OSError`` with the name of the file if it cannot be read."""
 
     def __getitem__(self, index: SupportsIndex) -> Any:
         """Return one sample; a negative index counts from the end.
 
         Raises:
             IndexError: if there is no such item.
-            UnreadableItemError: if its file is damaged or gone.
+            UnreadableItemError: if its file is damaged or missing.
         """
         index = item_index(index, len(self))
         name = self.name(index)
@@ -79,7 +80,7 @@ class SceneDataset(Dataset[Any]):
 
 
 def item_index(index: SupportsIndex, length: int) -> int:
-    """Return the index as an int from 0; ``IndexError``, by which Python ends loops, if there is no such item."""
+    """Return the index as an int from 0; raise ``IndexError``, which ends Python's loops, if there is no such item."""
     number = operator.index(index)
     if not -length <= number < length:
         raise IndexError(f"item {number} of a data set of {length}")

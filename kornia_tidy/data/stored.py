@@ -1,4 +1,4 @@
-"""The numbers an image file stores, whatever its format."""
+"""Decoding of image files of any supported format to the numbers stored in them."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from kornia_tidy.data.picture_header import check_header
 from kornia_tidy.data.quiet import caught
 from kornia_tidy.files import read_bytes
 
-# What libraries print about a picture that they filled up; bytes too many at its end, as some cameras write, are none.
+# Beginnings of messages about incomplete pictures; surplus bytes at the end, as some cameras write, are harmless.
 _DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent progression", "Invalid SOS")
 _HARMLESS = "extraneous bytes before marker 0xd9"
 
 
 def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Read the numbers a file stores, as they are: PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP or NPY.
+    """Read the numbers in a PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP or NPY file, without any conversion.
 
-    The format is told from the content, not from the name. The size in the header is looked at before anything is
-    decoded, see :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. An orientation written in EXIF is
-    ignored: depth maps and calibrations belong to the sensor's own grid of pixels.
+    The format is recognised by content, not by name. The size in the header is checked before decoding, see
+    :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. The orientation in EXIF is ignored: depth maps
+    and calibrations refer to the pixels of the sensor.
 
     Args:
         path: the file.
 
     Returns:
-        (H, W, C) in the file's own data type; channels are grey or R, G, B; a fourth one, alpha, is dropped.
+        (H, W, C) in the data type of the file; channels are grey or R, G, B; alpha is dropped.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -42,10 +42,10 @@ def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def decode_stored(data: bytes, path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Return the numbers in the bytes of a file, as :func:`read_stored` does; messages call it by its path.
+    """Decode the bytes of an image file as :func:`read_stored` does; error messages name the path.
 
     Raises:
-        ValueError: if they are cut short, damaged or of no known format.
+        ValueError: if the file is cut short, damaged or of no known format.
     """
     try:
         if data.startswith(NPY):
@@ -71,14 +71,14 @@ def _decode_with_opencv(data: bytes) -> NDArray[Any]:
     check_header(data)
     logging = cv2.utils.logging
     level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # a bad file raises; OpenCV need not print it too
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # bad files raise an error instead
     try:
         with caught() as said:
             decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         decoded = None
     finally:
-        if level != logging.LOG_LEVEL_SILENT:  # another thread may have found it silenced by this one
+        if level != logging.LOG_LEVEL_SILENT:  # else another thread silenced it before
             logging.setLogLevel(level)
     if decoded is None:
         raise ValueError("it is damaged, or needs more memory than there is")

@@ -1,4 +1,4 @@
-"""Networks by name, so that settings and checkpoints can say which one they mean."""
+"""Reconstruction networks by name, as settings and checkpoints name them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from kornia_tidy.checks import check_choice
 from kornia_tidy.reconstruction.head import ReconstructionHead
 
-# Each takes in_channels, out_channels and width; (B, in_channels, H, W) to (B, out_channels, H, W). Imported when used.
+# Each takes in_channels, out_channels and width, and maps (B, in_channels, H, W) to (B, out_channels, H, W).
 HEADS = {
     "attention-unet": "kornia_tidy.reconstruction:AttentionUNet",
     "phasecam3d": "kornia_tidy.reconstruction:PhaseCam3DUNet",
@@ -25,7 +25,7 @@ def make_head(name: str, out_channels: int, width: int | None = None, in_channel
         name: a key of :data:`HEADS`.
         out_channels: maps to estimate.
         width: channels of its first level. None: its default.
-        in_channels: of what it sees.
+        in_channels: channels of its input.
 
     Example:
         >>> import torch
@@ -40,9 +40,10 @@ def make_head(name: str, out_channels: int, width: int | None = None, in_channel
 
 
 class PlainHead(ReconstructionHead):
-    """A small network without normalisation: five 3x3 convolutions of growing reach, 63 pixels in all.
+    """Small network of five 3x3 convolutions with growing dilation and a receptive field of 63 pixels.
 
-    It has no statistics that processes would keep apart, and is quick: for examples, tests and first looks.
+    It is fast and has no batch normalisation, whose statistics would differ between processes: for examples, tests and
+    first trials.
 
     Args:
         in_channels: channels of the image.

@@ -1,4 +1,4 @@
-"""A trained system on real captures: linear light in, an encoded picture and depth in metres out."""
+"""Trained systems on real captures: from linear light to an sRGB image and depth in metres."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from kornia_tidy.reconstruction.tiled import reconstruct_tiled
 
 
 class Reconstruction(NamedTuple):
-    """What a system makes of a capture; None is what it was not trained for."""
+    """Image and depth that a system reconstructs from a capture; None for a map that it was not trained for."""
 
     image: Tensor | None
-    """(3, H, W) in [0, 1], all in focus, encoded as sRGB."""
+    """All-in-focus image, (3, H, W) in [0, 1], encoded as sRGB."""
     depth: Tensor | None
-    """(1, H, W) in metres, may be infinite."""
+    """Depth in metres, (1, H, W); may be infinite."""
 
 
 class LightHead(nn.Module):
-    """The network of a trained system, for linear light: what it learnt to see is made of it, pixel by pixel.
+    """The network of a trained system with linear light as input, converted to the colour space of its training.
 
-    Networks learn from captures in their camera's colour space: encoded ones for ``"srgb"``, linear light for
-    ``"linear"``, and for ``"paper"`` what the simulated sensor takes for light, so light itself.
+    That is the camera's colour space: sRGB-encoded captures for ``"srgb"``, linear light for ``"linear"``, and also for
+    ``"paper"``, whose simulated sensor takes encoded values for light.
 
     Args:
-        system: a camera and its network, see :func:`~kornia_tidy.inference.trained.load_trained`.
+        system: camera and network, see :func:`~kornia_tidy.inference.trained.load_trained`.
 
     Shape:
-        - light: (B, 3, H, W) or (B, 1, H, W), linear; black is 0, saturation 1, clipped there as a sensor does.
+        - light: (B, 3, H, W) or (B, 1, H, W), linear; black is 0 and saturation 1; other values are clipped.
         - output: the maps of the task, in the order of :data:`~kornia_tidy.inference.tasks.MAPS`: the image encoded as
-          sRGB, depth as nearness.
+          sRGB, depth as normalised inverse depth.
 
     Raises:
-        TypeError: if the camera does not know metres.
+        TypeError: if the camera has no metric scale.
     """
 
     def __init__(self, system: TrainedSystem) -> None:
@@ -71,14 +71,14 @@ def reconstruct_light(
     memory_budget: int = 512 << 20,
     progress: Callable[[int, int], object] | None = None,
 ) -> Reconstruction:
-    """Return image and depth of a capture of any size.
+    """Reconstruct image and depth from a capture of any size.
 
     Args:
         head: a trained network.
-        light: (3, H, W) or (1, H, W), linear light of the camera it was trained for, in the sensor's orientation (that
-            of its PSFs); black is 0, saturation 1.
+        light: (3, H, W) or (1, H, W), linear light of the camera that the network was trained for, in the orientation
+            of the sensor and of the PSFs; black is 0, saturation 1.
         memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
-        progress: see there.
+        progress: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
 
     Raises:
         TypeError: if the light is not a floating-point tensor.
@@ -99,17 +99,17 @@ def reconstruct_light(
 def reconstruct_opencv(
     head: LightHead, picture: NDArray[Any], *, linear: bool = False, memory_budget: int = 512 << 20
 ) -> tuple[NDArray[Any] | None, NDArray[np.float32] | None]:
-    """Return image and depth of a capture as OpenCV holds it.
+    """Reconstruct image and depth from a capture in an OpenCV array.
 
     Args:
         head: a trained network.
         picture: (H, W, 3) in BGR or (H, W), uint8 or uint16.
-        linear: it holds linear light; else it is encoded as sRGB, as pictures are.
+        linear: True if the picture holds linear light, False if it is encoded as sRGB.
         memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
 
     Returns:
-        The image, (H, W, 3) in BGR, encoded as sRGB, of the picture's type; the depth, (H, W) float32 in metres. None
-        is what the network was not trained for.
+        The image, (H, W, 3) in BGR, encoded as sRGB, of the picture's data type; the depth, (H, W) float32 in metres.
+        None for a map that the network was not trained for.
     """
     light = from_opencv(picture)
     if not linear:

@@ -1,4 +1,4 @@
-"""Nested states in one safetensors file: tensors as tensors, all else as JSON in its header. Nothing is pickled."""
+"""Checkpoints in one safetensors file: tensors as tensors, all other values as JSON in its header, no pickle."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from kornia_tidy.tensor_files import read_tensors
 FORMAT = "kornia_tidy state 1"
 WHAT = "checkpoint of kornia_tidy"
 _PLAIN = (str, bool, int, float, type(None))
-_TENSOR, _TUPLE, _PAIRS = "$tensor", "$tuple", "$pairs"  # what JSON has no word for
+_TENSOR, _TUPLE, _PAIRS = "$tensor", "$tuple", "$pairs"  # markers of types that JSON lacks
 
 
 def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
-    """Write a nested state, whole or not at all: an earlier file stays until the new one is complete on the disk.
+    """Write a nested state atomically: an existing file is replaced once the new one is complete on the disk.
 
     Args:
-        path: where to; an existing file is replaced.
-        state: dictionaries, lists and tuples of tensors, numbers, strings, booleans and None, nested at will.
+        path: of the file; an existing one is replaced.
+        state: nested dictionaries, lists and tuples of tensors, numbers, strings, booleans and None.
 
     Raises:
-        OSError: if it cannot be written, the disk being full for one.
-        TypeError: if it holds anything else, which is named by its place.
+        OSError: if it cannot be written, for example because the disk is full.
+        TypeError: if it holds a value of another type; the message names its place.
 
     Example:
         >>> import tempfile
@@ -46,7 +46,7 @@ def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
         with replacing(path) as temporary:
             save_file(tensors, temporary, {"format": FORMAT, "state": text})
             with temporary.open("rb") as written:
-                os.fsync(written.fileno())  # or a power cut could leave the new name on data never stored
+                os.fsync(written.fileno())  # else a power cut could leave an incomplete file under the name
     except (OSError, SafetensorError) as error:
         kept = "; the one written before is intact" if Path(path).is_file() else ""
         told = error if isinstance(error, OSError) else f"cannot write {path}: {error}"
@@ -54,11 +54,11 @@ def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
 
 
 def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what :func:`write_state` wrote, on the CPU. No code from the file is run.
+    """Read a state that :func:`write_state` wrote, to the CPU. No code from the file is run.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is damaged, or none of these files.
+        ValueError: if the file is damaged or of another format.
     """
     tensors, header = read_tensors(path, WHAT)
     try:

@@ -1,26 +1,17 @@
-"""The three tasks: what a network estimates from a capture, what the truth is, and how far both are apart."""
+"""The three tasks of reconstruction, their maps, and depth as normalised inverse depth."""
 
 from __future__ import annotations
-
-from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
 
-MAPS = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}  # and their channels, in order
-
-Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
-"""From prediction (B, C, H, W), target (B, C, H, W) and validity, bool (B, 1, H, W) or None, to a scalar."""
-
-# The paper's, Ikoma's of depth, and PhaseCam3D's of depth; each for every map of a task.
-LOSSES: dict[str, Loss] = {"mse": mse_loss, "l1": l1_loss, "phasecam3d": phasecam3d_loss}
+MAPS = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}  # with channels, in order
 
 
 def channels_of(task: str) -> int:
-    """Return how many channels a head needs for a task.
+    """Return the number of output channels of a network for a task.
 
     Example:
         >>> channels_of("joint")
@@ -31,41 +22,42 @@ def channels_of(task: str) -> int:
 
 
 def split_maps(task: str, output: Tensor) -> dict[str, Tensor]:
-    """Return the channels of a head's output by name: ``"depth"`` (B, 1, H, W), then ``"image"`` (B, 3, H, W)."""
+    """Return a network's output as maps by name, ``"depth"`` (B, 1, H, W) and ``"image"`` (B, 3, H, W)."""
     if output.ndim != 4 or output.shape[1] != channels_of(task):
         raise ValueError(f"a head for the task {task!r} must return (B, {channels_of(task)}, H, W), got {output.shape}")
     return dict(zip(MAPS[task], output.split(list(MAPS[task].values()), 1), strict=True))
 
 
-def nearness(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
-    r"""Return depth as networks learn it: 0 at the far end of the camera's range, 1 at the near one.
+def normalised_inverse_depth(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
+    r"""Return the normalised inverse depth that networks estimate: 0 at the far end of the range, 1 at the near end.
 
     .. math:: n = (\psi(z) - \psi_{min}) / (\psi_{max} - \psi_{min})
 
-    It is linear in defocus, so in inverse depth, as the normalised disparity of the paper's data; infinity is a number.
+    It is linear in defocus, and so in inverse depth, as is the normalised disparity of the paper's data. It is finite
+    at infinity.
 
     Args:
-        camera: what turns depth into defocus.
+        camera: the lens that turns depth into defocus.
         depth: (B, 1, H, W), as the camera takes it.
 
     Returns:
-        Same shape, in [0, 1]; depths beyond the camera's range have its ends.
+        Same shape, in [0, 1]; depths beyond the camera's range are clamped.
 
     Example:
         >>> import torch
-        >>> nearness(ThinLensCamera(), torch.tensor([0.2975, 0.595, float("inf")]))
+        >>> normalised_inverse_depth(ThinLensCamera(), torch.tensor([0.2975, 0.595, float("inf")]))
         tensor([1.0000, 0.5000, 0.0000])
     """
     lo, hi = camera.defocus_range
     return ((camera.defocus(depth, check_inputs=False) - lo) / (hi - lo)).clamp(0, 1)
 
 
-def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
-    """Return the depth of what networks learn, the inverse of :func:`nearness`.
+def metres(camera: ThinLensCamera, inverse_depth: Tensor) -> Tensor:
+    """Return depth in metres from normalised inverse depth, the inverse of :func:`normalised_inverse_depth`.
 
     Args:
-        camera: as for :func:`nearness`, one that knows metres.
-        nearness: any shape; beyond [0, 1] it is taken as the end of it.
+        camera: a lens with metric scale.
+        inverse_depth: any shape; values are clamped to [0, 1].
 
     Returns:
         Same shape, metres from the near to the far end of the camera's range, which may be infinite.
@@ -76,26 +68,10 @@ def metres(camera: ThinLensCamera, nearness: Tensor) -> Tensor:
         tensor([0.2975, 0.5950,    inf])
     """
     lo, hi = camera.defocus_range
-    return camera.depth(lo + (hi - lo) * nearness.clamp(0, 1))
-
-
-def task_loss(
-    loss: Loss, estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor], mask: Tensor, weights: Mapping[str, float]
-) -> Tensor:
-    """Return the weighted sum of the losses of a task's maps. The mask is that of the depth; images are known.
-
-    A batch whose depth is nowhere known, as a crop may lie in a hole, teaches nothing about depth: that term is zero.
-    """
-    terms = []
-    for name, maps in estimate.items():
-        if name == "depth" and not bool(mask.any()):
-            terms.append(0 * maps.sum())
-        else:
-            terms.append(weights[name] * loss(maps, truth[name], mask if name == "depth" else None))
-    return sum(terms[1:], terms[0])
+    return camera.depth(lo + (hi - lo) * inverse_depth.clamp(0, 1))
 
 
 def centre_crop(tensor: Tensor, height: int, width: int) -> Tensor:
-    """Return the middle of a map, as a camera with the border ``"valid"`` crops its capture."""
+    """Return the central part of a map, to which a camera with the border ``"valid"`` crops its capture."""
     top, left = (tensor.shape[-2] - height) // 2, (tensor.shape[-1] - width) // 2
     return tensor[..., top : top + height, left : left + width]

@@ -1,4 +1,4 @@
-"""From settings to camera and network, and from a checkpoint back to both."""
+"""Trained systems: building camera and network from settings, loading them from a checkpoint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.heads import make_head
-from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.masks.base import PhaseMasks
@@ -30,16 +30,18 @@ class TrainedSystem(NamedTuple):
 
     optics: TiDyOptics
     head: nn.Module
-    settings: TrainingSettings
+    settings: SystemSettings
     step: int
     """Steps of the optimiser that it was trained for."""
+    run: Mapping[str, Any] = {}
+    """The other settings in its checkpoint, unchecked: those of the run that trained it."""
 
 
-def build_optics(settings: TrainingSettings) -> TiDyOptics:
-    """Return the camera that settings describe, its masks as they are before training, its PSF window fixed.
+def build_optics(settings: SystemSettings) -> TiDyOptics:
+    """Return the camera that settings describe, with the initial masks and a fixed PSF window.
 
     Example:
-        >>> build_optics(TrainingSettings(masks=2, window=23)).window
+        >>> build_optics(SystemSettings(masks=2, window=23)).window
         23
     """
     optics = TiDyOptics(
@@ -54,8 +56,8 @@ def build_optics(settings: TrainingSettings) -> TiDyOptics:
     return fix_window(optics)
 
 
-def _masks(settings: TrainingSettings) -> PhaseMasks:
-    """Return the masks before training."""
+def _masks(settings: SystemSettings) -> PhaseMasks:
+    """Return the initial masks."""
     if not settings.masks:
         return FresnelLens()
     noise = torch.Generator().manual_seed(settings.seed)
@@ -65,43 +67,44 @@ def _masks(settings: TrainingSettings) -> PhaseMasks:
 
 
 def fix_window(optics: TiDyOptics) -> TiDyOptics:
-    """Fix a camera's PSF window where it is, in place: that of masks as they were before training is for all of it."""
+    """Fix a camera's PSF window at its present size, in place, so that it stays the same during training."""
     optics.fidelity = optics.fidelity.replace(window=optics.window)
     return optics
 
 
-def build_head(settings: TrainingSettings) -> nn.Module:
-    """Return the network that settings describe, its weights drawn from the global generator."""
+def build_head(settings: SystemSettings) -> nn.Module:
+    """Return the network that settings describe, with weights drawn from the global generator."""
     head = make_head(settings.head, channels_of(settings.task), settings.width, 3 + settings.refocus)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head
 
 
-def look_through(head: nn.Module, optics: TiDyOptics) -> None:
-    """Give a network the PSFs of its camera as they are now, if it refocuses captures: evenly over all defocus.
+def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
+    """Update the PSFs of a network that refocuses captures (:class:`~kornia_tidy.reconstruction.Refocused`).
 
-    They are those of green light. See :class:`~kornia_tidy.reconstruction.Refocused`.
+    They are the camera's present PSFs of green light, evenly spaced over the range of defocus. Other networks are
+    not changed.
     """
     for module in head.modules():
         if isinstance(module, Refocused):
             lo, hi = optics.camera.defocus_range
             nodes = torch.linspace(lo, hi, module.layers, dtype=torch.float64).tolist()
-            module.look_through(optics.psf_bank(1, defocus=nodes))
+            module.set_psfs(optics.psf_bank(1, defocus=nodes))
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
-    """Return camera and network of a checkpoint; of the network the moving average, where it has one.
+    """Load camera and network from a checkpoint; the network with averaged weights, if the checkpoint holds them.
 
     Args:
-        path: a checkpoint that ``kornia-tidy train`` wrote.
+        path: checkpoint that ``kornia-tidy train`` wrote.
 
     Returns:
         The system in eval mode, on the CPU. The sensor keeps its noise.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is no checkpoint, or weights and settings do not fit; the difference is named.
+        ValueError: if it is no checkpoint, or weights and settings do not fit; the message names the difference.
     """
     state = read_state(path)
     _check_parts(state, path)
@@ -111,19 +114,20 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
             f"and use load_weights"
         )
     try:
-        settings = TrainingSettings.from_dict(state["settings"])
+        known, run = SystemSettings.split(state["settings"])
+        settings = SystemSettings(**known)
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     _check_sizes(state, settings, str(path))
     optics, head = build_optics(settings), build_head(settings)
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
-        look_through(head, optics)
-    return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]))
+        update_psfs(head, optics)
+    return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]), run)
 
 
 def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
-    """Refuse a state whose parts are not those of a checkpoint."""
+    """Raise ``ValueError`` for a state without weights, step or settings."""
     weights, step = state.get("state_dict"), state.get("global_step")
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise ValueError(f"cannot read {path}: it is a checkpoint without weights, or is damaged")
@@ -131,8 +135,8 @@ def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None
         raise ValueError(f"cannot read {path}: it is a checkpoint without step or settings, or is damaged")
 
 
-def _check_sizes(state: Mapping[str, Any], settings: TrainingSettings, name: str) -> None:
-    """Refuse settings of another camera or network than the weights are of, before any memory is taken for these."""
+def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) -> None:
+    """Raise ``ValueError`` if settings and weights are of different sizes, before memory is allocated."""
     masks = state["state_dict"].get("optics.masks.phase")
     if masks is not None and settings.masks and len(masks) != settings.masks:
         raise ValueError(f"{name} does not fit: it holds {len(masks)} masks, and its settings tell of {settings.masks}")
@@ -151,17 +155,17 @@ def load_weights(
     head: nn.Module | None = None,
     name: str | None = None,
 ) -> None:
-    """Load a checkpoint's weights into a camera, a network, or both; of the network the moving average if there is one.
+    """Load weights of a checkpoint into a camera, a network, or both; for the network averaged ones, if there are any.
 
     Args:
-        checkpoint: a path, or a state that was read.
-        optics: the camera. None: its weights are left.
-        head: the network. None: its weights are left.
-        name: how messages call the checkpoint.
+        checkpoint: path, or a state that was read.
+        optics: the camera. None: its weights are not loaded.
+        head: the network. None: its weights are not loaded.
+        name: of the checkpoint in messages.
 
     Raises:
-        ValueError: if a weight is missing, unknown or of another shape, or the camera is another one; nothing is loaded
-            then.
+        ValueError: if a weight is missing, unknown or of another shape, or the camera is another one. Nothing is then
+            loaded.
     """
     state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
     name = name or str(checkpoint)
@@ -175,17 +179,17 @@ def load_weights(
 
 
 def _head_prefix(weights: Mapping[str, Tensor]) -> str:
-    """Where in a checkpoint the network is: of the moving average, if there is one."""
+    """Return the prefix of the network's weights in a checkpoint; of the averaged ones, if there are any."""
     return "average.network." if any(key.startswith("average.") for key in weights) else "head."
 
 
 def below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the weights whose names begin with a prefix, without it."""
+    """Return the weights whose names begin with a prefix, under their names without it."""
     return {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
 
 
 def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -> None:
-    """Raise ``ValueError`` unless weights fit a module and are finite, naming what does not.
+    """Raise ``ValueError`` unless weights fit a module by name and shape and are finite.
 
     Example:
         >>> check_weights(nn.Linear(2, 1), {"weight": torch.ones(1, 3)}, "a.safetensors")
@@ -193,7 +197,7 @@ def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -
         ...
         ValueError: a.safetensors does not fit: missing bias; weight is (1, 3), wanted (1, 2)
     """
-    # A camera checks its settings itself.
+    # load_state_dict of a camera checks its settings.
     weights, own = (
         {key: value for key, value in state.items() if not key.endswith(EXTRA_STATE)}
         for state in (weights, module.state_dict())
@@ -215,7 +219,7 @@ def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -
 
 
 def describe(optics: TiDyOptics, head: nn.Module) -> dict[str, str]:
-    """Return in words what no weight tells: which lens, sensor and network these are."""
+    """Return the lens, sensor, fidelity and types of modules in words, which weights do not determine."""
     parts = {name: repr(getattr(optics, name)) for name in ("camera", "sensor")}
     parts |= {"fidelity": repr(optics.fidelity.replace(window=optics.window))}
     parts |= {name: str(getattr(optics, name)) for name in ("compositing", "color_space", "border")}

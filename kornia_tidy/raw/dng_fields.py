@@ -1,4 +1,7 @@
-"""DNG encoding from TIFF fields, with uncompressed 16-bit samples in one strip."""
+"""DNG encoding from TIFF fields, with uncompressed 16-bit samples in one strip.
+
+tifffile is not used: it writes extra tags, but no Exif directory, in which exposure, aperture and lens stand.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""From captures back to the scene: networks and inversion for the all-in-focus image and the depth, losses, metrics."""
+"""Reconstruction of the all-in-focus image and of depth from captures: networks, inversion, losses, metrics.
+
+Captures come in, maps of the same size go out. Read ``head.py``, the base class of the networks, first.
+"""
 
 from kornia_tidy.reconstruction.attention_unet import AttentionUNet
 from kornia_tidy.reconstruction.head import ReconstructionHead

@@ -1,19 +1,17 @@
-"""Attention U-Net: an encoder, a decoder, and gates that choose what the decoder sees of the encoder's detail."""
+"""Attention U-Net: a U-Net with attention gates in its skip connections."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
-from kornia_tidy.reconstruction.unet import LEVELS, conv_block, conv_unit, encode
+from kornia_tidy.reconstruction.head import check_count
+from kornia_tidy.reconstruction.unet import UNet, conv_block, conv_unit
 
 
-class AttentionUNet(ReconstructionHead):
-    r"""U-Net whose skip connections pass an attention gate, without a final activation.
+class AttentionUNet(UNet):
+    r"""U-Net with an attention gate in each skip connection and without a final activation.
 
     Five levels of two 3x3 convolutions (width, 2, 4, 8 and 16 times width channels), joined by 2x2 maximum pooling on
     the way down and by nearest upsampling and a 3x3 convolution on the way up. On each level the upsampled decoder
@@ -24,19 +22,22 @@ class AttentionUNet(ReconstructionHead):
     Args:
         in_channels: channels of the image.
         out_channels: maps to estimate: 3 for an all-in-focus image, 4 with depth (see :class:`JointHead`).
-        width: channels of the first level, at least 2. The paper's network has 64; its parameters go with the square.
+        width: channels of the first level, at least 2. The paper's network has 64. The number of parameters
+            grows as the square of the width.
 
     Shape:
-        - image: (B, in_channels, H, W), any size; see :class:`ReconstructionHead` for the borders.
+        - image: (B, in_channels, H, W), any size; for the borders see
+          :class:`~kornia_tidy.reconstruction.ReconstructionHead`.
         - output: (B, out_channels, H, W), any real number.
 
     Convention:
-        - Starts from :meth:`ReconstructionHead.reset_parameters`: normalisation follows every convolution but the
-          last, so that its initial scale does not matter; the last one starts with outputs of order one.
+        - Initial weights are those of :meth:`~kornia_tidy.reconstruction.ReconstructionHead.reset_parameters`. Batch
+          normalisation follows every convolution but the last, so that the scale of these does not matter; the initial
+          outputs of the last one are of order one.
 
     Source: Oktay et al., Attention U-Net (MIDL 2018). The gate works at the full resolution of its level instead of
-    the coarser one, as in the five-level form commonly used with PyTorch (34,878,703 parameters for three outputs),
-    and as time-averaged dynamic PSFs are evaluated with.
+    that of the coarser level, as in the five-level form commonly used with PyTorch (34,878,703 parameters for three
+    outputs), with which TiDy-PSFs were evaluated.
 
     Example:
         >>> head = AttentionUNet(width=4).eval()
@@ -44,24 +45,11 @@ class AttentionUNet(ReconstructionHead):
         torch.Size([1, 3, 50, 70])
     """
 
-    stride = 2 ** (LEVELS - 1)
-
     def __init__(self, in_channels: int = 3, out_channels: int = 3, width: int = 64) -> None:
-        super().__init__(in_channels, out_channels)
         check_count("width", width, least=2)
-        channels = [width << level for level in range(LEVELS)]
-        steps = list(pairwise(channels))
-        self.encoder = nn.ModuleList(conv_block(i, o) for i, o in [(in_channels, width), *steps])
-        self.decoder = nn.ModuleList(_GatedLevel(coarse, fine) for fine, coarse in reversed(steps))
+        super().__init__(in_channels, out_channels, width, _GatedLevel)
         self.output = nn.Conv2d(width, out_channels, 1)
         self.reset_parameters()
-
-    def predict(self, image: Tensor) -> Tensor:
-        """Return the maps of an image whose sides are multiples of 16."""
-        features, skips = encode(self.encoder, image)
-        for level in self.decoder:
-            features = level(features, skips.pop())
-        return self.output(features)
 
 
 class _GatedLevel(nn.Module):
@@ -79,7 +67,7 @@ class _GatedLevel(nn.Module):
 
 
 class _AttentionGate(nn.Module):
-    """Additive attention: one weight between 0 and 1 per pixel, from what the decoder and the encoder see there."""
+    """Additive attention: one weight between 0 and 1 per pixel, from the decoder's and the encoder's features."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

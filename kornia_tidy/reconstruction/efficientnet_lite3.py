@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-EPSILON = 1e-3  # of the normalisation, as trained in TensorFlow
+EPSILON = 1e-3  # of the batch normalisation, as in TensorFlow
 
 
 class EfficientNetLite3(nn.Module):
@@ -47,7 +47,7 @@ class EfficientNetLite3(nn.Module):
 
 
 class _DepthwiseSeparable(nn.Module):
-    """A 3x3 convolution of each channel alone, then a mixture of channels."""
+    """Depthwise 3x3 convolution, then a pointwise convolution."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class _DepthwiseSeparable(nn.Module):
 
 
 class _InvertedResidual(nn.Module):
-    """Widen six times, convolve each channel alone, narrow again; add the input where the shapes agree."""
+    """Inverted residual: expansion by six, depthwise convolution, projection; plus the input if the shapes agree."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class _InvertedResidual(nn.Module):
 
 
 class _HalvingConv2d(nn.Conv2d):
-    """Convolution of stride 2 with TensorFlow's ``SAME`` padding: of even sides, one pixel more after than before."""
+    """Convolution of stride 2 with TensorFlow's ``SAME`` padding: for even sides one pixel more after than before."""
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002, named by torch
         return super().forward(functional.pad(input, (0, 1, 0, 1)))

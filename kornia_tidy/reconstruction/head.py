@@ -1,4 +1,4 @@
-"""What every reconstruction network does: takes a picture of any size and returns maps of the same size."""
+"""Base class of reconstruction networks, which take images of any size and return maps of the same size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from kornia_tidy.runtime.tracing import is_value_unknown
 
 
 class ReconstructionHead(nn.Module, ABC):
-    """Base of the networks: a head defines :meth:`predict` for sizes that are multiples of its ``stride``.
+    """Base class of reconstruction networks: checks, padding to multiples of ``stride``, and cropping.
+
+    A subclass defines ``stride`` and :meth:`predict`.
 
     Args:
         in_channels: channels of the image.
@@ -29,11 +31,10 @@ class ReconstructionHead(nn.Module, ABC):
         TypeError: if the image is not a floating-point tensor.
 
     Convention:
-        - The first image is looked at: one in 0..255 or normalised is warned about, as captures are in [0, 1].
-        - An image whose sides are no multiples of ``stride`` is continued at its borders, half of what is missing on
-          each side, and the result is cropped. It is continued by reflection, which makes no edge where there is
-          none; where a side is too short to be reflected that far, by repeating the outermost pixels.
-        - An ONNX export holds the padding of the size it was made for; the batch may be dynamic.
+        - Captures are in [0, 1]. If the first image is in 0..255 or normalised, a warning is given.
+        - An image whose sides are no multiples of ``stride`` is padded equally on both sides, and the result is
+          cropped. The padding is by reflection, which adds no edges; if a side is too short for that, by replication.
+        - An ONNX export is for the image size it was made with; the batch size may be dynamic.
     """
 
     stride: int
@@ -53,7 +54,7 @@ class ReconstructionHead(nn.Module, ABC):
             remedy = layout_remedy(tuple(image.shape), self.in_channels)
             raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}{remedy}")
         if not self._looked and not is_value_unknown():
-            self._looked = True  # at the first image only: a look waits for the device
+            self._looked = True  # for the first image only, as the check waits for the device
             if (said := check_head_image(image)) is not None:
                 warnings.warn(said, stacklevel=4)
         height, width = image.shape[-2:]
@@ -64,13 +65,13 @@ class ReconstructionHead(nn.Module, ABC):
 
     @abstractmethod
     def predict(self, image: Tensor) -> Tensor:
-        """Return the maps of an image whose sides are multiples of ``stride``."""
+        """Return the maps, (B, out_channels, H, W), of an image with sides that are multiples of ``stride``."""
 
     def reset_parameters(self) -> None:
-        """Draw all parameters anew from the global generator.
+        """Initialise all parameters, by the global generator.
 
-        Convolutions get He's normal weights, which keep the variance from layer to layer through rectified units,
-        and no bias; batch normalisation starts as the identity on normalised values, with empty statistics.
+        Convolutions get He's normal weights, which keep the variance from layer to layer through ReLUs, and zero
+        biases; batch normalisation gets scale one, shift zero and initial statistics.
 
         Source: He et al., Delving Deep into Rectifiers (ICCV 2015), equation 10.
         """
@@ -90,7 +91,7 @@ def check_count(name: str, value: int, least: int = 1) -> None:
 
 
 def border_padding(size: tuple[int, int], multiple: int) -> tuple[tuple[int, int, int, int], str]:
-    """Return by how much heads continue an image on the left, right, top and bottom, and in which mode.
+    """Return the padding (left, right, top, bottom) of an image to multiples of a number of pixels, and its mode.
 
     Example:
         >>> border_padding((13, 32), 16)

@@ -1,4 +1,4 @@
-"""How much memory a network takes, counted."""
+"""Peak memory of a network, counted operation by operation."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from torch.utils._pytree import tree_leaves
 
 @torch.no_grad()
 def head_bytes(head: nn.Module, image: Tensor) -> int:
-    """Return the most memory that a network takes at one time for an image, the image and its output included.
+    """Return the peak memory of a network for an image, including the image and its output.
 
-    What is alive after each operation is added up. A convolution is given its input and output once more, for libraries
-    that bring both into an order of their own.
+    It is the largest sum of all tensors alive after an operation. For a convolution, input and output are counted
+    twice, as some libraries copy both to another memory layout.
 
     Args:
         head: the network. Its weights are not counted.
@@ -27,17 +27,17 @@ def head_bytes(head: nn.Module, image: Tensor) -> int:
         Bytes.
 
     Example:
-        >>> head_bytes(nn.Conv2d(3, 8, 1), torch.rand(1, 3, 10, 10))  # twice what goes in and comes out
+        >>> head_bytes(nn.Conv2d(3, 8, 1), torch.rand(1, 3, 10, 10))  # twice input and output
         8800
     """
     with _Living() as living:
-        image = image.clone()  # which is counted so
+        image = image.clone()  # so that it is counted
         head(image)
     return living.most
 
 
 class _Living(TorchDispatchMode):
-    """Adds up the memory of the tensors that are alive, operation by operation."""
+    """Dispatch mode that sums the memory of all tensors alive after each operation."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class _Living(TorchDispatchMode):
         return output
 
     def _born(self, storage: torch.UntypedStorage) -> None:
-        key, size = storage._cdata, storage.nbytes()  # two views of one memory have one key
+        key, size = storage._cdata, storage.nbytes()  # views of one storage have one key
         if key not in self._known:
             self._known.add(key)
             self._now += size

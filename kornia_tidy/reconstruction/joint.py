@@ -1,4 +1,4 @@
-"""Depth and image from one network: the channels of a head, by name."""
+"""Depth and image from one network, as a named tuple."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from kornia_tidy.reconstruction.head import ReconstructionHead
 
 
 class JointEstimate(NamedTuple):
-    """What a joint network estimates: ``depth`` (B, 1, H, W) and the all-in-focus ``image`` (B, 3, H, W)."""
+    """Estimates of a joint network: ``depth`` (B, 1, H, W) and the all-in-focus ``image`` (B, 3, H, W)."""
 
     depth: Tensor
     image: Tensor
 
 
 class JointHead(nn.Module):
-    """Name the four channels that a head estimates: depth first, then the all-in-focus image.
+    """Splits the four output channels of a network into depth and all-in-focus image.
 
     Args:
-        network: any head with four outputs.
+        network: a reconstruction network with four output channels, depth first.
 
     Shape:
         - image: (B, C, H, W), as the network takes it.
-        - output: :class:`JointEstimate` of depth (B, 1, H, W) and image (B, 3, H, W): views of one tensor.
+        - output: :class:`JointEstimate` of depth (B, 1, H, W) and image (B, 3, H, W), which are views of one tensor.
 
     Raises:
-        ValueError: if the network has not four outputs.
+        ValueError: if the network does not have four output channels.
 
     Convention:
-        - Both are in the units they are trained in, usually [0, 1]; a head that ends in an activation bounds both.
+        - Both are in the units of training, usually [0, 1]; a final activation of the network applies to both.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), joint optimisation: an attention U-Net with four channels.
 
@@ -50,6 +50,6 @@ class JointHead(nn.Module):
         self.network = network
 
     def forward(self, image: Tensor) -> JointEstimate:
-        """Return the estimated depth and image by name."""
+        """Return the estimated depth and image."""
         depth, image = self.network(image).split([1, 3], 1)
         return JointEstimate(depth, image)

@@ -1,7 +1,7 @@
-"""Losses of depth and all-in-focus images, over the pixels whose true value is known.
+"""Losses of depth maps and all-in-focus images over valid pixels.
 
-Each is pooled over all valid samples of the batch, as training wants it; :mod:`kornia_tidy.reconstruction.metrics` has
-one value an image. Gradients of masked pixels are exactly zero.
+Each is a mean over all valid samples of the batch; those in :mod:`kornia_tidy.reconstruction.metrics` are means over
+each image. Gradients of masked pixels are exactly zero.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
 
-PHASECAM3D_WEIGHT = 20.0  # of its RMSE beside its gradients
+PHASECAM3D_WEIGHT = 20.0  # of the RMSE, relative to the gradient loss
 
 
 def mse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -29,8 +29,8 @@ def mse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
 
     Raises:
         TypeError: if prediction or target are not floating point, or the mask is not bool.
-        ValueError: if shapes do not fit, or the mask is False everywhere (waits for the device). Compiled code, which
-            does not look at values, then returns zero with zero gradients.
+        ValueError: if shapes do not fit, or the mask is False everywhere, a check that waits for the device. Compiled
+            code does not check the mask, and returns zero with zero gradients then.
 
     Source: Shah et al., TiDy-PSFs, ICCV 2023.
 
@@ -44,7 +44,7 @@ def mse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
 
 
 def l1_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return the mean absolute error, which Ikoma et al. take for depth maps.
+    r"""Return the mean absolute error, the loss of Ikoma et al. for depth maps.
 
     .. math:: L = \frac{1}{N} \lVert x - \hat{x} \rVert_1
 
@@ -54,7 +54,7 @@ def l1_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> T
         mask: as for :func:`mse_loss`.
 
     Returns:
-        A scalar in the unit of the maps; errors are those of :func:`mse_loss`. Its gradient is zero where both agree.
+        A scalar in the unit of the maps; it raises as :func:`mse_loss` does. Its gradient is zero where both are equal.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021.
 
@@ -67,7 +67,7 @@ def l1_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> T
 
 
 def rmse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return the root of the mean squared error, PhaseCam3D's loss of depth maps.
+    r"""Return the root mean squared error, PhaseCam3D's loss of depth maps.
 
     .. math:: L = \frac{1}{\sqrt{N}} \lVert x - \hat{x} \rVert_2
 
@@ -77,7 +77,7 @@ def rmse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) ->
         mask: as for :func:`mse_loss`.
 
     Returns:
-        A scalar in the unit of the maps; errors are those of :func:`mse_loss`. Its gradient is zero where both agree.
+        A scalar in the unit of the maps; it raises as :func:`mse_loss` does. Its gradient is zero where both are equal.
 
     Source: Wu et al., PhaseCam3D, ICCP 2019.
 
@@ -89,12 +89,12 @@ def rmse_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) ->
 
 
 def gradient_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return how far the slopes of two maps differ, PhaseCam3D's loss for sharp depth edges.
+    r"""Return the root mean squared difference of two maps' gradients, PhaseCam3D's loss for sharp depth edges.
 
     .. math:: L = \frac{1}{\sqrt{N_x}} \lVert \partial_x x - \partial_x \hat{x} \rVert_2
                 + \frac{1}{\sqrt{N_y}} \lVert \partial_y x - \partial_y \hat{x} \rVert_2
 
-    with differences between neighbouring pixels that are both valid; N counts these pairs.
+    Derivatives are differences of neighbouring pixels that are both valid; N counts these pairs.
 
     Args:
         prediction: as for :func:`mse_loss`, at least two pixels a side.
@@ -102,7 +102,7 @@ def gradient_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None
         mask: as for :func:`mse_loss`.
 
     Returns:
-        A scalar in the unit of the maps a pixel; it does not see a constant offset.
+        A scalar in the unit of the maps per pixel; a constant offset does not change it.
 
     Raises:
         TypeError: as :func:`mse_loss`.
@@ -125,7 +125,7 @@ def gradient_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None
 
 
 def phasecam3d_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return PhaseCam3D's whole loss of a map: 20 times :func:`rmse_loss`, and :func:`gradient_loss`.
+    r"""Return PhaseCam3D's loss of a map: 20 times :func:`rmse_loss` plus :func:`gradient_loss`.
 
     Args:
         prediction: as for :func:`gradient_loss`, in [0, 1].
@@ -133,7 +133,7 @@ def phasecam3d_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = No
         mask: as for :func:`gradient_loss`.
 
     Returns:
-        A scalar; errors are those of :func:`gradient_loss`.
+        A scalar; it raises as :func:`gradient_loss` does.
 
     Source: Wu et al., PhaseCam3D, ICCP 2019.
 
@@ -154,7 +154,7 @@ def joint_loss(
     depth_weight: float = 1.0,
     image_weight: float = 1.0,
 ) -> Tensor:
-    r"""Return the paper's loss of depth map and all-in-focus image together.
+    r"""Return the paper's joint loss of depth map and all-in-focus image.
 
     .. math:: L = \lambda_{Depth} L_{Depth} + \lambda_{AiF} L_{AiF}
 
@@ -168,7 +168,7 @@ def joint_loss(
         image_weight: :math:`\lambda_{AiF}`, 1 in the paper.
 
     Returns:
-        A scalar; both terms are :func:`mse_loss`, whose errors it raises.
+        A scalar; it raises as :func:`mse_loss` does, which both terms are.
 
     Source: Shah et al., TiDy-PSFs, ICCV 2023.
 
@@ -216,7 +216,7 @@ class JointLoss(nn.Module):
 
 
 def _mean(error: Tensor, mask: Tensor, sample: str = "pixel") -> Tensor:
-    """The mean of an error, zero where masked, over the samples that are not."""
+    """Return the mean of an error over the valid samples; it must be zero at the others."""
     count = mask.sum()
     if not torch.compiler.is_compiling() and not bool(count):
         raise ValueError(f"a loss needs at least one valid {sample}, got a mask {tuple(mask.shape)} with none")

@@ -1,7 +1,7 @@
-"""Metrics of depth maps and all-in-focus images: one value an image, over the pixels whose true value is known.
+"""Metrics of depth maps and all-in-focus images: one value per image, over its valid pixels.
 
-An image without a valid pixel scores NaN: it has no error, neither a small nor a large one. :class:`MeanScores` leaves
-such images out when told so. A NaN within the mask also scores NaN, and is not hidden.
+The score of an image without a valid pixel is NaN; :class:`MeanScores` can leave such images out. A NaN at a valid
+pixel also makes the score NaN.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
 
-SSIM_WINDOW = 11  # pixels, with a Gaussian of sigma 1.5 in it: Wang et al. 2004
-PHASECAM3D_SPAN = 20.0  # radians: PhaseCam3D's maps span psi in [-10, 10], and its RMSE is given in these units
+SSIM_WINDOW = 11  # pixels; its weights are a Gaussian of sigma 1.5, as in Wang et al. 2004
+PHASECAM3D_SPAN = 20.0  # radians; PhaseCam3D's maps span psi in [-10, 10], and its RMSE is in radians
 
 
 def rmse(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -51,8 +51,8 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
         max_value: the data range.
 
     Returns:
-        (B,) in decibels; ``inf`` for equal images. Averaged over images it is not the PSNR of their pooled error, which
-        :func:`kornia.metrics.psnr` gives for a batch.
+        (B,) in decibels; ``inf`` for equal images. The mean over images differs from the PSNR of their pooled error,
+        which :func:`kornia.metrics.psnr` returns for a batch.
 
     Raises:
         TypeError: as :func:`rmse`.
@@ -68,12 +68,12 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
 
 
 def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_value: float = 1.0) -> Tensor:
-    """Return the structural similarity: the mean over all windows of 11x11 pixels that are valid as a whole.
+    """Return the structural similarity: the mean over all windows of 11x11 pixels without a masked pixel.
 
     Args:
         prediction: as for :func:`rmse`, at least 11 pixels a side.
         target: as for :func:`rmse`.
-        mask: as for :func:`rmse`. A window that holds one masked pixel does not count.
+        mask: as for :func:`rmse`.
         max_value: the data range.
 
     Returns:
@@ -84,8 +84,8 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
         ValueError: as :func:`rmse`, or if the images are too small.
 
     Convention:
-        Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, nothing made up beyond the border: the reference
-        implementation of Wang et al., but for its downsampling of large images. Channels are averaged.
+        Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, no padding: the reference implementation of Wang et al.
+        without its downsampling of large images. Channels are averaged.
 
     Source: Wang et al., IEEE Transactions on Image Processing 13(4) 600 (2004).
 
@@ -98,7 +98,7 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
     if min(target.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"ssim needs images of at least {SSIM_WINDOW} pixels a side, got {tuple(target.shape[-2:])}")
     similarity = kornia.metrics.ssim(prediction, target, SSIM_WINDOW, float(max_value), eps=0.0, padding="valid")
-    masked = torch.nn.functional.max_pool2d((~mask).to(similarity), SSIM_WINDOW, stride=1)  # the worst of a window
+    masked = torch.nn.functional.max_pool2d((~mask).to(similarity), SSIM_WINDOW, stride=1)  # 1: a masked pixel
     whole = masked == 0
     return _mean(torch.where(whole, similarity, 0), whole)
 
@@ -135,7 +135,7 @@ def log10_error(prediction: Tensor, target: Tensor, mask: Tensor | None = None) 
         mask: as for :func:`rmse`.
 
     Returns:
-        (B,) decades, as :func:`abs_rel`; so are the errors.
+        (B,) in decades, NaN as for :func:`abs_rel`; it raises as that does.
 
     Example:
         >>> log10_error(torch.full((1, 1, 1, 2), 10.0), torch.tensor([1.0, 10.0]).view(1, 1, 1, 2))
@@ -146,7 +146,7 @@ def log10_error(prediction: Tensor, target: Tensor, mask: Tensor | None = None) 
 
 
 def delta_accuracy(prediction: Tensor, target: Tensor, mask: Tensor | None = None, threshold: float = 1.25) -> Tensor:
-    r"""Return the share of pixels whose depth is right within a factor: :math:`\max(z/\hat{z}, \hat{z}/z) < t`.
+    r"""Return the fraction of pixels with a depth right within a factor, :math:`\max(z/\hat{z}, \hat{z}/z) < t`.
 
     Args:
         prediction: depth as for :func:`rmse`. A pixel where it is zero or negative is wrong.
@@ -155,7 +155,7 @@ def delta_accuracy(prediction: Tensor, target: Tensor, mask: Tensor | None = Non
         threshold: the factor t; 1.25, 1.25² and 1.25³ are usual.
 
     Returns:
-        (B,) in [0, 1], as :func:`abs_rel`; so are the errors. It has no gradient.
+        (B,) in [0, 1], NaN as for :func:`abs_rel`; it raises as that does. It has no gradient.
 
     Source: Eigen et al., NeurIPS 2014.
 
@@ -164,7 +164,7 @@ def delta_accuracy(prediction: Tensor, target: Tensor, mask: Tensor | None = Non
         tensor([0.6667])
     """
     prediction, target, mask = _valid_depths(prediction, target, mask)
-    right = (prediction < threshold * target) & (target < threshold * prediction)  # no quotient: it may be by zero
+    right = (prediction < threshold * target) & (target < threshold * prediction)  # no division by zero
     return _mean((right & mask).to(target), mask)
 
 
@@ -193,7 +193,7 @@ def depth_scores(prediction: Tensor, target: Tensor, mask: Tensor | None = None)
 def defocus_scores(
     prediction: Tensor, target: Tensor, mask: Tensor | None = None, span: float = PHASECAM3D_SPAN
 ) -> dict[str, Tensor]:
-    """Return the RMSE of normalised defocus maps on both scales found in papers, which differ by a factor of 20.
+    """Return the RMSE of normalised defocus maps in [0, 1] and in radians, the two units used in papers.
 
     Args:
         prediction: (B, 1, H, W), normalised to [0, 1].
@@ -202,10 +202,10 @@ def defocus_scores(
         span: radians of defocus between 0 and 1: 20 for PhaseCam3D's range, 40 for the TiDy paper's.
 
     Returns:
-        ``rmse_unit``, of the maps as they are, and ``rmse_radians``, ``span`` times it; each (B,).
+        ``rmse_unit``, the RMSE of the maps, and ``rmse_radians``, ``span`` times as large; each (B,).
 
     Convention:
-        PhaseCam3D reports radians with a span of 20. Compare values of one scale only: 0.521 rad is 0.026 of the map.
+        PhaseCam3D reports radians with a span of 20: its 0.521 rad are 0.026 in [0, 1].
 
     Raises:
         TypeError: as :func:`rmse`.
@@ -240,7 +240,7 @@ def image_scores(prediction: Tensor, target: Tensor, mask: Tensor | None = None)
 
 
 class MeanScores:
-    """The mean of scores over the images of a data set, batch by batch, each image with the same weight.
+    """Mean of scores over the images of a data set, batch by batch, each image with the same weight.
 
     Example:
         >>> mean = MeanScores()
@@ -256,12 +256,12 @@ class MeanScores:
         self._totals: dict[str, float] = {}
 
     def add(self, scores: Mapping[str, Tensor], counted: Tensor | None = None) -> None:
-        """Add a batch.
+        """Add the scores of a batch.
 
         Args:
-            scores: (B,) values under the same names as before, such as :func:`depth_scores` returns.
+            scores: (B,) values by name, such as :func:`depth_scores` returns; the same names in every batch.
             counted: bool (B,), False for images to leave out: ``mask.flatten(1).any(1)`` leaves out those without a
-                valid pixel. None: all count, and one NaN makes the mean NaN.
+                valid pixel. None: all images count, and one NaN makes the mean NaN.
 
         Raises:
             ValueError: if names or shapes do not fit.
@@ -293,7 +293,7 @@ class MeanScores:
 
 
 def _valid_depths(prediction: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """As :func:`valid_maps`, with depths of 1 behind the mask; waits for the device."""
+    """Return :func:`valid_maps` with masked depths of 1, after a check of valid depths that waits for the device."""
     prediction, target, mask = valid_maps(prediction, target, mask, filler=1.0)
     good = (target > 0) & target.isfinite()
     if not bool(good.all()):
@@ -303,6 +303,6 @@ def _valid_depths(prediction: Tensor, target: Tensor, mask: Tensor | None) -> tu
 
 
 def _mean(error: Tensor, mask: Tensor) -> Tensor:
-    """The mean over each image of an error that is zero where masked; NaN where there is nothing to average."""
+    """Return the mean of an error, zero where masked, over each image; NaN for an image without valid pixels."""
     count = mask.flatten(1).sum(1)
     return torch.where(count > 0, error.flatten(1).sum(1) / count.clamp(min=1), torch.nan)

@@ -1,4 +1,4 @@
-"""MiDaS Small: monocular depth, with the names of the published weights."""
+"""MiDaS Small, a network for monocular depth, with the module names of the published weights."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from kornia_tidy.files import read_bytes
 from kornia_tidy.reconstruction.efficientnet_lite3 import EfficientNetLite3
 from kornia_tidy.reconstruction.head import ReconstructionHead
 
-IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet's red, green and blue, on which the encoder was trained
+IMAGE_MEAN = (0.485, 0.456, 0.406)  # of red, green and blue of ImageNet, on which the encoder was trained
 IMAGE_DEVIATION = (0.229, 0.224, 0.225)
 
 
 class MiDaSSmall(ReconstructionHead):
-    """MiDaS 2.1 Small: an EfficientNet-Lite3 encoder and a decoder that fuses its four scales, coarse to fine.
+    """MiDaS 2.1 Small: an EfficientNet-Lite3 encoder, and a decoder that fuses its four scales from coarse to fine.
 
     Args:
         out_channels: maps to estimate; the published weights have 1.
@@ -31,10 +31,10 @@ class MiDaSSmall(ReconstructionHead):
     Convention:
         - The image is normalised inside, by ImageNet's mean and deviation. The published weights were trained on
           pictures whose shorter side has 256 pixels and return inverse depth up to an unknown scale and shift:
-          larger is nearer. Trained on, the network returns what it is trained for.
-        - ``state_dict()`` has the published names, shapes and order. One unit of the coarsest fusion is among them and
-          never used: it is frozen, so that optimisers and distributed training do not wait for its gradient.
-        - Starts from :meth:`reset_parameters`; see :func:`load_midas_small` for trained weights.
+          larger is nearer. The output of a network that is trained further depends on its training.
+        - ``state_dict()`` has the published names, shapes and order. One of its units, in the coarsest fusion, is
+          never used. It is frozen, so that optimisers and distributed training do not wait for its gradient.
+        - Initial weights are those of :meth:`reset_parameters`; :func:`load_midas_small` loads trained weights.
 
     Source: Ranftl et al., Towards Robust Monocular Depth Estimation (TPAMI 2022); the small network of release 2.1.
 
@@ -53,18 +53,17 @@ class MiDaSSmall(ReconstructionHead):
         self.reset_parameters()
 
     def predict(self, image: Tensor) -> Tensor:
-        """Return the maps of an image whose sides are multiples of 32."""
+        """Return the maps of an image with sides that are multiples of 32."""
         constants = zip(image.split(1, 1), IMAGE_MEAN, IMAGE_DEVIATION, strict=True)
         normalised = torch.cat([(colour - mean) / deviation for colour, mean, deviation in constants], 1)
         return self.scratch(*self.pretrained(normalised))
 
     def reset_parameters(self) -> None:
-        """Draw all parameters anew from the global generator.
+        """Initialise all parameters, by the global generator.
 
-        The encoder starts as :meth:`ReconstructionHead.reset_parameters` says. The decoder has no normalisation that
-        would undo growth: its residual units start as the identity, and its other convolutions keep the variance of
-        what they are given. The last layer starts at small weights and a bias of 1/2, because an output that is
-        rectified has no gradient where it starts below zero.
+        The encoder is initialised as in :meth:`ReconstructionHead.reset_parameters`. The decoder has no normalisation:
+        its residual units start as the identity, and its other convolutions keep the variance of their input. The last
+        layer starts with small weights and a bias of 1/2, as the final ReLU has no gradient below zero.
 
         Source: zero residual units: Goyal et al., Accurate, Large Minibatch SGD (2017), section 5.1.
         """
@@ -82,7 +81,7 @@ class MiDaSSmall(ReconstructionHead):
 
 
 class _Decoder(nn.Module):
-    """Project the four scales to 64, 128, 256 and 512 channels; fuse from the coarsest to the finest."""
+    """Decoder: projects the four scales to 64, 128, 256 and 512 channels and fuses them from coarse to fine."""
 
     def __init__(self, out_channels: int) -> None:
         super().__init__()
@@ -102,7 +101,7 @@ class _Decoder(nn.Module):
             nn.Conv2d(32, out_channels, 1),
             nn.ReLU(inplace=True),
         )
-        self.refinenet4.resConfUnit1.requires_grad_(False)  # there is nothing coarser to fuse with
+        self.refinenet4.resConfUnit1.requires_grad_(False)  # unused: the coarsest scale has no coarser path
 
     def forward(self, fine: Tensor, medium: Tensor, coarse: Tensor, coarsest: Tensor) -> Tensor:
         path = self.refinenet4(self.layer4_rn(coarsest))
@@ -113,7 +112,7 @@ class _Decoder(nn.Module):
 
 
 class _Fusion(nn.Module):
-    """Add one scale of the encoder to the coarser path, if there is one; refine, and double the size."""
+    """Fusion: adds one scale of the encoder to the coarser path, if there is one, refines it and doubles its size."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -124,13 +123,13 @@ class _Fusion(nn.Module):
     def forward(self, features: Tensor, path: Tensor | None = None) -> Tensor:
         if path is not None:
             features = path + self.resConfUnit1(features)
-        # A mixture of channels commutes with interpolation: mixing first takes a quarter of the products.
+        # A 1x1 convolution commutes with interpolation; before it, it takes a quarter of the multiplications.
         mixed = self.out_conv(self.resConfUnit2(features))
         return functional.interpolate(mixed, scale_factor=2.0, mode="bilinear", align_corners=True)
 
 
 class _ResidualUnit(nn.Module):
-    """Two rectified 3x3 convolutions added to their input."""
+    """Residual unit: its input plus two 3x3 convolutions with ReLUs."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -142,15 +141,15 @@ class _ResidualUnit(nn.Module):
 
 
 def load_midas_small(path: str | os.PathLike[str]) -> MiDaSSmall:
-    """Read published weights of MiDaS Small from a local file, such as ``midas_v21_small_256.pt``.
+    """Load published weights of MiDaS Small from a local file, such as ``midas_v21_small_256.pt``.
 
     The file is read as data: nothing in it is executed, and nothing is downloaded.
 
     Args:
-        path: a file of ``torch.save`` with the state dict, plain or under the key ``"model"``.
+        path: file of ``torch.save`` with the state dict, itself or under the key ``"model"``.
 
     Returns:
-        The network on the CPU, in training mode as every new module; call ``.eval()`` to predict.
+        The network on the CPU, in training mode; call ``.eval()`` before use.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -171,7 +170,7 @@ def load_midas_small(path: str | os.PathLike[str]) -> MiDaSSmall:
     data = read_bytes(path)
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever a damaged archive or a refused pickle raises
+    except Exception as error:  # of any type, for damaged archives and refused pickles
         raise ValueError(
             f"cannot read {path}: it must be a state dict that torch.save wrote, and hold tensors only"
         ) from error

@@ -1,4 +1,4 @@
-"""Planes that repeat: an image leads smoothly from its end back to its beginning, so a Fourier inverse sees no edge."""
+"""Periodic extension of images for inversion by Fourier transform: a smooth path from the end to the beginning."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from torch import Tensor
 
 
 def periodic_extension(image: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Return the image with rows below and columns on the right that lead from its last ones back to its first.
+    r"""Return the image with added rows below and columns on the right that make its periodic repetition smooth.
 
     .. math:: (1 - w) \, x_{after} + w \, x_{before}, \qquad w = \sin^2 \frac{\pi}{2} \frac{j}{n + 1}
 
-    for the j-th of n added pixels: the mirror image beyond the end fades into the mirror image before the beginning.
+    for the j-th of n added pixels: a blend from the mirror image beyond the end to that before the beginning.
 
     Args:
         image: (..., H, W).
-        size: height and width to reach, not below the image's.
+        size: height and width of the result, at least those of the image.
 
     Returns:
-        (..., *size); the image itself stands unchanged in the upper left corner.
+        (..., *size), with the unchanged image in the upper left corner.
 
     Example:
         >>> periodic_extension(torch.tensor([[0.0, 0.0, 6.0, 6.0]]), (1, 7)).round(decimals=3)
@@ -32,7 +32,7 @@ def periodic_extension(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _bridge(image: Tensor, axis: int, count: int) -> Tensor:
-    """What stands between the image's end and its next repetition along one axis."""
+    """Return the pixels between the end of the image and its next repetition along one axis."""
     last = image.shape[axis] - 1
     step = torch.arange(1, count + 1, device=image.device)
     after = image.index_select(axis, _mirrored(last + step, last))
@@ -43,7 +43,7 @@ def _bridge(image: Tensor, axis: int, count: int) -> Tensor:
 
 
 def _mirrored(index: Tensor, last: int) -> Tensor:
-    """The pixel from 0 to ``last`` that stands at an index beyond them, mirrored as often as it takes."""
+    """Return the pixel from 0 to ``last`` at any index of the image repeated by reflection."""
     if last == 0:
         return torch.zeros_like(index)
     index = index.remainder(2 * last)

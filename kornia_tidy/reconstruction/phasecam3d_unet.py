@@ -1,20 +1,17 @@
-"""The U-Net of PhaseCam3D: the network of the first learnt phase mask for depth, as a baseline."""
+"""The U-Net of PhaseCam3D, the first learnt phase mask for depth: a baseline."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
-from kornia_tidy.reconstruction.unet import LEVELS, conv_block, encode
+from kornia_tidy.reconstruction.unet import UNet, conv_block
 
-EPSILON = 1e-3  # of the normalisation: TensorFlow's, where the network comes from
+EPSILON = 1e-3  # of the batch normalisation, as in TensorFlow, in which the network was published
 
 
-class PhaseCam3DUNet(ReconstructionHead):
-    """U-Net with transposed convolutions and a normalised sigmoid at its end.
+class PhaseCam3DUNet(UNet):
+    """U-Net with transposed convolutions and, at its end, batch normalisation and a sigmoid.
 
     Five levels of two 3x3 convolutions (width, 2, 4, 8 and 16 times width channels), joined by 2x2 maximum pooling on
     the way down and by a 3x3 transposed convolution of stride 2 on the way up.
@@ -25,13 +22,15 @@ class PhaseCam3DUNet(ReconstructionHead):
         width: channels of the first level. PhaseCam3D has 32.
 
     Shape:
-        - image: (B, in_channels, H, W), any size; see :class:`ReconstructionHead` for the borders.
+        - image: (B, in_channels, H, W), any size; for the borders see
+          :class:`~kornia_tidy.reconstruction.ReconstructionHead`.
         - output: (B, out_channels, H, W) between 0 and 1. PhaseCam3D's defocus is linear in it.
 
     Convention:
         - The transposed convolution is aligned as TensorFlow's ``SAME``: pixel i reaches pixels 2i, 2i + 1, 2i + 2.
-        - Starts from :meth:`ReconstructionHead.reset_parameters`: normalisation follows every convolution directly or
-          after the next one, so that their initial scale does not matter; the output starts around 1/2.
+        - Initial weights are those of :meth:`~kornia_tidy.reconstruction.ReconstructionHead.reset_parameters`. Batch
+          normalisation follows every convolution directly or after the next one, so that the scale of these does not
+          matter; the initial outputs lie around 1/2.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), and the network published with it.
 
@@ -41,26 +40,12 @@ class PhaseCam3DUNet(ReconstructionHead):
         torch.Size([1, 1, 50, 70])
     """
 
-    stride = 2 ** (LEVELS - 1)
-
     def __init__(self, in_channels: int = 3, out_channels: int = 1, width: int = 32) -> None:
-        super().__init__(in_channels, out_channels)
-        check_count("width", width)
-        channels = [width << level for level in range(LEVELS)]
-        steps = list(pairwise(channels))
-        self.encoder = nn.ModuleList(conv_block(i, o, EPSILON) for i, o in [(in_channels, width), *steps])
-        self.decoder = nn.ModuleList(_Level(coarse, fine) for fine, coarse in reversed(steps))
+        super().__init__(in_channels, out_channels, width, _Level, EPSILON)
         self.output = nn.Sequential(
             nn.Conv2d(width, out_channels, 1), nn.BatchNorm2d(out_channels, eps=EPSILON), nn.Sigmoid()
         )
         self.reset_parameters()
-
-    def predict(self, image: Tensor) -> Tensor:
-        """Return the maps of an image whose sides are multiples of 16."""
-        features, skips = encode(self.encoder, image)
-        for level in self.decoder:
-            features = level(features, skips.pop())
-        return self.output(features)
 
 
 class _Level(nn.Module):

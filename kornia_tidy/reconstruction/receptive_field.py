@@ -1,4 +1,4 @@
-"""How far a network looks: found by marking pixels and seeing which outputs are marked."""
+"""Receptive field of a network, measured by the spread of NaN from an input pixel to the outputs."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torch import Tensor, nn
 from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.tile_place import TilePlace
 
-FARTHEST = 8192  # px; a network that looks farther is taken to look everywhere
-_STRIP = 32  # px across, at least: nothing is looked for along that side
-_ENDLESS = 2**20  # px of an image at whose ends interpolation is most shifted; a multiple of any stride
+FARTHEST = 8192  # px; a larger receptive field is taken for the whole image
+_STRIP = 32  # px; least width of the strip in which the field is measured lengthwise
+_ENDLESS = 2**20  # strides; side of an image, at the ends of which interpolation is shifted most
 
 _found: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
 
 
 def total_stride(head: nn.Module) -> int:
-    """Return the pixels by which an image must be shifted for a network's output to be shifted, and nothing else.
+    """Return the shift of an image in pixels by which a network's output is shifted equally, and otherwise unchanged.
 
-    It is the ``stride`` of the :class:`ReconstructionHead` in it, and 1 where there is none.
+    It is the ``stride`` of the :class:`ReconstructionHead` in the network, and 1 if there is none.
 
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
@@ -34,26 +34,26 @@ def total_stride(head: nn.Module) -> int:
 
 
 def receptive_field(head: nn.Module) -> int:
-    r"""Return how many pixels beyond an edge on the grid of its stride still have a say in a network's output.
+    r"""Return the radius of a network's receptive field in pixels, counted from a cell of the grid of its stride.
 
-    In a strip of an image one cell of that grid is NaN. Every operation passes it on to whatever it has a say in, also
-    where a weight is zero, so the outputs that are not NaN do not depend on the cell. Algorithms that convolve whole
-    blocks at once can only mark more. Measured along rows and columns, in both directions, and at both ends of an
-    image, for networks that interpolate by their place (:class:`~kornia_tidy.reconstruction.tile_place.TilePlace`);
-    on the CPU, once for each network.
+    One cell of that grid is NaN in a strip of an image. NaN spreads to all that depends on it, also through zero
+    weights, so that outputs other than NaN do not depend on the cell. Convolution algorithms that work on blocks can
+    only spread it farther. It is measured along rows and columns, in both directions, and at both ends of an image for
+    networks whose interpolation depends on position (:class:`~kornia_tidy.reconstruction.tile_place.TilePlace`); on
+    the CPU, once for each network.
 
     Args:
-        head: (B, C, H, W) to maps of the same size, in eval mode.
+        head: network from (B, C, H, W) to maps of the same size, in eval mode.
 
     Returns:
-        Pixels, the largest of all directions.
+        The largest radius of all directions.
 
     Raises:
-        ValueError: if it is in training mode, where pixels see each other through the batch's statistics, or looks
-            farther than 8192 pixels, as averages over the whole image do.
+        ValueError: if the network is in training mode, in which batch statistics depend on all pixels, or its
+            receptive field exceeds 8192 pixels, as with averages over the whole image.
 
     Source: Luo et al., Understanding the Effective Receptive Field in Deep Convolutional Neural Networks (NIPS 2016),
-    section 2, for what is measured here.
+    section 2, for the definition.
 
     Example:
         >>> head = nn.Sequential(nn.Conv2d(3, 4, 5, padding=2), nn.ReLU(), nn.Conv2d(4, 1, 3, padding=1))
@@ -68,7 +68,7 @@ def receptive_field(head: nn.Module) -> int:
 
 
 def maps_of(output: object) -> tuple[Tensor, ...]:
-    """Return the maps of a network's output: itself, or the fields of a tuple.
+    """Return the maps of a network's output, which is one tensor or a tuple of tensors, as a tuple.
 
     Raises:
         TypeError: if it is neither a tensor nor a tuple of tensors.
@@ -80,7 +80,7 @@ def maps_of(output: object) -> tuple[Tensor, ...]:
 
 
 def input_channels(head: nn.Module) -> int:
-    """Return the channels of the images that a network takes: those its first convolution takes, or three.
+    """Return the number of input channels of a network: that of its first convolution, or three without one.
 
     Example:
         >>> input_channels(nn.Sequential(nn.Conv2d(4, 1, 3)))
@@ -111,7 +111,7 @@ def _measure(head: nn.Module, stride: int) -> int:
 
 @torch.no_grad()
 def _marked_around(head: nn.Module, axis: int, length: int, across: int, stride: int, at_end: bool) -> int | None:
-    """How far outputs beside the one marked cell are marked, or None if that is to the end of the strip."""
+    """Return how far NaN spreads from a cell in the middle of the strip, or None if it reaches an end."""
     size = (length, across) if axis == -2 else (across, length)
     image = torch.zeros(1, input_channels(head), *size)
     begin = length // 2 // stride * stride

@@ -1,4 +1,4 @@
-"""A network that sees a capture as it would be, were all of it at one depth, for each of some depths."""
+"""Networks with refocused captures as input: the capture deconvolved for each of several depths."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, pad_border, to_spectrum
 
-WEIGHT = 0.3  # of the prior in inverse filters, in units of a PSF's energy squared
+WEIGHT = 0.3  # of the prior in inverse filters, in units of the square of a PSF's energy
 
 
 def inverse_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
-    r"""Return the filters that give of a capture each layer's share of light, cut off at the PSFs' window.
+    r"""Return the inverse filters that separate a capture into depth layers, truncated to the window of the PSFs.
 
     .. math:: w_k = D \, \mathcal{F}^{-1} \left[ \frac{\bar{H}_k}{\gamma + \sum_j |H_j|^2} \right]
 
-    :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov_layers` with PSFs of one channel, times their number: at its
-    own depth a texture comes out most like itself, at others blurred or ringing. Being cut off, they see no farther
-    than PSFs reach, so that a picture can be reconstructed in tiles.
+    They are those of :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov_layers` for PSFs of one channel, times the
+    number D of PSFs. A texture is restored best by the filter of its depth; other filters blur it or make it ring.
+    Truncation bounds the receptive field, so that a picture can be reconstructed in tiles.
 
     Args:
         psfs: (D, P, P) with P odd.
@@ -42,43 +42,43 @@ def inverse_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
     transfer = torch.fft.rfft2(psfs, s=(size, size))
     power = (transfer.real.square() + transfer.imag.square()).sum(0)
     filters = torch.fft.irfft2(transfer.conj() / (power + weight), s=(size, size))
-    # PSFs began at the corner, so what undoes them ends there.
+    # PSFs begin at the corner of the plane, so their inverses end there.
     return len(psfs) * filters.roll((window - 1, window - 1), (-2, -1))[..., :window, :window]
 
 
 class Refocused(ReconstructionHead):
-    """Show a network a capture, and beside it the capture's brightness refocused to each of some depths.
+    """Feeds a network the capture and, as further channels, its brightness refocused to each of several depths.
 
-    Where a scene lies is then a matter of comparing: the maps in which a place is sharp without ringing tell its depth.
-    A network would have to learn such filters, as wide as the PSFs, by itself.
+    The network then finds depth by comparison: the refocused map in which a region is sharp without ringing is that of
+    its depth. Otherwise it would have to learn such filters, which are as wide as the PSFs.
 
     Args:
-        network: takes C + D channels: the capture, then its refocused brightness, layer by layer with the first of the
-            bank first.
-        layers: D.
+        network: takes C + D channels: the capture, then its refocused brightness, in the order of the bank's layers.
+        layers: number D of depths.
 
     Shape:
         - image: (B, C, H, W), a capture as the network takes it.
         - output: the network's.
 
     Raises:
-        ValueError: if the network takes no channels but those of the layers, a bank has another number of layers, or
-            no bank was ever given.
+        ValueError: if the network has no more than D input channels, a bank has another number of layers, or no bank
+            was given before the first image.
 
     Convention:
-        - Brightness is the channels' mean, of encoded captures the encoded one, whose blur filters undo only nearly.
-        - Borders are continued as :class:`ReconstructionHead` says, then for the filters alike.
-        - Filters are no weights: :meth:`look_through` computes them from the camera's PSFs. In training they are
-          computed anew for every batch, and gradients reach the masks through them also.
+        - Brightness is the mean of the channels; for encoded captures it is not linear light, and the inversion is
+          approximate.
+        - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the filters.
+        - The filters are computed by :meth:`set_psfs` from the camera's PSFs and are not part of the state. In
+          training they are computed for every batch, and gradients reach the masks through them too.
 
-    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), who show a network the layers of a closed
-    form; see :class:`~kornia_tidy.reconstruction.tikhonov.Preconditioned`, which does so exactly, in linear light, and
-    over the whole picture.
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes the layers of a closed
+    form. :class:`~kornia_tidy.reconstruction.tikhonov.Preconditioned` does this exactly, in linear light, with filters
+    as large as the picture.
 
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
         >>> head = Refocused(AttentionUNet(3 + 4, out_channels=1, width=4), layers=4).eval()
-        >>> head.look_through(PSFBank.from_measured(torch.rand(4, 1, 5, 5), torch.arange(4.0)))
+        >>> head.set_psfs(PSFBank.from_measured(torch.rand(4, 1, 5, 5), torch.arange(4.0)))
         >>> head(torch.rand(2, 3, 16, 20)).shape
         torch.Size([2, 1, 16, 20])
     """
@@ -89,35 +89,35 @@ class Refocused(ReconstructionHead):
         check_count("layers", layers)
         super().__init__(network.in_channels - layers, network.out_channels)
         self.network, self.layers, self.stride = network, layers, network.stride
-        network._looked = True  # at no capture: what is refocused overshoots [0, 1]
+        network._looked = True  # no check of the range, as refocused maps leave [0, 1]
         self.register_buffer("filters", torch.zeros(0), persistent=False)
 
-    def look_through(self, bank: PSFBank) -> None:
-        """Compute the filters for a camera's PSFs; of several channels their mean."""
+    def set_psfs(self, bank: PSFBank) -> None:
+        """Compute the filters from a camera's PSFs, averaged over channels."""
         if len(bank.psfs) != self.layers:
             raise ValueError(f"a network for {self.layers} layers needs as many PSFs, got {len(bank.psfs)}")
         self.filters = inverse_filters(bank.psfs.mean(1))
 
     def predict(self, image: Tensor) -> Tensor:
-        """Return what the network makes of the capture and its refocused brightness."""
+        """Return the network's maps from the capture and its refocused brightness."""
         if not self.filters.numel():
-            raise ValueError("the network does not know its camera: call look_through(optics.psf_bank(...)) first")
+            raise ValueError("the network does not know its camera: call set_psfs(optics.psf_bank(...)) first")
         brightness = image.to(torch.promote_types(image.dtype, self.filters.dtype)).mean(1, keepdim=True)
         return self.network(torch.cat([image, _convolve(brightness, self.filters).to(image.dtype)], 1))
 
 
 def _convolve(image: Tensor, filters: Tensor) -> Tensor:
-    """Convolve (B, 1, H, W) with (D, P, P) to (B, D, H, W), continued at its borders."""
+    """Convolve (B, 1, H, W) with (D, P, P) to (B, D, H, W), with padded borders."""
     window = filters.shape[-1]
     padded = pad_border(image, window // 2, "reflect" if window // 2 < min(image.shape[-2:]) else "replicate")
-    if torch.compiler.is_compiling():  # exporters know no complex numbers
+    if torch.compiler.is_compiling():  # exporters do not support complex numbers
         return functional.conv2d(padded, filters.flip((-2, -1)).unsqueeze(1))
     unknown = padded.isnan()
-    if marked := bool(unknown.any()):  # a transform would spread what is unknown over the whole picture
+    if marked := bool(unknown.any()):  # a transform would spread NaN over the whole picture
         padded = padded.where(~unknown, 0)
     size = padded.shape[-2], padded.shape[-1]
     spectrum = to_spectrum(padded, size)
-    # Large pictures are looked at without gradients: one filter at a time takes a fraction of the memory.
+    # Without gradients, as for large pictures, one filter at a time takes a fraction of the memory.
     together = len(filters) if torch.is_grad_enabled() else 1
     layers = [from_spectrum(spectrum * to_spectrum(some, size), size, window) for some in filters.split(together)]
     convolved = torch.cat(layers, 1)

@@ -1,4 +1,4 @@
-"""What a network adds to a capture: it need not learn to copy what the capture shows already."""
+"""Residual estimation: a network estimates the difference between the all-in-focus image and the capture."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from torch import Tensor, nn
 
 
 class Residual(nn.Module):
-    """Add the capture to a network's last maps, its estimate of the all-in-focus image.
+    """Adds the capture to a network's last maps, which estimate the all-in-focus image.
 
-    It begins as the identity, whatever the network's weights: the last convolution starts at zero. So training starts
-    from the capture's error, and short trainings improve on the capture instead of learning to copy it.
+    The last convolution is initialised with zeros, so that the initial estimate is the capture itself. A short training
+    then improves on the capture instead of learning to copy it.
 
     Args:
-        network: any that ends in a convolution; its last maps are the image.
+        network: network that ends in a convolution; its last maps are the image.
         channels: of the image.
 
     Shape:
@@ -24,7 +24,7 @@ class Residual(nn.Module):
         ValueError: if the network does not end in a convolution, or has fewer maps than the image has channels.
 
     Source: He et al., Deep Residual Learning (CVPR 2016); Zhang et al., Beyond a Gaussian Denoiser (TIP 2017), for
-    estimating the residual of an image; zero to begin with, as Goyal et al. (2017), section 5.1.
+    estimating the residual of an image; zero initialisation as in Goyal et al. (2017), section 5.1.
 
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
@@ -49,7 +49,7 @@ class Residual(nn.Module):
                 parameter.zero_()
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return the maps, the capture added to the last ones."""
+        """Return the maps, with the capture added to the last ones."""
         maps = self.network(image)
         others = maps.shape[1] - self.channels
         return torch.cat([maps[:, :others], maps[:, others:] + image], 1)

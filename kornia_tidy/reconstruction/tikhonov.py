@@ -1,9 +1,8 @@
-"""Tikhonov and Wiener inversion: captures undone in closed form, one product for each spatial frequency.
+"""Tikhonov and Wiener inversion of captures in closed form, by one product for each spatial frequency.
 
-Everything is linear light: decode captures first. A capture ends at its border while a Fourier inverse sees it repeat,
-so it is first continued over a PSF's width to lead smoothly into its repetition (``border="smooth"``, see
-:func:`~kornia_tidy.reconstruction.periodic.periodic_extension`); ``border="circular"`` takes it as it is, right for
-images that do repeat.
+Captures must be linear light. As the Fourier transform takes them for periodic, they are first extended by the width of
+a PSF to a smooth periodic image (``border="smooth"``, see
+:func:`~kornia_tidy.reconstruction.periodic.periodic_extension`). ``border="circular"`` is for images that are periodic.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ def tikhonov(
     veil: Tensor | None = None,
     border: str = "smooth",
 ) -> Tensor:
-    r"""Return the image that explains a capture by one PSF, kept near a prior image: deconvolution.
+    r"""Deconvolve a capture with one PSF by Tikhonov regularisation towards a prior image.
 
     .. math:: \arg\min_x \lVert h * x - y \rVert^2 + \gamma \lVert x - x_0 \rVert^2, \qquad
               X = \frac{\bar{H} Y + \gamma X_0}{|H|^2 + \gamma}
@@ -38,24 +37,24 @@ def tikhonov(
     Args:
         capture: y, (B, C, H, W) linear light.
         psf: h, (C, P, P) with P odd.
-        weight: :math:`\gamma`, positive, in units of a PSF's energy squared. Or a tensor that broadcasts to the half
-            spectrum (B, C, H, W // 2 + 1) for ``"circular"``.
-        prior: :math:`x_0`, as ``capture``. None for black, which is Wiener's filter if ``weight`` is the power spectrum
-            of the noise over that of the image. The capture itself (Sitzmann et al.) keeps white white, and
-            frequencies that the PSF does not pass as they are.
-        veil: (C,) share of light spread evenly over the image, or None.
+        weight: :math:`\gamma`, positive, in units of the square of a PSF's energy. Or, for ``"circular"``, a tensor
+            that broadcasts to the half spectrum (B, C, H, W // 2 + 1).
+        prior: :math:`x_0`, as ``capture``. None is black, which gives Wiener's filter if ``weight`` is the ratio of the
+            power spectra of noise and image. With the capture as prior (Sitzmann et al.) white stays white, and
+            frequencies that the PSF does not pass stay as they are.
+        veil: (C,) stray light, the fraction of light spread evenly over the image, or None.
         border: ``"smooth"`` or ``"circular"``.
 
     Returns:
-        (B, C, H, W) in the capture's dtype, computed in float32 or better, autocast or not. Not clamped; NaN is not
-        looked for.
+        (B, C, H, W) in the capture's dtype, computed in float32 or better, also under autocast. It is neither clamped
+        nor checked for NaN.
 
     Raises:
         TypeError: if a tensor is not floating point.
         ValueError: if shapes do not fit, or ``weight`` is a number that is not positive.
 
     Convention:
-        Undoes a convolution; for captures made with ``correlate=True`` turn the PSF by ``psf.flip(-2, -1)``.
+        It inverts a convolution; for captures made with ``correlate=True`` flip the PSF by ``psf.flip(-2, -1)``.
 
     Source: Sitzmann et al., ACM Transactions on Graphics 37(4) 114 (2018); Wiener (1949).
 
@@ -85,25 +84,25 @@ def tikhonov_layers(
     veil: Tensor | None = None,
     border: str = "smooth",
 ) -> Tensor:
-    r"""Return the layers of light that together explain a capture, the shortest that do.
+    r"""Separate a capture into depth layers: their blurred sum is the capture, and their energy is least.
 
     .. math:: \arg\min_{x_k} \lVert \sum_k h_k * x_k - y \rVert^2 + \gamma \sum_k \lVert x_k \rVert^2, \qquad
               X_k = \frac{\bar{H}_k Y}{\gamma + \sum_j |H_j|^2}
 
     The model is :func:`kornia_tidy.render.scatter`. All layers are solved jointly: at each frequency the normal matrix
-    is the identity and one outer product, which Sherman and Morrison's formula inverts, so nothing of size D x D is
-    built. Each layer is given of every frequency the share that its PSF passes, compared with the others.
+    is the identity plus an outer product, which the Sherman-Morrison formula inverts without a D x D matrix. At each
+    frequency a layer gets light in proportion to the transfer of its PSF.
 
     Args:
         capture: y, (B, C, H, W) linear light.
         psfs: h, (D, C, P, P) with P odd.
-        weight: :math:`\gamma`, positive, in units of a PSF's energy squared. Or a tensor that broadcasts to the half
-            spectrum (B, C, H, W // 2 + 1) for ``"circular"``.
-        veil: (D, C) share of light spread evenly over the image, or None.
+        weight: :math:`\gamma`, positive, in units of the square of a PSF's energy. Or, for ``"circular"``, a tensor
+            that broadcasts to the half spectrum (B, C, H, W // 2 + 1).
+        veil: (D, C) stray light, the fraction of light spread evenly over the image, or None.
         border: ``"smooth"`` or ``"circular"``.
 
     Returns:
-        (B, D, C, H, W), as :func:`tikhonov`; so are errors and convention. The layers' sum, not each of them, has the
+        (B, D, C, H, W), with dtype, errors and convention of :func:`tikhonov`. The sum of the layers has the
         brightness of the scene.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021.
@@ -119,15 +118,15 @@ def tikhonov_layers(
 
 
 class Inversion(nn.Module):
-    """What the inversions share: a weight that is learnt through its logarithm, so that it stays positive.
+    """Base class of the inversions, with a weight that stays positive as its logarithm is learnt.
 
     Args:
-        weight: where the weight starts, positive.
+        weight: initial weight, positive.
         border: ``"smooth"`` or ``"circular"``.
-        correlate: captures are correlations, as with fidelity ``"paper"``: PSFs turned by 180 degrees.
+        correlate: captures are correlations, as with fidelity ``"paper"``: PSFs are flipped by 180 degrees.
 
     Raises:
-        ValueError: if the weight is not positive, or the border not known.
+        ValueError: if the weight is not positive, or the border unknown.
     """
 
     def __init__(self, weight: float, border: str = "smooth", *, correlate: bool = False) -> None:
@@ -146,14 +145,14 @@ class Inversion(nn.Module):
         return bank.psfs.flip((-2, -1)) if self.correlate else bank.psfs
 
     def extra_repr(self) -> str:
-        """Return the weight and the choices."""
+        """Return the weight and the options."""
         return f"weight={self.weight.item():.3g}, border={self.border!r}, correlate={self.correlate}"
 
 
 class Tikhonov(Inversion):
-    """All-in-focus images by deconvolution with the mean PSF of all layers, for masks whose PSF hardly changes.
+    """Deconvolution with the mean PSF of all layers, for masks whose PSF hardly changes with depth.
 
-    Kept near the capture, so white stays white whatever the weight. See :func:`tikhonov` and :class:`Inversion`.
+    The prior is the capture, so that white stays white for any weight. See :func:`tikhonov` and :class:`Inversion`.
 
     Args:
         weight: as for :class:`Inversion`. 0.03 suits cubic masks and read noise of 1 %.
@@ -181,10 +180,10 @@ class Tikhonov(Inversion):
 
 
 class TikhonovLayers(Inversion):
-    """Estimates of every layer's light; see :func:`tikhonov_layers` and :class:`Inversion`.
+    """Separation into depth layers, see :func:`tikhonov_layers` and :class:`Inversion`.
 
     Args:
-        weight: as for :class:`Inversion`; 1 is Ikoma et al.'s.
+        weight: as for :class:`Inversion`; Ikoma et al. use 1.
         border: as for :class:`Inversion`.
         correlate: as for :class:`Inversion`.
 
@@ -202,15 +201,15 @@ class TikhonovLayers(Inversion):
 
 
 class Preconditioned(nn.Module):
-    """A network that sees the capture together with what an inversion makes of it.
+    """Feeds a network the capture together with the estimates of an inversion.
 
     Args:
-        network: takes (B, C + C D, H, W): the capture, then the estimates, layer by layer with the bank's first.
-            (B, 2 C, H, W) with :class:`Tikhonov`.
-        inversion: default :class:`TikhonovLayers`, as Ikoma et al. do.
+        network: takes (B, C + C D, H, W): the capture, then the estimates in the order of the bank's layers; with
+            :class:`Tikhonov` it takes (B, 2 C, H, W).
+        inversion: of the capture. Default: :class:`TikhonovLayers`, as in Ikoma et al.
 
     Shape:
-        - ``(capture, bank)``: (B, C, H, W) linear light and a bank of D layers, to what the network returns.
+        - ``(capture, bank)``: (B, C, H, W) linear light and a bank of D layers, to the network's output.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021.
 
@@ -227,23 +226,23 @@ class Preconditioned(nn.Module):
         self.network = network
 
     def forward(self, capture: Tensor, bank: PSFBank) -> Tensor:
-        """Return what the network makes of capture and estimates."""
+        """Return the network's output for capture and estimates."""
         estimates = self.inversion(capture, bank).flatten(1, -3)
         return self.network(torch.cat([capture, estimates], dim=1))
 
 
 def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None = None) -> Tensor:
-    r"""Return the half spectrum of PSFs on a plane that repeats, the chief ray on its first pixel.
+    r"""Return the half spectrum of PSFs on a periodic plane, with the chief ray on its first pixel.
 
     .. math:: H_{uv} = \sum_{yx} e^{-2 \pi i \, u y / M} \, h_{yx} \, e^{-2 \pi i \, v x / N}
 
-    as two matrix products: of a plane's rows and columns a PSF fills so few that this is faster than a transform of
-    the whole plane, and no plane is filled with zeros.
+    It is computed as two matrix products. A PSF fills so few rows and columns of the plane that this is faster than a
+    fast Fourier transform of the zero-padded plane.
 
     Args:
-        psfs: (..., P, P) with P odd, float32 or float64. Those larger than the plane wrap around, as light does there.
+        psfs: (..., P, P) with P odd, float32 or float64. PSFs larger than the plane wrap around.
         size: rows M and columns N of the plane.
-        veil: (...) share of light spread evenly over the plane, or None.
+        veil: (...) stray light, the fraction of light spread evenly over the plane, or None.
 
     Returns:
         Complex (..., M, N // 2 + 1).
@@ -263,17 +262,17 @@ def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None =
 
 
 def _fourier_matrix(psfs: Tensor, side: int, count: int) -> Tensor:
-    """(count, P): the first frequencies of a line of ``side`` pixels, of points about its first one."""
+    """Return the DFT matrix (count, P) of a line of ``side`` pixels, for P pixels centred on its first one."""
     points = torch.arange(psfs.shape[-1], device=psfs.device) - psfs.shape[-1] // 2
     turns = torch.arange(count, device=psfs.device)[:, None] * points
-    phase = turns.double() * (-2 * math.pi / side)  # float32 would lose it on wide planes
+    phase = turns.double() * (-2 * math.pi / side)  # in float32 it would be inaccurate on wide planes
     return torch.polar(torch.ones_like(phase), phase).to(torch.promote_types(psfs.dtype, torch.complex64))
 
 
 def _spectra(
     capture: Tensor, psfs: Tensor, weight: float | Tensor, veil: Tensor | None, border: str
 ) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """The half spectra of the capture's plane and of the PSFs on it, and the plane's size."""
+    """Return the half spectra of the extended capture and of the PSFs on its plane, and the size of the plane."""
     check_float_tensor("capture", capture, 4, "(B, C, H, W)")
     check_choice("border", border, BORDERS)
     if not isinstance(weight, Tensor):
@@ -293,7 +292,7 @@ def _spectra(
 
 
 def _spectrum(image: Tensor, size: tuple[int, int], dtype: torch.dtype) -> Tensor:
-    """The half spectrum of an image on a plane that repeats, in float32, or better where image or ``dtype`` are."""
+    """Return the half spectrum of an image on a periodic plane, in float32 or the precision of image or ``dtype``."""
     precise = torch.promote_types(torch.promote_types(image.dtype, dtype), torch.float32)
     return torch.fft.rfft2(periodic_extension(image.to(precise), size))
 
@@ -303,6 +302,6 @@ def _power(transfer: Tensor) -> Tensor:
 
 
 def _image(spectrum: Tensor, size: tuple[int, int], capture: Tensor) -> Tensor:
-    """The part of a plane on which the capture lay."""
+    """Return the image on a plane, cropped to the capture."""
     plane = torch.fft.irfft2(spectrum, s=size)
     return plane[..., : capture.shape[-2], : capture.shape[-1]].to(capture.dtype)

@@ -1,4 +1,4 @@
-"""How an image is cut into overlapping tiles for a network: where each begins, and which part of it is kept."""
+"""Grid of overlapping tiles of an image, and the part of each tile that is kept."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kornia_tidy.reconstruction.head import border_padding
 
 
 class Span(NamedTuple):
-    """A tile along one axis: where it begins, and the pixels from ``kept`` to before ``end`` that are kept of it."""
+    """A tile along one axis: its first pixel, and the kept pixels from ``kept`` to before ``end``."""
 
     start: int
     kept: int
@@ -21,19 +21,19 @@ class Span(NamedTuple):
 
 
 class TileGrid:
-    r"""The tiles of an image of some size.
+    r"""Overlapping tiles of an image.
 
-    Positions are those of the image as heads continue it (:class:`~kornia_tidy.reconstruction.ReconstructionHead`), so
-    its sides P are multiples of the stride. n tiles of side T that overlap by twice the margin R reach over it if
+    Positions are in the image padded as by :class:`~kornia_tidy.reconstruction.ReconstructionHead`, whose sides P are
+    multiples of the stride. n tiles of side T that overlap by twice the margin R cover a side if
 
     .. math:: T \\geq \\frac{P + 2 R (n - 1)}{n}
 
-    All tiles are of one size, which keeps memory and the choice of algorithms the same from tile to tile.
+    All tiles have one size, so that memory and choice of algorithms are the same for each.
 
     Args:
         size: rows and columns of the image.
-        stride: pixels of the grid on which tiles begin and end.
-        overlap: pixels thrown away at each cut; rounded up to the grid.
+        stride: spacing of the grid on which tiles begin and end, in pixels.
+        overlap: pixels discarded at each cut; rounded up to the grid.
 
     Example:
         >>> grid = TileGrid((100, 250), stride=16, overlap=20)
@@ -50,10 +50,10 @@ class TileGrid:
         self.whole = (size[0] + self.top + bottom, size[1] + self.left + right)
 
     def sides_within(self, wanted: tuple[int, int]) -> tuple[int, int]:
-        """Return the largest tile not larger than wanted.
+        """Return the sides of the largest tile that is not larger than wanted.
 
         Raises:
-            ValueError: if that is smaller than the smallest tile.
+            ValueError: if it is smaller than the smallest tile.
         """
         sides = tuple(
             min(whole, side // self.stride * self.stride) for side, whole in zip(wanted, self.whole, strict=True)
@@ -66,7 +66,7 @@ class TileGrid:
         return sides  # ty: ignore[invalid-explicit-return]
 
     def cheapest_sides(self, pixels: int) -> tuple[int, int] | None:
-        """Return the tile of at most so many pixels with the least to compute, or None if every one has more."""
+        """Return the sides of the tile with the least computation and at most ``pixels``, or None if there is none."""
         choices = []
         for rows, columns in product(self._counts(0), self._counts(1)):
             sides = self._side(0, rows), self._side(1, columns)
@@ -75,16 +75,16 @@ class TileGrid:
         return min(choices)[1] if choices else None
 
     def smallest_sides(self) -> tuple[int, int]:
-        """Return the smallest tile: something of it is kept, and it has more of the image than continues it."""
+        """Return the sides of the smallest tile: a part of it is kept, and less of it is padding than image."""
         least = max(2 * self.margin, self.stride) + self.stride
         return min(least, self.whole[0]), min(least, self.whole[1])
 
     def tiles(self, sides: tuple[int, int]) -> list[tuple[Span, Span]]:
-        """Return the tiles of some size, row by row."""
+        """Return the tiles of given sides, row by row."""
         return list(product(self._spans(0, sides[0]), self._spans(1, sides[1])))
 
     def cut(self, image: Tensor, tile: tuple[Span, Span], sides: tuple[int, int]) -> Tensor:
-        """Return a tile of an image (B, C, H, W), continued at its borders as the image is."""
+        """Return a tile of an image (B, C, H, W), padded at the borders of the image."""
         (row, _, _), (column, _, _) = tile
         rows = self._inside(row, row + sides[0], self.top, self.size[0])
         columns = self._inside(column, column + sides[1], self.left, self.size[1])
@@ -94,7 +94,7 @@ class TileGrid:
         return functional.pad(part, (left, right, top, bottom), self.mode) if top + bottom + left + right else part
 
     def keep(self, part: Tensor, whole: Tensor, tile: tuple[Span, Span]) -> None:
-        """Copy what is kept of a tile's map to the map of the image, both (B, C, H, W)."""
+        """Copy the kept part of a tile's map into the map of the image, both (B, C, H, W)."""
         row, column = tile
         rows = self._inside(row.kept, row.end, self.top, self.size[0])
         columns = self._inside(column.kept, column.end, self.left, self.size[1])
@@ -103,7 +103,7 @@ class TileGrid:
         whole[..., rows.start : rows.stop, columns.start : columns.stop] = kept
 
     def _counts(self, axis: int) -> Iterator[int]:
-        """The numbers of tiles along an axis, up to that of the smallest tile."""
+        """Yield the numbers of tiles along an axis, up to that of the smallest tile."""
         count, least = 1, self.smallest_sides()[axis]
         yield count
         while self._side(axis, count) > least:
@@ -111,7 +111,7 @@ class TileGrid:
             yield count
 
     def _side(self, axis: int, count: int) -> int:
-        """The side of so many tiles that reach over an axis."""
+        """Return the side of the tiles, if ``count`` of them cover an axis."""
         return -(-(self.whole[axis] + 2 * self.margin * (count - 1)) // (count * self.stride)) * self.stride
 
     def _spans(self, axis: int, side: int) -> list[Span]:
@@ -125,5 +125,5 @@ class TileGrid:
 
     @staticmethod
     def _inside(start: int, stop: int, before: int, size: int) -> range:
-        """The pixels of the image from one position to before another of the continued image."""
+        """Return the range of image pixels between two positions of the padded image."""
         return range(max(0, start - before), min(size, stop - before))

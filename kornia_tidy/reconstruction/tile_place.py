@@ -1,4 +1,4 @@
-"""Where a tile lies in its image: for the one common layer whose weights depend on it."""
+"""Position of a tile in its image, on which interpolation with ``align_corners=True`` depends."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch.overrides import TorchFunctionMode
 
 
 class TilePlace(TorchFunctionMode):
-    r"""Inside this context a network interpolates a tile as it would the whole image.
+    r"""Context in which a network interpolates a tile as it would the whole image.
 
     Interpolation with ``align_corners=True`` maps the first and last pixel of the whole image onto themselves, so
 
     .. math:: x = i \, \frac{n - 1}{m - 1}
 
-    for pixel i of m made from n: the step is not 1/2, and pixels move against each other over the image. A tile needs
-    the n, m and i of the image. Other layers do not depend on the place.
+    for pixel i of m computed from n. For twofold interpolation the step is not exactly 1/2, so that the weights change
+    over the image, and a tile needs n, m and i of the image. Other layers do not depend on position.
 
     Args:
         tile: rows and columns of the tile.
@@ -27,8 +27,8 @@ class TilePlace(TorchFunctionMode):
         image: rows and columns of the image.
 
     Convention:
-        - Rounded as PyTorch does it: indices in float32 for all types but float64.
-        - What a network interpolates must be the tile at a whole factor smaller, and become a whole factor larger.
+        - Rounding is PyTorch's: indices are in float32 for all types but float64.
+        - Features must be smaller than the tile by an integer factor, and be enlarged by an integer factor.
 
     Example:
         >>> image = torch.arange(8.0).square().view(1, 1, 1, 8).expand(1, 1, 8, 8)
@@ -46,7 +46,7 @@ class TilePlace(TorchFunctionMode):
     def __torch_function__(
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        """Interpolate for the place; pass on everything else."""
+        """Replace interpolation by that for the tile's position; call all other functions as they are."""
         kwargs = kwargs or {}
         if func is not functional.interpolate or not kwargs.get("align_corners"):
             return func(*args, **kwargs)
@@ -66,14 +66,14 @@ class TilePlace(TorchFunctionMode):
 
 
 def _stretched(features: Tensor, axis: int, factor: int, start: int, whole: int) -> Tensor:
-    """Interpolate one axis of features that begin at ``start`` of ``whole``, as the whole would be."""
+    """Interpolate one axis of features that are part of ``whole`` and begin at ``start``, as the whole would be."""
     size = features.shape[axis]
     precise = torch.promote_types(features.dtype, torch.float32)
     index = torch.arange(factor * start, factor * (start + size), device=features.device, dtype=precise)
     scale = torch.tensor(whole - 1, dtype=precise) / max(1, factor * whole - 1)
     place = index * scale.to(features.device)
     before = place.floor()
-    # Beyond the tile's ends stands what a tile cannot know; the caller cuts it away.
+    # Values beyond the ends of the tile are wrong; the caller discards them.
     first = (before.long() - start).clamp(0, size - 1)
     second = (before.long() + 1).clamp(max=whole - 1).sub(start).clamp(0, size - 1)
     weight = (place - before).to(features.dtype)

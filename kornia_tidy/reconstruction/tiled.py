@@ -1,4 +1,4 @@
-"""Images of any size through a network, tile by tile, as if they had been seen whole."""
+"""Tiled reconstruction of images of any size, with the result of the whole image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kornia_tidy.reconstruction.receptive_field import input_channels, maps_of, 
 from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
 
-SEAM = 1e-4  # of the largest output: thirty times what float32 was seen to differ by, and below what is seen
+SEAM = 1e-4  # largest difference, relative to the largest output: 30 times the rounding found in float32
 _COUNTED_ON = 128  # px; sides of the tile on which memory is counted
 
 _seamless: WeakSet[nn.Module] = WeakSet()
@@ -33,28 +33,28 @@ def reconstruct_tiled(
     out: Tensor | tuple[Tensor, ...] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Any:
-    r"""Return what a network makes of an image, seen in overlapping tiles of which the middles are kept.
+    r"""Apply a network to an image in overlapping tiles and join their middles.
 
-    Tiles are cut on the grid of the network's stride, and what lies within its receptive field of a cut is thrown away:
-    what is left does not know of the tile, and equals the result for the whole image up to rounding. The field is
-    measured, not assumed, see :func:`~kornia_tidy.reconstruction.receptive_field.receptive_field`; a network whose
-    tiles would show is refused.
+    Tiles are cut on the grid of the network's stride, and outputs within its receptive field of a cut are discarded.
+    The others equal the result for the whole image up to rounding. The receptive field is measured, see
+    :func:`~kornia_tidy.reconstruction.receptive_field.receptive_field`. Networks for which tiles differ from the whole
+    are refused.
 
     Args:
-        head: (B, C, H, W) to maps of the same size: a tensor, or a tuple of several. In eval mode, on any device.
-        image: (B, C, H, W). May lie on another device than the network, or in a mapped file; tiles are moved, and
-            converted to the type of the network's weights, one by one.
-        tile: rows and columns of a tile in pixels, its overlap included; one number for both. None: the tile that
-            takes the least work within the memory.
-        overlap: pixels thrown away at each cut. None: the receptive field, for an exact result. Fewer are faster and
-            show; the network is not checked then.
-        memory_budget: bytes that the network may take for a tile, beyond its weights, the image and the result.
-        out: where to write the maps, such as mapped files: of the output's shape, or a tuple of these. None: new
-            tensors on the image's device, in the network's type.
-        progress: called after each tile with the numbers of tiles done and of all. What it raises ends the work.
+        head: network in eval mode, on any device, from (B, C, H, W) to a map of the same size or a tuple of maps.
+        image: (B, C, H, W). It may be on another device than the network, or in a mapped file; tiles are moved, and
+            converted to the data type of the network's weights, one by one.
+        tile: rows and columns of a tile in pixels, including its overlap; one number for both. None: the tile with the
+            least computation within the memory.
+        overlap: pixels discarded at each cut. None: the receptive field, for an exact result. Fewer are faster, but
+            leave visible seams; the network is not checked then.
+        memory_budget: bytes that the network may use for a tile, beyond its weights, the image and the result.
+        out: tensors for the maps, such as mapped files, in the form of the output. None: new tensors on the device of
+            the image, in the network's data type.
+        progress: called after each tile with the numbers of finished and of all tiles. Its exceptions end the work.
 
     Returns:
-        What the network returns. An image that fits the memory is seen whole.
+        The network's output for the whole image. An image that fits the memory is one tile.
 
     Raises:
         TypeError: if the image is not a floating-point tensor.
@@ -104,21 +104,21 @@ def _run(
             result = _blank(output, image)
         for part, whole in zip(maps_of(output), maps_of(result), strict=True):
             grid.keep(part, whole, place)
-        del output, part, whole  # or the next tile would be seen beside it
+        del output, part, whole  # else this tile's output would be held beside the next one's
         if progress is not None:
             progress(done + 1, len(tiles))
     return result
 
 
 def _see(head: nn.Module, part: Tensor, grid: TileGrid, place: tuple[Span, Span]) -> Any:
-    """What the network makes of one tile. Channels last takes less memory and, on a CPU, up to 0.6 of the time."""
+    """Return the network's output for one tile, in channels-last format: less memory, and on a CPU less time (0.6)."""
     corner = (place[0].start, place[1].start)
     with TilePlace((part.shape[-2], part.shape[-1]), corner, grid.whole):
         return head(part.contiguous(memory_format=torch.channels_last))
 
 
 def _blank(output: Any, image: Tensor) -> Any:
-    """Maps of the whole image, in the form of a tile's."""
+    """Return empty maps of the whole image, in the form of a tile's output."""
     maps = [part.new_empty((*part.shape[:2], *image.shape[-2:]), device=image.device) for part in maps_of(output)]
     if isinstance(output, Tensor):
         return maps[0]
@@ -126,7 +126,7 @@ def _blank(output: Any, image: Tensor) -> Any:
 
 
 def _sides_that_fit(head: nn.Module, grid: TileGrid, like: Tensor, memory_budget: int) -> tuple[int, int]:
-    """The tile with the least to compute within the memory, whose use grows with the pixels of a tile."""
+    """Return the sides of the tile with the least computation within the memory, which is linear in its pixels."""
     side = -(-_COUNTED_ON // grid.stride) * grid.stride
     each = head_bytes(head, like.new_zeros(*like.shape[:2], side, side)) / side**2
     sides = grid.cheapest_sides(int(memory_budget / each))
@@ -142,9 +142,10 @@ def _sides_that_fit(head: nn.Module, grid: TileGrid, like: Tensor, memory_budget
 
 
 def _check_seamless(head: nn.Module) -> None:
-    """Raise ``ValueError`` unless two tiles of noise are the whole, on sides that are no multiples of the stride.
+    """Raise ``ValueError`` unless tiles of a noise image give the result of the whole image.
 
-    Finds what no receptive field tells: pixels that are treated by their place, or borders continued in another way.
+    Its sides are no multiples of the stride. This finds dependence on position and other paddings, which the receptive
+    field does not show.
     """
     if head in _seamless:
         return

@@ -1,4 +1,4 @@
-"""Validity masks: pixels without a true value stay out of losses and metrics, whatever stands there, NaN included."""
+"""Validity masks, which exclude pixels without a true value, NaN included, from losses and metrics."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from kornia_tidy.checks import check_float_tensor
 def valid_maps(
     prediction: Tensor, target: Tensor, mask: Tensor | None = None, filler: float = 0.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return prediction and target with masked pixels put to the same number, and the mask of every sample.
+    """Return prediction and target with equal values at masked pixels, and the mask of every sample.
 
-    Masked pixels are replaced before anything is computed from them: they reach neither values nor gradients, where
-    a product with zero would let NaN through.
+    Masked pixels are replaced before any computation, so that they affect neither values nor gradients. A product with
+    zero would keep NaN.
 
     Args:
         prediction: (B, C, H, W).
         target: (B, C, H, W).
         mask: bool (B, 1, H, W), or another shape that broadcasts; True where the target is known. None: everywhere.
-        filler: what stands behind the mask, in both.
+        filler: value of masked pixels in both.
 
     Returns:
         Prediction, target, both in float32 or float64, and the mask, all (B, C, H, W).
 
     Raises:
         TypeError: if prediction or target are not floating point, or the mask is not bool.
-        ValueError: if the shapes do not fit. Broadcasting (B, H, W) against (B, 1, H, W) would compare all images.
+        ValueError: if the shapes do not fit. Broadcasting (B, H, W) with (B, 1, H, W) would compare all pairs of
+            images.
 
     Example:
         >>> depth = torch.tensor([1.5, float("nan")]).view(1, 1, 1, 2)
@@ -55,7 +56,7 @@ def valid_maps(
 
 
 def safe_sqrt(value: Tensor) -> Tensor:
-    """Return the square root, with a gradient of zero at zero instead of an infinite one.
+    """Return the square root, with a gradient of zero instead of infinity at zero.
 
     Example:
         >>> x = torch.tensor([0.0, 4.0], requires_grad=True)

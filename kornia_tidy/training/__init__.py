@@ -1,4 +1,4 @@
-"""Training optics and network together: data, checkpoints, and the Lightning module that joins them.
+"""Joint training of optics and network: settings of a run, data, checkpoints and the Lightning module.
 
 The settings of a run come in, checkpoints of a trained system go out. Read ``run.py`` first. Lightning is an extra
 (``pip install 'kornia-tidy[train]'``), imported by ``module``, ``data_module``, ``callbacks``, ``checkpoint`` and

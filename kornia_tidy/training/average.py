@@ -1,4 +1,9 @@
-"""The exponential moving average of a network's weights, which is steadier than the network in training."""
+"""Exponential moving average of a network's weights.
+
+The step is torch's ``get_ema_multi_avg_fn``. Its ``AveragedModel`` copies all buffers, and so fails on the filters of
+:class:`~kornia_tidy.reconstruction.Refocused`, whose size follows the PSFs. Lightning's ``WeightAveraging`` averages
+the masks too, which the network is not trained for, and stores the average under the network's names.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +11,18 @@ import copy
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 
 
 class MovingAverage(nn.Module):
-    r"""A copy of a network whose weights follow those of the original slowly.
+    r"""Exponential moving average of a network's weights, held in a copy of the network.
 
     .. math:: a \leftarrow d_t a + (1 - d_t) w, \quad d_t = \min(d, (1 + t) / (10 + t))
 
-    The smaller decay at first lets it forget where the network began. Saved buffers, such as the statistics of
-    batch normalisation, are copied.
+    The decay is small at first, so that the initial weights are soon forgotten. Saved buffers, such as the statistics
+    of batch normalisation, are copied.
 
     Args:
         network: the original, which is not changed.
@@ -47,19 +53,17 @@ class MovingAverage(nn.Module):
 
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
-        """Take a step towards the network's weights."""
+        """Move the average towards the network's present weights by one step."""
         steps = int(self.steps)
-        decay = min(self.decay, (1 + steps) / (10 + steps))
-        learnt = {name for name, _ in network.named_parameters()}
+        step = get_ema_multi_avg_fn(min(self.decay, (1 + steps) / (10 + steps)))
+        learnt = dict(network.named_parameters())
+        if learnt:
+            step(list(self.network.parameters()), list(learnt.values()), steps)
         for (name, own), new in zip(self.network.state_dict().items(), network.state_dict().values(), strict=True):
-            if name.endswith(EXTRA_STATE):  # settings, of which there is no average
-                continue
-            if name in learnt:
-                own.lerp_(new, 1 - decay)
-            else:
+            if name not in learnt and not name.endswith(EXTRA_STATE):  # settings have no average
                 own.copy_(new)
         self.steps += 1
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Return what the averaged network does."""
+        """Return the output of the averaged network."""
         return self.network(*inputs)

@@ -1,4 +1,4 @@
-"""What happens beside training: checkpoints that a run goes on from to the bit, and a log that people can open."""
+"""Callbacks of a training run: checkpoints from which it resumes bit for bit, CSV logs, and pictures."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ LAST, BEST = "last.safetensors", "best.safetensors"
 
 
 class SaveCheckpoints(pl.Callback):
-    """Saves the run every few steps and at the end of each epoch; the best weights too, and stops when they are old.
+    """Saves the run every few steps and after each epoch, saves the best weights, and stops the run early.
 
-    A run that goes on from ``last.safetensors`` ends with the same weights as one that never stopped: to the bit on
-    one process and a CPU, or wherever the operations themselves are deterministic. The states of the global generators
-    of all processes are saved.
+    A run that resumes from ``last.safetensors`` ends with the same weights as one that was never stopped: bit for bit
+    with one process on a CPU, or wherever the operations themselves are deterministic. A checkpoint holds the states
+    of the global generators of all processes.
 
     Args:
-        folder: where to.
+        folder: the folder of the run.
         every: steps of the optimiser between saves within an epoch.
-        monitor: the score that is to fall.
-        patience: epochs without improvement after which training stops. None: never.
+        monitor: name of the score to minimise.
+        patience: epochs without improvement after which training stops. None: it does not stop early.
     """
 
     def __init__(self, folder: str | Path, every: int = 100, monitor: str = "val_loss", patience: int | None = None):
@@ -42,25 +42,25 @@ class SaveCheckpoints(pl.Callback):
         self._pending: Any = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Begin counting, and stop a run that had stopped."""
+        """Start counting steps, and stop a resumed run that had stopped early."""
         self._saved_step = trainer.global_step
         self._stop_if_old(trainer)
 
     def on_train_batch_start(self, *args: Any, **kwargs: Any) -> None:
-        """Put the generators where they were: only here is all done that may draw from them on the way."""
+        """Restore the generators of a resumed run: nothing between this hook and the first step draws from them."""
         if self._pending is not None:
             set_random_state(own_random_state(self._pending))
             self._pending = None
 
     def on_train_batch_end(self, trainer: pl.Trainer, *args: Any, **kwargs: Any) -> None:
-        """Save within an epoch. Its last step is saved when the epoch has been validated."""
+        """Save the run within an epoch; after the last step, :meth:`on_train_epoch_end` saves it."""
         step = trainer.global_step
         last = trainer.fit_loop.epoch_loop.batch_progress.current.ready == trainer.num_training_batches
         if step % self.every == 0 and step != self._saved_step and not last:
             self._save(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Keep the best weights."""
+        """Save the weights if their score is the best so far."""
         if trainer.sanity_checking or self.monitor not in trainer.callback_metrics:
             return
         score = float(trainer.callback_metrics[self.monitor])
@@ -72,15 +72,15 @@ class SaveCheckpoints(pl.Callback):
         self._stop_if_old(trainer)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save."""
+        """Save the run at the end of an epoch."""
         self._save(trainer)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a run needs to go on. All processes take part, as in every save."""
+        """Return the best score, the epochs since, and the generators' states; all processes must call it."""
         return {"best": self.best, "waited": self.waited, "random": random_states()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take what :meth:`state_dict` returned."""
+        """Restore the state that :meth:`state_dict` returned."""
         self.best, self.waited, self._pending = state_dict["best"], state_dict["waited"], state_dict["random"]
 
     def _save(self, trainer: pl.Trainer) -> None:
@@ -93,10 +93,10 @@ class SaveCheckpoints(pl.Callback):
 
 
 class WriteLog(pl.Callback):
-    """Writes ``training.csv``, a line a step, and ``validation.csv``, a line an epoch; a run that goes on adds to them.
+    """Writes ``training.csv``, one line per step, and ``validation.csv``, one per epoch; a resumed run appends.
 
     Args:
-        folder: where to.
+        folder: the folder of the run.
         every: steps between the lines of ``training.csv``.
     """
 
@@ -105,14 +105,14 @@ class WriteLog(pl.Callback):
         self._since, self._step = 0.0, 0
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Forget lines of steps that will be taken again."""
+        """Drop the lines of steps that a resumed run takes again."""
         self._since, self._step = time.perf_counter(), trainer.global_step
         if trainer.is_global_zero:
             for name in ("training.csv", "validation.csv"):
                 drop_rows_after(self.folder / name, trainer.global_step)
 
     def on_train_batch_end(self, trainer: pl.Trainer, *args: Any, **kwargs: Any) -> None:
-        """Add a line for a step."""
+        """Write a line for a step."""
         step = trainer.global_step
         if step == self._step or step % self.every:
             return
@@ -122,7 +122,7 @@ class WriteLog(pl.Callback):
         self._since, self._step = time.perf_counter(), step
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Add a line for an epoch."""
+        """Write a line for an epoch."""
         if trainer.sanity_checking:
             return
         scores = {k: float(v) for k, v in sorted(trainer.callback_metrics.items()) if k.startswith("val_")}
@@ -136,10 +136,10 @@ class WriteLog(pl.Callback):
 
 
 class DrawPictures(pl.Callback):
-    """Draws masks, PSFs and estimates after validation, as files and for TensorBoard.
+    """Draws masks, PSFs and estimates after validation, into PNG files and TensorBoard.
 
     Args:
-        folder: where to.
+        folder: folder of the PNG files.
         every: epochs between pictures.
     """
 
@@ -150,16 +150,18 @@ class DrawPictures(pl.Callback):
     def on_validation_batch_start(
         self, trainer: pl.Trainer, pl_module: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        """Keep the first scenes."""
+        """Keep the first batch, which is drawn."""
         if batch_idx == 0 and trainer.is_global_zero:
             self._batch = batch
 
     @torch.no_grad()
     def on_validation_end(self, trainer: pl.Trainer, pl_module: Any) -> None:
-        """Draw."""
+        """Draw the pictures of an epoch."""
         if self._batch is None or trainer.sanity_checking or trainer.current_epoch % self.every:
             return
-        pictures = draw_pictures(pl_module.optics, pl_module.see(self._batch), self.folder, trainer.current_epoch)
+        pictures = draw_pictures(
+            pl_module.optics, pl_module.reconstruct(self._batch), self.folder, trainer.current_epoch
+        )
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 for name, picture in pictures.items():
@@ -168,7 +170,7 @@ class DrawPictures(pl.Callback):
 
 
 def append_row(path: Path, row: Mapping[str, float]) -> None:
-    """Add a line to a CSV file, under a heading if it is new."""
+    """Append a line to a CSV file; a new file starts with a heading."""
     new = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
@@ -178,7 +180,7 @@ def append_row(path: Path, row: Mapping[str, float]) -> None:
 
 
 def drop_rows_after(path: Path, step: int) -> None:
-    """Drop lines of later steps from a CSV file, and one that was cut short."""
+    """Drop lines of later steps, and incomplete lines, from a CSV file."""
     if not path.exists():
         return
     with path.open(newline="") as file:

@@ -1,4 +1,4 @@
-"""Checkpoints of Lightning's trainer without pickle: see :mod:`kornia_tidy.inference.state_file`."""
+"""Checkpoints of Lightning's trainer in safetensors instead of pickle."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class SafetensorsIO(CheckpointIO):
         path: str | os.PathLike[str],
         storage_options: Any | None = None,
     ) -> None:
-        """Write a checkpoint. See :func:`~kornia_tidy.inference.state_file.write_state`."""
+        """Write a checkpoint as :func:`~kornia_tidy.inference.state_file.write_state` does."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_state(path, checkpoint)
 
@@ -30,9 +30,9 @@ class SafetensorsIO(CheckpointIO):
         map_location: Any | None = None,
         weights_only: bool | None = None,
     ) -> dict[str, Any]:
-        """Read a checkpoint, on the CPU. See :func:`~kornia_tidy.inference.state_file.read_state`."""
+        """Read a checkpoint to the CPU as :func:`~kornia_tidy.inference.state_file.read_state` does."""
         return read_state(path)
 
     def remove_checkpoint(self, path: str | os.PathLike[str]) -> None:
-        """Remove a checkpoint if it is there."""
+        """Remove a checkpoint, if it exists."""
         Path(path).unlink(missing_ok=True)

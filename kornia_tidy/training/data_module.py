@@ -1,4 +1,4 @@
-"""Training and validation scenes for Lightning's trainer, shared out among its processes."""
+"""Lightning data module of training and validation scenes, divided among the processes of a run."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from kornia_tidy.training.scenes import SceneLoader
 
 
 class SceneData(pl.LightningDataModule):
-    """Loads scenes so that a run can be repeated and resumed; see :class:`~kornia_tidy.training.scenes.SceneLoader`.
+    """Loads scenes reproducibly and resumably by :class:`~kornia_tidy.training.scenes.SceneLoader`.
 
-    Use it with ``Trainer(use_distributed_sampler=False)``: it shares the scenes out itself.
+    Use it with ``Trainer(use_distributed_sampler=False)``, as it divides the scenes among processes itself.
 
     Args:
         train: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
-        validation: another.
+        validation: data set of the same kind.
         batch: scenes in a batch.
         seed: of order, augmentation and noise.
         augment: flip training scenes and vary their brightness.
-        workers: processes that load.
+        workers: processes that load scenes.
     """
 
     def __init__(
@@ -38,11 +38,11 @@ class SceneData(pl.LightningDataModule):
         self.batch, self.seed, self.augment, self.workers = batch, seed, augment, workers
 
     def train_dataloader(self) -> SceneLoader:
-        """Return this process's share of the training scenes, in a new order each epoch."""
+        """Return this process's share of the training scenes, in another order in each epoch."""
         return SceneLoader(self.train, self.batch, augment=self.augment, **self._shared())
 
     def val_dataloader(self) -> SceneLoader:
-        """Return this process's share of the validation scenes, always the same."""
+        """Return this process's share of the validation scenes, in the same order in each epoch."""
         return SceneLoader(self.validation, self.batch, train=False, **self._shared())
 
     def _shared(self) -> dict[str, Any]:

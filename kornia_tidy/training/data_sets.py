@@ -1,4 +1,4 @@
-"""Data sets by name: scenes to train on, others that tell how training goes, and others again to be judged by."""
+"""Data sets by name, split into scenes for training, validation and testing."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.patches import central_crop, random_crop
 from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.data.rgbd_folder import described_folder
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.tasks import metres
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
+from kornia_tidy.training.settings import TrainingSettings
 
 SPLITS = ("train", "validation", "test", "all")
 PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}
-SHARE = 10  # one in so many scenes is for validation, and one for testing where nothing else is published
-TESTED = 32  # scenes made here, unless asked for more
+SHARE = 10  # one scene in ten is for validation, and one for testing where no split is published
+TESTED = 32  # test scenes of dead leaves, unless another number is asked for
 
 
 def make_scenes(settings: TrainingSettings, split: str, count: int | None = None) -> Dataset[Any]:
-    """Return the data set that settings name.
+    """Return a split of the data set that settings name.
 
     Args:
         settings: its ``data``, ``root``, ``size``, ``scenes``, ``validation_scenes``, ``depth_range`` and ``seed``.
-        split: ``"train"``, ``"validation"`` or ``"test"``; ``"all"`` of a folder that was not trained on.
-        count: scenes for ``"test"`` or ``"all"``, drawn by the seed. None: all of them.
+        split: ``"train"``, ``"validation"`` or ``"test"``; for ``data="rgbd-folder"`` also ``"all"``.
+        count: number of scenes of the splits ``"test"`` and ``"all"``, drawn by the seed. None: all of them.
 
     Returns:
         A map-style data set of ``{"image", "depth", "mask", "index", "name"}``, with depth in metres. Scenes of files
-        are cropped to the size: for training at a place that follows from torch's global generator, else in the middle.
+        are cropped to the size: for training at a place drawn from torch's global generator, else in the middle.
 
     Raises:
-        FileNotFoundError: if the data are not there; says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
         ValueError: if a name is unknown, the first scene is smaller than the size, or the data cannot be used.
 
     Example:
@@ -56,7 +56,7 @@ def make_scenes(settings: TrainingSettings, split: str, count: int | None = None
         raise ValueError(f"the number of scenes must be 1 or more, got {count}")
     scenes = SCENES[settings.data](settings, split, count)
     with seeded(0):
-        scenes[0]  # most data have one size: what is too small is found here, before any work
+        scenes[0]  # raises before training if scenes are too small; most data sets have one size
     return scenes
 
 
@@ -68,14 +68,14 @@ def _dead_leaves(settings: TrainingSettings, split: str, count: int | None) -> D
 
 
 def _flying_things(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
-    """Frames have no size: they are taken to be so large that their nearest things are at the camera's near end."""
+    """Frames without metric scale: they are scaled so that the nearest objects lie at the near end of the range."""
     baseline = settings.camera().depth_range[0] * NEAREST / FOCAL_PX
     frames = split_frames(_root(settings), PUBLISHED[split], baseline_m=baseline, transform=_Cut.of(settings, split))
     return _limited(frames, settings, split, count)
 
 
 def _flying_things_patches(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
-    """Their normalised disparity goes from the far to the near end of the camera's range, as it does in the paper."""
+    """The paper's patches: normalised disparity 0 to 1 is the far to the near end of the camera's range."""
     cut = _Cut.of(settings, split)._replace(camera=settings.camera())
     options: dict[str, Any] = {"seed": settings.seed, "transform": cut}
     if split == "train":
@@ -84,7 +84,7 @@ def _flying_things_patches(settings: TrainingSettings, split: str, count: int | 
 
 
 def _nyu(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
-    """Validation takes every tenth run of the published training frames: neighbours show the same room."""
+    """Validation takes every tenth block of consecutive training frames, as neighbouring frames show one room."""
     published = "test" if split == "test" else "train"
     frames = NYUDepthV2(_root(settings), published, transform=_Cut.of(settings, split))
     if split == "test":
@@ -96,7 +96,7 @@ def _nyu(settings: TrainingSettings, split: str, count: int | None) -> Dataset[A
 
 
 def _rgbd_folder(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
-    """A tenth for validation and a tenth for testing, drawn by the seed."""
+    """A tenth of the pairs for validation and a tenth for testing, drawn by the seed."""
     pairs = described_folder(_root(settings), _Cut.of(settings, split))
     if split == "all":
         return _limited(pairs, settings, split, count)
@@ -118,7 +118,7 @@ SCENES: dict[str, Maker] = {
 
 
 class _Cut(NamedTuple):
-    """Cuts a scene to the size, at random or in the middle, and turns normalised disparity to metres for a camera."""
+    """Crops a scene, at random or in the middle; with a camera, converts normalised disparity to metres."""
 
     size: int
     at_random: bool
@@ -144,7 +144,7 @@ def _root(settings: TrainingSettings) -> Path:
 
 
 def _limited(scenes: Any, settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
-    """At most as many scenes as asked for, drawn by the seed."""
+    """Return at most the wanted number of scenes, drawn by the seed."""
     if not len(scenes):
         raise ValueError(f"{_root(settings)} has no scenes for the split {split!r}")
     limit = {"train": None, "validation": settings.validation_scenes}.get(split, count)

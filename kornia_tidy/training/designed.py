@@ -1,4 +1,4 @@
-"""Masks brought near the best for a task before there are scenes or a network: seconds in place of hours."""
+"""Mask design before training, without scenes or network: it takes seconds where training takes hours."""
 
 from __future__ import annotations
 
@@ -8,29 +8,30 @@ from tqdm import tqdm
 from kornia_tidy.mask_design.objectives import design, restoration_error
 from kornia_tidy.psf.psf_model import CodedLens
 
-LEAST_SIGMA = 1e-3  # of full scale; without noise every blur can be undone, and there is nothing to design
-SCENE_SPREAD = 0.2  # standard deviation of a scene's light, of full scale
-LR_METRES = 8e-8  # five masks are after 120 steps within 0.2 % of where they are after 200
+LEAST_SIGMA = 1e-3  # in units of full scale; without noise every blur can be inverted
+SCENE_SPREAD = 0.2  # standard deviation of a scene's light, in units of full scale
+LR_METRES = 8e-8  # restoration error of five masks after 120 steps is within 0.2 % of that after 200
 
 
 def design_masks(lens: CodedLens, steps: int, sigma: float = 0.01, *, progress: bool = False) -> list[float]:
-    """Design a camera's masks for extended depth of field, in place: they lower the error of the best restoration.
+    """Optimise a camera's masks in place for extended depth of field, by the error of the best linear restoration.
 
-    End-to-end training then goes on from there. Few steps of it move masks little: those that began as noise had a
-    restoration error of 0.37 (K = 1) and 0.31 (K = 5) after 640 steps with a small network, where 120 steps of this
+    End-to-end training then starts from these masks. A short training moves masks little: random masks trained for 640
+    steps with a small network had a restoration error of 0.37 (K = 1) and 0.31 (K = 5). 120 steps of this function
     reach 0.31 and 0.26 from any focal sweep, in 9 and 23 s on one core.
 
     Args:
-        lens: the camera. Its window and stray light are as before afterwards.
+        lens: the camera. Only its masks are changed.
         steps: gradient steps.
-        sigma: noise, of full scale; none counts as 0.001. The less of it, the more masks may blur. Training leaves the
-            default whatever the sensor: with a noise of 0.002, networks behind one mask designed for 0.002 ended 0.2 dB
-            below those behind one designed for 0.01 (three seeds of three), and behind five masks alike.
+        sigma: noise in units of full scale; at least 0.001 is assumed. Less noise allows masks that blur more.
+            Training uses the default whatever the sensor: with a noise of 0.002, networks behind one mask designed for
+            0.002 ended 0.2 dB below those behind one mask designed for 0.01 (for each of three seeds); behind five
+            masks both were equal.
         progress: show a progress bar.
 
     Returns:
-        The :func:`~kornia_tidy.mask_design.objectives.restoration_error` before each step, averaged over the colours,
-        in the largest window that the fidelity allows.
+        The :func:`~kornia_tidy.mask_design.objectives.restoration_error` before each step, averaged over colours,
+        with the largest window that the fidelity allows.
 
     Raises:
         ValueError: if the steps are not positive.
@@ -42,7 +43,7 @@ def design_masks(lens: CodedLens, steps: int, sigma: float = 0.01, *, progress: 
         (10, True)
     """
     fidelity = lens.fidelity
-    # Light thrown out of the window must be lost, or else it would come back as a reward.
+    # Light outside the window must be lost: renormalisation would reward masks that throw it there.
     lens.fidelity = fidelity.replace(window=fidelity.max_window, stray_light="discard")
     bar = tqdm(total=steps, desc="design", leave=False, disable=not progress)
 

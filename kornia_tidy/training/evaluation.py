@@ -1,4 +1,4 @@
-"""How well a trained system does: a table with a line for each scene, and maps of where it errs."""
+"""Evaluation of a trained system: a table of scores with one line per scene, and error maps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.tasks import centre_crop, metres, nearness, split_maps
+from kornia_tidy.inference.tasks import centre_crop, metres, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores
@@ -25,13 +25,13 @@ from kornia_tidy.training.pictures import error_map
 from kornia_tidy.training.scenes import Broken, SceneLoader
 
 Row = dict[str, Any]
-"""``scene``, its number, ``name``, and scores by name."""
+"""``scene`` (its number), ``name``, and scores by name."""
 
 ABOUT_ROW = ("scene", "name")
-REACH = 32.0  # near ends of a range without a far end, within which depth is scored in metres
+REACH = 32.0  # in units of the near end: how far depth is scored in metres, if the range has no far end
 
 
-class Looked(NamedTuple):
+class SceneResult(NamedTuple):
     """One scene as a trained system sees it; maps are (C, H, W)."""
 
     index: int
@@ -50,72 +50,74 @@ def evaluate(
     system: TrainedSystem,
     scenes: Dataset,
     seed: int = 0,
-    each: Callable[[Looked], None] | None = None,
+    each: Callable[[SceneResult], None] | None = None,
 ) -> list[Row]:
-    """Let a system photograph scenes and estimate them.
+    """Photograph scenes with a system's camera and score the estimates of its network.
 
     Args:
         system: camera and network, in eval mode.
         scenes: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
         seed: of the sensor's noise.
-        each: is shown every scene, to draw it or to say how far things are.
+        each: called with each scene, for example to draw it or to show progress.
 
     Returns:
-        One row a scene, with the scores of :func:`image_row` and :func:`depth_row`, as the task has them.
+        One row per scene, with the scores of :func:`image_row` and :func:`depth_row`, as the task has them.
 
     Raises:
-        ValueError: if a scene is broken; it is named.
+        ValueError: if a scene cannot be used; the message names it.
     """
     rows = []
     for batch in SceneLoader(scenes, 1, seed=seed, train=False):
         if isinstance(batch, Broken):
             raise ValueError(batch.reason)
-        looked = _look(system, batch)
-        row: Row = {"scene": looked.index, "name": looked.name}
-        if "depth" in looked.estimate:
-            row |= depth_row(system.optics.camera, looked)
-        if "image" in looked.estimate:
-            row |= image_row(looked)
+        result = _reconstruct(system, batch)
+        row: Row = {"scene": result.index, "name": result.name}
+        if "depth" in result.estimate:
+            row |= depth_row(system.optics.camera, result)
+        if "image" in result.estimate:
+            row |= image_row(result)
         rows.append(row)
         if each is not None:
-            each(looked)
+            each(result)
     return rows
 
 
-def image_row(looked: Looked) -> dict[str, float]:
-    """Return the scores of an all-in-focus image, which is not clipped to [0, 1] for them.
+def image_row(result: SceneResult) -> dict[str, float]:
+    """Return the scores of an all-in-focus image, which is not clipped to [0, 1].
 
     Returns:
         ``image_rmse``, ``image_psnr`` in dB, and ``image_ssim``; see :mod:`kornia_tidy.reconstruction.metrics`.
     """
-    scores = image_scores(looked.estimate["image"][None], looked.truth["image"][None])
+    scores = image_scores(result.estimate["image"][None], result.truth["image"][None])
     return {f"image_{name}": float(value) for name, value in scores.items()}
 
 
-def depth_row(camera: ThinLensCamera | DefocusRange, looked: Looked) -> dict[str, float]:
+def depth_row(camera: ThinLensCamera | DefocusRange, result: SceneResult) -> dict[str, float]:
     r"""Return the scores of a depth map where depth is known.
 
     Args:
-        camera: what turned depth into defocus.
-        looked: the scene.
+        camera: the camera that took the capture.
+        result: the scene.
 
     Returns:
-        - ``depth_rmse``, of nearness in [0, 1] over the camera's range, as it is learnt, and ``depth_rmse_radians``, of
-          the defocus behind it: papers use both, and PhaseCam3D's radians are 20 times its nearness.
+        - ``depth_rmse``, of the normalised inverse depth in [0, 1] that the network estimates, and
+          ``depth_rmse_radians``, of the defocus in radians: papers use both, and PhaseCam3D's radians are 20 times its
+          normalised values.
         - ``depth_rmse_metres``, ``depth_abs_rel``, ``depth_log10`` and ``depth_delta1`` to ``depth_delta3``, of depth
-          in metres, over the share ``depth_counted`` of all pixels. Without these for a camera that knows no metres.
+          in metres, over the fraction ``depth_counted`` of all pixels. A camera of normalised disparity has none of
+          these.
 
     Convention:
-        In metres those pixels count whose depth is known and lies within :func:`metric_range`, so that infinity, which
-        has no error in metres, does not. Estimates are clamped to this range.
+        Scores in metres count the pixels whose depth is known and lies within :func:`metric_range`, which excludes
+        infinity. Estimates are clamped to this range.
     """
-    estimate, truth, mask = looked.estimate["depth"][None], looked.truth["depth"][None], looked.mask[None]
+    estimate, truth, mask = result.estimate["depth"][None], result.truth["depth"][None], result.mask[None]
     lo, hi = camera.defocus_range
     unit, radians = defocus_scores(estimate, truth, mask, span=hi - lo).values()
     row = {"depth_rmse": unit, "depth_rmse_radians": radians}
     if isinstance(camera, ThinLensCamera):
         near, far = metric_range(camera)
-        depth = looked.depth[None].to(estimate)
+        depth = result.depth[None].to(estimate)
         counted = mask & (depth >= near) & (depth <= far)
         scores = depth_scores(metres(camera, estimate).clamp(near, far), depth, counted)
         scores["rmse_metres"] = scores.pop("rmse")
@@ -125,7 +127,9 @@ def depth_row(camera: ThinLensCamera | DefocusRange, looked: Looked) -> dict[str
 
 
 def metric_range(camera: ThinLensCamera) -> tuple[float, float]:
-    """Return the depths that are scored in metres: the camera's range, to 32 times its near end if it has no far end.
+    """Return the nearest and farthest depth that are scored in metres.
+
+    They are the ends of the camera's range; if it has no far end, the farthest depth is 32 times the near end.
 
     Example:
         >>> metric_range(ThinLensCamera()), metric_range(ThinLensCamera(depth_range=(0.5, 4.0)))
@@ -136,7 +140,7 @@ def metric_range(camera: ThinLensCamera) -> tuple[float, float]:
 
 
 def mean_row(rows: Sequence[Row]) -> Row:
-    """Return the mean of each score over the scenes that have it.
+    """Return the mean of each score over the scenes in which it is not NaN.
 
     Example:
         >>> mean_row([{"scene": 0, "depth_rmse": 0.25}, {"scene": 1, "depth_rmse": 0.75}])
@@ -151,7 +155,7 @@ def mean_row(rows: Sequence[Row]) -> Row:
 
 
 def write_table(folder: str | os.PathLike[str], rows: Sequence[Row], about: dict[str, Any]) -> None:
-    """Write ``results.csv``, a line a scene, and ``summary.json``: the means and what was evaluated."""
+    """Write ``results.csv``, one line per scene, and ``summary.json`` with the means and ``about``."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -162,7 +166,7 @@ def write_table(folder: str | os.PathLike[str], rows: Sequence[Row], about: dict
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Return the lines of a table of scores: their mean and their range over the scenes that have them.
+    """Return the lines of a table of scores: mean, lowest and highest value over the scenes.
 
     Example:
         >>> for line in table([{"scene": 0, "depth_rmse": 0.25}, {"scene": 1, "depth_rmse": 0.75}]):
@@ -177,23 +181,23 @@ def table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def draw_scene(folder: Path, looked: Looked) -> None:
-    """Write a scene's capture, estimates, truths and errors (times 3) as PNG files."""
-    pictures = {"coded": looked.coded}
-    for name, maps in looked.estimate.items():
-        known = looked.mask if name == "depth" else torch.ones_like(looked.mask)
-        error = error_map(maps, looked.truth[name]).where(known, 0)
-        pictures |= {name: maps, f"{name}_truth": looked.truth[name], f"{name}_error_x3": error}
+def draw_scene(folder: Path, result: SceneResult) -> None:
+    """Write capture, estimates, true maps and errors (times 3) of a scene as PNG files."""
+    pictures = {"coded": result.coded}
+    for name, maps in result.estimate.items():
+        known = result.mask if name == "depth" else torch.ones_like(result.mask)
+        error = error_map(maps, result.truth[name]).where(known, 0)
+        pictures |= {name: maps, f"{name}_truth": result.truth[name], f"{name}_error_x3": error}
     for name, picture in pictures.items():
-        write_image(folder / f"scene_{looked.index:04d}_{name}.png", picture)
+        write_image(folder / f"scene_{result.index:04d}_{name}.png", picture)
 
 
-def _look(system: TrainedSystem, batch: dict[str, Any]) -> Looked:
+def _reconstruct(system: TrainedSystem, batch: dict[str, Any]) -> SceneResult:
     noise = torch.Generator().manual_seed(batch["noise_seed"])
     sample = system.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
     coded, depth = sample["image"], sample["depth"]
     maps = split_maps(system.settings.task, system.head(coded).float())
-    truth = {"image": sample["all_in_focus"][0], "depth": nearness(system.optics.camera, depth)[0]}
+    truth = {"image": sample["all_in_focus"][0], "depth": normalised_inverse_depth(system.optics.camera, depth)[0]}
     mask = centre_crop(batch["mask"], *coded.shape[-2:])[0]
     estimate = {name: m[0] for name, m in maps.items()}
-    return Looked(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask)
+    return SceneResult(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask)

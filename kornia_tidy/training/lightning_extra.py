@@ -1,4 +1,4 @@
-"""The extra that training needs: one clear sentence where it is missing."""
+"""Check that Lightning and TensorBoard, the packages of the extra ``train``, are installed."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import importlib
 
 
 def require_lightning() -> None:
-    """Raise one clear sentence if Lightning or TensorBoard is missing.
+    """Raise ``ImportError`` with the command that installs them if Lightning or TensorBoard is missing.
 
     Raises:
-        ImportError: if one is.
+        ImportError: if one is missing.
     """
     try:
         importlib.import_module("lightning.pytorch")

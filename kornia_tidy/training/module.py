@@ -1,4 +1,4 @@
-"""Optics, network and loss as one Lightning module, with a learning rate for each."""
+"""Lightning module of optics, network and loss, with separate learning rates of masks and network."""
 
 from __future__ import annotations
 
@@ -11,32 +11,37 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.settings import SCHEDULES, TrainingSettings, differences
-from kornia_tidy.inference.tasks import LOSSES, MAPS, Loss, centre_crop, nearness, split_maps, task_loss
-from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, look_through
+from kornia_tidy.inference.tasks import MAPS, centre_crop, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
+from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
+from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
 
-class Seen(NamedTuple):
-    """A batch as camera and network see it."""
+class BatchResult(NamedTuple):
+    """Captures of a batch, the network's estimates and the true maps."""
 
     coded: Tensor
-    """(B, 3, H, W), the captures."""
+    """Captures, (B, 3, H, W)."""
     estimate: dict[str, Tensor]
-    """The network's maps by name, float32."""
+    """Estimated maps by name, float32."""
     truth: dict[str, Tensor]
-    """What they should be: ``"image"`` the scene in focus, ``"depth"`` its nearness in [0, 1]."""
+    """True maps by name: ``"image"`` is the all-in-focus scene, ``"depth"`` its normalised inverse depth in [0, 1]."""
     mask: Tensor
     """bool (B, 1, H, W), True where depth is known."""
 
 
 def cosine_rate(progress: float, warm_up: float = 0.1) -> float:
-    """Return the factor of a learning rate at a share of a run: up from a tenth in a straight line, down as a cosine.
+    """Return the factor of a learning rate after a fraction of a run: linear warm-up from 0.1, then cosine decay to 0.
+
+    Args:
+        progress: fraction of the run that is over.
+        warm_up: fraction of the run in which the rate rises.
 
     Source: Loshchilov and Hutter, SGDR (ICLR 2017), without restarts.
 
@@ -50,32 +55,33 @@ def cosine_rate(progress: float, warm_up: float = 0.1) -> float:
 
 
 class TidyTraining(pl.LightningModule):
-    """Trains a camera's masks and the network that reads its captures, by one Adam.
+    """Trains a camera's masks together with the network that reads its captures, by one Adam optimiser.
 
-    Batches are mappings of ``"image"`` (B, 3, H, W), ``"depth"`` (B, 1, H, W), and, where they have them, ``"mask"``
-    (bool, True where depth is known) and ``"noise_seed"`` (an int that the sensor's noise follows from; without it
-    noise comes from the global generator).
+    Batches are mappings of ``"image"`` (B, 3, H, W), ``"depth"`` (B, 1, H, W) and, optionally, ``"mask"`` (bool, True
+    where depth is known) and ``"noise_seed"`` (int, the seed of the sensor's noise; without it noise is drawn from the
+    global generator).
 
     Args:
-        optics: the camera. Masks in training keep its PSF window, which checkpoints tell.
+        optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
         head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint.
-        task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is learnt as :func:`~kornia_tidy.inference.tasks.nearness`.
-        loss: of a map, its truth and its validity; the same for all maps.
-        lr: learning rate of the network, and of what the optics may learn besides masks.
+        task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is estimated as
+            :func:`~kornia_tidy.inference.tasks.normalised_inverse_depth`.
+        loss: function of an estimated map, the true map and the validity mask; the same for all maps.
+        lr: learning rate of the network, and of learnable parameters of the optics other than masks.
         lr_metres: learning rate of the masks, in metres of height.
         betas: Adam's.
-        schedule: of both rates: ``"constant"``, or ``"cosine"``: up in a tenth of the run's steps, then down to zero.
-        ema: decay of the network's moving average, which validation and checkpoints' readers use. 0: none.
+        schedule: of both rates: ``"constant"``, or ``"cosine"``, see :func:`cosine_rate`.
+        ema: decay of the moving average of the network's weights, which validation and trained systems use. 0: none.
         depth_weight: of the depth loss in the joint task.
         image_weight: of the image loss in the joint task.
-        settings: what camera and network were made from, so that a checkpoint can make them again.
+        settings: those that camera and network were made from; checkpoints hold them to rebuild both.
 
     Raises:
         ValueError: if a value is not allowed.
 
     Convention:
-        - ``Trainer(precision="bf16-mixed")`` concerns the network alone: optics and losses stay in float32.
-        - Batch normalisation has the statistics of each process's own batches, as usual.
+        - ``Trainer(precision="bf16-mixed")`` applies to the network alone: optics and losses stay in float32.
+        - Batch normalisation uses the statistics of each process's own batches.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), section 4.4: Adam with betas 0.99 and 0.999, 1e-8 m for the masks and
     1e-4 for the network; mean squared errors, weighted 1 and 1 for the joint task.
@@ -111,18 +117,18 @@ class TidyTraining(pl.LightningModule):
 
     @classmethod
     def from_settings(cls, settings: TrainingSettings, *, design: bool = True, progress: bool = False) -> TidyTraining:
-        """Return the module that settings describe; the network's weights come from the global generator.
+        """Return the module that settings describe; the network's weights are drawn from the global generator.
 
         Args:
-            settings: of camera, network and learning.
-            design: design masks if the settings say so; in vain where masks are loaded next.
-            progress: show a progress bar of that.
+            settings: of the system and the run.
+            design: design the masks first if the settings say so; not needed if masks are loaded afterwards.
+            progress: show a progress bar of the design.
         """
         optics = build_optics(settings)
         if design and settings.design and settings.masks:
             design_masks(optics, settings.design, progress=progress)
             optics.fidelity = optics.fidelity.replace(window=settings.window)
-            fix_window(optics)  # that of the masks as they are now
+            fix_window(optics)  # for the designed masks
         return cls(
             optics,
             build_head(settings),
@@ -138,16 +144,16 @@ class TidyTraining(pl.LightningModule):
         )
 
     def forward(self, coded: Tensor) -> Tensor:
-        """Return what the network makes of captures; its moving average, once training is over or looked at."""
+        """Return the network's estimates from captures; in eval mode those of its moving average."""
         network = self.head if self.training or self.average is None else self.average
-        look_through(network, self.optics)
+        update_psfs(network, self.optics)
         return network(coded)
 
-    def see(self, batch: dict[str, Any]) -> Seen:
-        """Photograph the scenes of a batch and let the network look at the captures.
+    def reconstruct(self, batch: dict[str, Any]) -> BatchResult:
+        """Photograph the scenes of a batch and estimate their maps.
 
         Raises:
-            ValueError: if the batch tells that one of its scenes is broken.
+            ValueError: if one of the batch's scenes cannot be used.
         """
         if isinstance(batch, Broken):
             raise ValueError(batch.reason)
@@ -156,29 +162,32 @@ class TidyTraining(pl.LightningModule):
         sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
         coded = sample["image"]
         estimate = {name: maps.float() for name, maps in split_maps(self.task, self(coded)).items()}
-        truth = {"image": sample["all_in_focus"], "depth": nearness(self.optics.camera, sample["depth"].float())}
+        truth = {
+            "image": sample["all_in_focus"],
+            "depth": normalised_inverse_depth(self.optics.camera, sample["depth"].float()),
+        }
         mask = batch.get("mask")
         mask = torch.ones_like(sample["depth"], dtype=torch.bool) if mask is None else mask
-        return Seen(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
+        return BatchResult(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
-        seen = self.see(batch)
-        loss = task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)
-        self.log("loss", loss.detach(), prog_bar=True, batch_size=len(seen.coded))
+        result = self.reconstruct(batch)
+        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)
+        self.log("loss", loss.detach(), prog_bar=True, batch_size=len(result.coded))
         return loss
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Log the mean over all scenes of the loss and of each map's root mean squared error."""
-        seen = self.see(batch)
-        scores = {"val_loss": task_loss(self.loss, seen.estimate, seen.truth, seen.mask, self.weights)}
-        for name, maps in seen.estimate.items():
-            errors = rmse(maps, seen.truth[name], seen.mask if name == "depth" else None)
+        result = self.reconstruct(batch)
+        scores = {"val_loss": task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)}
+        for name, maps in result.estimate.items():
+            errors = rmse(maps, result.truth[name], result.mask if name == "depth" else None)
             scores[f"val_{name}_rmse"] = errors.nanmean()
-        self.log_dict(scores, batch_size=len(seen.coded), sync_dist=True, prog_bar=True)
+        self.log_dict(scores, batch_size=len(result.coded), sync_dist=True, prog_bar=True)
 
     def configure_optimizers(self) -> Any:
-        """Return one Adam: masks in metres of height, all else at the network's rate; and its schedule, if there is."""
+        """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""
         groups = self.optics.parameter_groups(self.lr_metres, self.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
         groups.append({"params": list(self.head.parameters()), "lr": self.lr})
@@ -190,33 +199,33 @@ class TidyTraining(pl.LightningModule):
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_start(self) -> None:
-        """Compute all PSFs at once: those of a fixed lens are remembered, and rounded by what is computed with them."""
+        """Cache all PSFs of a fixed lens: their rounding depends on which PSFs are computed together."""
         with torch.no_grad():
             self.optics.psf_bank()
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """Take a step, and let the average follow."""
+        """Take a step of the optimiser and update the moving average."""
         super().optimizer_step(*args, **kwargs)
         if self.average is not None:
             self.average.update(self.head)
 
-    # ------------------------------------------------------------------ what a checkpoint holds besides weights
+    # ------------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what camera and network are."""
+        """Add settings, task and description of camera and network."""
         checkpoint["settings"] = None if self.settings is None else self.settings.as_dict()
         checkpoint["task"] = self.task
         checkpoint["description"] = describe(self.optics, self.head)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another camera or network, before anything of it is loaded.
+        """Raise ``ValueError`` for a checkpoint of another camera or network, before its weights are loaded.
 
         Raises:
-            ValueError: naming what differs.
+            ValueError: if task, camera, network or weights differ; the message names the difference.
         """
         here = {"task": self.task, **describe(self.optics, self.head)}
         stored = {"task": checkpoint.get("task"), **checkpoint.get("description", {})}
-        if f"optics.{EXTRA_STATE}" in checkpoint["state_dict"]:  # it tells the fidelity in full, and the window to take
+        if f"optics.{EXTRA_STATE}" in checkpoint["state_dict"]:  # it holds all of the fidelity, and restores the window
             here["fidelity"] = stored.get("fidelity", "")
         if other := differences(stored, here):
             raise ValueError(f"the checkpoint does not fit (checkpoint / here): {'; '.join(other)}")

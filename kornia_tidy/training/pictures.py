@@ -1,4 +1,4 @@
-"""Pictures of a run: its masks, its PSFs over depth, and what the network makes of captures."""
+"""Pictures of a training run: masks, PSFs over depth, captures and estimates."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.image_files import write_image
 
-SCALE, GAP = 4, 2  # pixels of a picture for one of a mask or PSF; between pictures
-DEPTHS, SCENES = 7, 4  # shown
-ERROR_SCALE = 3.0  # of error maps, so that small errors can be seen
+SCALE, GAP = 4, 2  # picture pixels per pixel of a mask or PSF; picture pixels between two of them
+DEPTHS, SCENES = 7, 4  # drawn, at most
+ERROR_SCALE = 3.0  # of error maps, so that small errors are visible
 
 
-class SeenLike(Protocol):
-    """What is drawn of a batch; see :class:`kornia_tidy.training.module.Seen`."""
+class BatchMaps(Protocol):
+    """Captures, estimates and true maps of a batch, see :class:`kornia_tidy.training.module.BatchResult`."""
 
     @property
     def coded(self) -> Tensor: ...  # noqa: D102
@@ -28,10 +28,10 @@ class SeenLike(Protocol):
     def truth(self) -> dict[str, Tensor]: ...  # noqa: D102
 
 
-def draw_pictures(optics: TiDyOptics, seen: SeenLike, folder: Path, epoch: int) -> dict[str, Tensor]:
+def draw_pictures(optics: TiDyOptics, result: BatchMaps, folder: Path, epoch: int) -> dict[str, Tensor]:
     """Write masks, PSFs and estimates to PNG files named by the epoch, and return the pictures, (3, H, W)."""
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = {"masks": masks_picture(optics), "psfs": psfs_picture(optics), "estimates": estimates_picture(seen)}
+    pictures = {"masks": masks_picture(optics), "psfs": psfs_picture(optics), "estimates": estimates_picture(result)}
     for name, picture in pictures.items():
         write_image(folder / f"epoch_{epoch:04d}_{name}.png", picture)
     return pictures
@@ -52,27 +52,27 @@ def masks_picture(optics: TiDyOptics) -> Tensor:
 
 @torch.no_grad()
 def psfs_picture(optics: TiDyOptics) -> Tensor:
-    """Return PSFs from the near (left) to the far end of the range, each the square root of its light, to its peak."""
+    """Return PSFs from the near (left) to the far end of the range: square roots, each scaled to its peak."""
     psfs = optics.psf_bank().psfs.detach().float().cpu()
     nodes = torch.linspace(len(psfs) - 1, 0, DEPTHS).round().long().tolist()
     light = [psfs[node] if psfs.shape[1] == 3 else psfs[node, :1] for node in nodes]
     return _grid([[enlarged((psf / psf.max().clamp(min=1e-30)).clamp(min=0).sqrt()) for psf in light]])
 
 
-def estimates_picture(seen: SeenLike) -> Tensor:
-    """Return a row a scene: the capture, then for each map the estimate, the truth, and their distance times 3."""
+def estimates_picture(result: BatchMaps) -> Tensor:
+    """Return one row per scene: the capture, then for each map estimate, true map, and :func:`error_map`."""
     rows = []
-    for i in range(min(SCENES, len(seen.coded))):
-        row = [seen.coded[i]]
-        for name, maps in seen.estimate.items():
-            truth = seen.truth[name][i]
+    for i in range(min(SCENES, len(result.coded))):
+        row = [result.coded[i]]
+        for name, maps in result.estimate.items():
+            truth = result.truth[name][i]
             row += [maps[i], truth, error_map(maps[i], truth)]
         rows.append([part.detach().float().cpu() for part in row])
     return _grid(rows)
 
 
 def error_map(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Return the distance of two maps, times 3 and at most 1.
+    """Return the absolute difference of two maps, times 3, clipped to 1.
 
     Example:
         >>> error_map(torch.tensor([0.5]), torch.tensor([0.25]))
@@ -82,12 +82,12 @@ def error_map(estimate: Tensor, truth: Tensor) -> Tensor:
 
 
 def enlarged(picture: Tensor) -> Tensor:
-    """Return a picture with its pixels repeated to squares."""
+    """Return a picture enlarged by whole pixels."""
     return torch.nn.functional.interpolate(picture[None], scale_factor=float(SCALE), mode="nearest")[0]
 
 
 def _grid(rows: list[list[Tensor]]) -> Tensor:
-    """Put pictures of one size beside and below each other, white between them."""
+    """Return a grid of pictures of one size, with white gaps."""
     height, width = rows[0][0].shape[-2:]
     canvas = torch.ones(3, len(rows) * (height + GAP) - GAP, len(rows[0]) * (width + GAP) - GAP)
     for y, row in enumerate(rows):

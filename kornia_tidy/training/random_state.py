@@ -1,4 +1,4 @@
-"""Where randomness comes from in training: states that can be saved, and blocks that are seeded."""
+"""States of the global random generators: saving, restoring, and seeding for a block."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def random_state() -> dict[str, Any]:
 
 
 def set_random_state(state: Mapping[str, Any]) -> None:
-    """Set the global generators to what :func:`random_state` returned.
+    """Restore the states of the global generators that :func:`random_state` returned.
 
     Example:
         >>> state = random_state()
@@ -44,19 +44,19 @@ def set_random_state(state: Mapping[str, Any]) -> None:
 
 
 def random_states() -> list[dict[str, Any]]:
-    """Return :func:`random_state` of each process of a run, in their order; all of them must call it."""
+    """Return :func:`random_state` of every process of a run, by rank; all processes must call it."""
     if not (dist.is_available() and dist.is_initialized()):
         return [random_state()]
     states: list[Any] = [None] * dist.get_world_size()
-    dist.all_gather_object(states, random_state())  # between processes of one run; what is read from files is no pickle
+    dist.all_gather_object(states, random_state())  # pickles, but only between processes of one run
     return states
 
 
 def own_random_state(states: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return this process's part of what :func:`random_states` returned.
+    """Return this process's entry of the states that :func:`random_states` returned.
 
-    A run that goes on with more processes than it had gives its states out by turns. A single state, which is what
-    checkpoints held at first, is for all.
+    If there are more processes than states, the states are reused in turn. A single state, as in checkpoints of early
+    versions, is for all processes.
     """
     if isinstance(states, Mapping):
         return states
@@ -66,7 +66,7 @@ def own_random_state(states: Mapping[str, Any] | Sequence[Mapping[str, Any]]) ->
 
 @contextmanager
 def seeded(seed: int) -> Generator[None]:
-    """Seed the CPU's global generators for a block, and put them back as they were.
+    """Seed the global generators of the CPU for a block, and restore their states after it.
 
     Example:
         >>> with seeded(3):

@@ -1,4 +1,4 @@
-"""A whole training run in a folder: settings, checkpoints, log and pictures; stopped anywhere, it goes on."""
+"""A training run in a folder, with settings, checkpoints, logs and pictures; a stopped run can be resumed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch.utils.data import Dataset
 
 from kornia_tidy.files import only_here
-from kornia_tidy.inference.settings import TrainingSettings, differences
 from kornia_tidy.inference.trained import load_weights
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
@@ -27,9 +26,10 @@ from kornia_tidy.training.checkpoint import SafetensorsIO
 from kornia_tidy.training.data_module import SceneData
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.settings import TrainingSettings, differences
 
 SETTINGS = "settings.json"
-MAY_CHANGE = ("epochs", "patience")  # of a run that goes on
+MAY_CHANGE = ("epochs", "patience")  # settings that may differ when a run is resumed
 
 
 def train(
@@ -43,15 +43,15 @@ def train(
     progress: bool = False,
     **trainer_options: Any,
 ) -> TidyTraining:
-    """Train in a folder, from the start or from where the run in it stopped.
+    """Train a system in a folder, from the start or from the last checkpoint in it.
 
     Args:
-        settings: what is trained, and how.
-        folder: made if missing. It gets ``settings.json``, ``last.safetensors`` (to go on from), ``best.safetensors``
+        settings: of the system and the run.
+        folder: made if missing. It gets ``settings.json``, ``last.safetensors`` (to resume from), ``best.safetensors``
             (weights of the best epoch), ``training.csv``, ``validation.csv``, ``pictures/`` and a TensorBoard log;
-            with ``pretrain_epochs`` the same of that stage in ``pretrain/``.
-        resume: go on with the run in the folder, if there is one.
-        head_from: checkpoint whose network is taken to begin with, such as one trained with a fixed Fresnel lens.
+            with ``pretrain_epochs`` the same files of that stage in ``pretrain/``.
+        resume: resume the run in the folder, if there is one.
+        head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens.
         save_every: steps between checkpoints within an epoch.
         workers: processes that load scenes.
         progress: show a progress bar.
@@ -87,14 +87,14 @@ def _train(
     progress: bool,
     trainer_options: Mapping[str, Any],
 ) -> TidyTraining:
-    """Train in a folder that is held."""
+    """Train in a folder that is locked."""
     checkpoint = _prepare(folder, settings, resume)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
         stage = {"head_from": head_from, "save_every": save_every, "workers": workers, "progress": progress}
         train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
         head_from = folder / "pretrain" / LAST
-    if checkpoint is not None:  # its masks are on their way already, and the window was measured before they left
+    if checkpoint is not None:  # the window was measured on the masks before training
         settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
     module = TidyTraining.from_settings(settings, design=checkpoint is None, progress=progress)
@@ -108,7 +108,7 @@ def _train(
     callbacks: list[pl.Callback] = [
         WriteLog(folder),
         DrawPictures(folder / "pictures"),
-        SaveCheckpoints(folder, save_every, patience=settings.patience),  # last: no run goes on after a missing line
+        SaveCheckpoints(folder, save_every, patience=settings.patience),  # last, after the logs
     ]
     if progress:
         callbacks.append(pl.callbacks.TQDMProgressBar(leave=False))
@@ -139,12 +139,12 @@ def _train(
 
 
 def _is_first_process() -> bool:
-    """Whether this is the one of a run's processes that speaks for all, by what torchrun and Lightning set."""
+    """Return whether this is the first process of a run, by the environment variables of torchrun and Lightning."""
     return {os.environ.get(name, "0") for name in ("RANK", "LOCAL_RANK", "NODE_RANK")} == {"0"}
 
 
 def _fit(trainer: pl.Trainer, module: TidyTraining, data: SceneData, checkpoint: Path | None) -> None:
-    """Fit, and let Ctrl-C be what it is elsewhere: Lightning ignores further ones and leaves the interpreter."""
+    """Fit, and raise ``KeyboardInterrupt`` on Ctrl-C; Lightning would exit and ignore further signals."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGINT)
     try:
@@ -159,7 +159,7 @@ def _fit(trainer: pl.Trainer, module: TidyTraining, data: SceneData, checkpoint:
 
 
 def _prepare(folder: Path, settings: TrainingSettings, resume: bool) -> Path | None:
-    """Write the settings of a new run; return the checkpoint to go on from, if there is one."""
+    """Write the settings of a new run; return the checkpoint to resume from, if there is one."""
     path, last = folder / SETTINGS, folder / LAST
     if not resume:
         if last.exists():
@@ -177,7 +177,7 @@ def _prepare(folder: Path, settings: TrainingSettings, resume: bool) -> Path | N
 
 @contextmanager
 def _contained() -> Generator[None]:
-    """Keep Lightning's doings in a block: determinism for all of torch, advertisements, advice, old uses of torch."""
+    """Silence Lightning's messages and warnings in a block, and restore torch's determinism flags after it."""
     logger = logging.getLogger("lightning.pytorch")
     level = logger.level
     before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()

@@ -1,4 +1,4 @@
-"""Scenes to train on: the order they are seen in, and batches of them that can be repeated."""
+"""Reproducible batches of scenes: their order, their augmentation, and a resumable loader."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 
-GAIN = (0.8, 1.1)  # range of the brightness that augmentation varies
+GAIN = (0.8, 1.1)  # range of the brightness factor of augmentation
 
 
 # ---------------------------------------------------------------------- order
 
 
 class EpochBatches(Sampler):
-    """The batches of each epoch: an order that follows from seed and epoch, shared out among processes by turns.
+    """Batches of each epoch, in an order drawn from seed and epoch, dealt to the processes in turn.
 
-    Two processes with batches of b see in a step what one process sees that accumulates two batches of b.
+    Two processes with batches of b scenes take the same step as one process that accumulates two batches of b.
 
     Args:
         length: number of scenes.
         batch: scenes in a batch.
         seed: of the order.
-        shuffle: False keeps the order, and the last scenes even where they do not fill a batch.
+        shuffle: False keeps the order of the scenes, and the last batch even if it is incomplete.
         rank: of this process.
         world: number of processes.
 
     Raises:
-        ValueError: if the scenes do not fill one batch for each process.
+        ValueError: if there are fewer scenes than fill one batch for each process.
 
     Example:
         >>> batches = EpochBatches(5, 2, shuffle=False)
@@ -55,16 +55,16 @@ class EpochBatches(Sampler):
 
     @property
     def sampler(self) -> EpochBatches:
-        """This object: where Lightning looks for what to tell the epoch."""
+        """This object, on which Lightning calls :meth:`set_epoch`."""
         return self
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch, from its beginning if it is another. Without shuffling all are the same, noise included."""
+        """Start another epoch at its first batch. Without shuffling all epochs are the same, noise included."""
         if self.shuffle and epoch != self.epoch:
             self.start(epoch, 0)
 
     def start(self, epoch: int, first: int) -> None:
-        """Begin with a batch in the middle of an epoch."""
+        """Start an epoch at batch number ``first``."""
         self.epoch, self.first = epoch, first
 
     def __len__(self) -> int:
@@ -87,17 +87,17 @@ class EpochBatches(Sampler):
 
 
 class Broken(NamedTuple):
-    """What a batch becomes that cannot be had: a worker's exception would come back as its whole traceback."""
+    """Placeholder for a batch that cannot be used: an exception in a worker would show its whole traceback."""
 
     reason: str
 
 
 class RepeatableScenes(Dataset):
-    """A data set whose item follows from (epoch, index) alone, whoever loads it and in whatever order.
+    """Data set whose items depend on epoch and index alone, not on the worker or the order of loading.
 
     Args:
         scenes: a map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
-        seed: of what is random in them, and of the augmentation.
+        seed: of random scenes and of the augmentation.
         augment: flip scenes and vary their brightness.
     """
 
@@ -109,7 +109,7 @@ class RepeatableScenes(Dataset):
         return len(cast("Any", self.scenes))
 
     def __getitem__(self, index: Any) -> dict[str, Any] | Broken:
-        """Return a scene by epoch and index, or why there is none."""
+        """Return a scene by (epoch, index), or the reason why it cannot be used."""
         epoch, index = index
         try:
             with seeded(keyed_seed(self.seed, "item", epoch, index)):
@@ -126,7 +126,7 @@ class RepeatableScenes(Dataset):
 
 
 def augmented(image: Tensor, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Flip a scene at random and vary its brightness, from torch's global generator.
+    """Flip a scene and vary its brightness at random, by torch's global generator.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), which varies brightness batch by batch.
 
@@ -143,7 +143,7 @@ def augmented(image: Tensor, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tenso
 
 
 class _Collate:
-    """Make a batch, with a seed for its noise that follows from the scenes in it."""
+    """Collates scenes to a batch and adds a noise seed that depends on these scenes."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -163,17 +163,17 @@ class _Collate:
 
 
 class SceneLoader(DataLoader):
-    """Loads batches that follow from seed and epoch alone, and knows where it is in an epoch, so as to go on there.
+    """Data loader whose batches depend on seed and epoch alone, and that resumes in the middle of an epoch.
 
-    It draws nothing from the global generators. Its state is what Lightning asks a resumable loader for.
+    It does not use the global generators. Lightning saves and restores its state.
 
     Args:
         scenes: as for :class:`RepeatableScenes`.
         batch: scenes in a batch.
         seed: of everything random in the batches.
-        train: shuffle and, if asked to, augment; False for validation: always the same.
+        train: shuffle, and augment if ``augment`` is True. False, for validation: the same batches in every epoch.
         augment: see :class:`RepeatableScenes`.
-        workers: processes that load.
+        workers: processes that load scenes.
         rank: of this process.
         world: number of processes that share the scenes.
 
@@ -205,20 +205,22 @@ class SceneLoader(DataLoader):
             batch_sampler=self._batches,
             num_workers=workers,
             collate_fn=_Collate(seed),
-            generator=torch.Generator().manual_seed(seed % 2**63),  # or each pass would draw from the global one
+            generator=torch.Generator().manual_seed(
+                seed % 2**63
+            ),  # else each epoch would draw from the global generator
         )
 
     def __iter__(self) -> Any:
-        """Yield batches; nothing is loaded before the first is asked for."""
+        """Yield batches; loading starts with the first one that is asked for."""
         self._handed = self._batches.first
         for batch in super().__iter__():
             self._handed += 1
             yield batch
 
     def state_dict(self) -> dict[str, int]:
-        """Return the epoch and how many of its batches have been handed out."""
+        """Return the epoch and the number of its batches that were yielded."""
         return {"epoch": self._batches.epoch, "batches": self._handed}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on after the batches that a state tells of."""
+        """Resume after the batches that :meth:`state_dict` counted."""
         self._batches.start(state["epoch"], state["batches"])

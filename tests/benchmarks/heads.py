@@ -33,14 +33,14 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, ship
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.training.callbacks import BEST
-from kornia_tidy.training.evaluation import Looked, evaluate, mean_row
+from kornia_tidy.training.evaluation import SceneResult, evaluate, mean_row
 from kornia_tidy.training.run import train
+from kornia_tidy.training.settings import TrainingSettings
 from tests.scenes import ENTRIES, load_scene
 
 SETTINGS = TrainingSettings(
@@ -117,8 +117,8 @@ def score(folder: Path) -> dict[str, dict[str, float]]:
     for name, scenes in sets.items():
         captures: list[float] = []
 
-        def note(looked: Looked, captures: list[float] = captures) -> None:
-            captures.append(float(psnr(looked.coded[None], looked.truth["image"][None])))
+        def note(result: SceneResult, captures: list[float] = captures) -> None:
+            captures.append(float(psnr(result.coded[None], result.truth["image"][None])))
 
         rows = evaluate(system, scenes, each=note)
         scores[name] = {"scenes": len(rows), "capture_psnr": statistics.fmean(captures), **mean_row(rows)}

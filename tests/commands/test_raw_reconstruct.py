@@ -21,7 +21,6 @@ from kornia_tidy.commands import raw_reconstruct
 from kornia_tidy.data import read_depth, read_image
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
 from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.raw.capture import RawCapture
@@ -29,6 +28,7 @@ from kornia_tidy.raw.develop import develop
 from kornia_tidy.raw.dng_file import encode_dng
 from kornia_tidy.raw.simulation import simulate_raw
 from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
 
 FILES = 8  # in the batch that gets a signal

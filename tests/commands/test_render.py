@@ -12,9 +12,9 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.coded_datasets import CodedCaptures
 from kornia_tidy.data import write_depth, write_image
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_head, build_optics
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 from tests.coded_datasets.samples import contents
 

@@ -10,8 +10,8 @@ import torch
 
 from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import read_image
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
@@ -36,7 +36,7 @@ class TestTrain(BaseTester):
             pretrain_epochs=1, lr=1e-3, seed=3, window=settings.window,
         )  # fmt: skip
         assert settings == expected
-        assert load_trained(run / "best.safetensors").settings == settings
+        assert TrainingSettings.of(load_trained(run / "best.safetensors")) == settings
         assert (run / "pretrain" / "last.safetensors").exists()
 
     def test_feature_resume_goes_on_and_refuses_other_settings(self, run, capsys):

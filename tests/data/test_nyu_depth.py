@@ -101,7 +101,7 @@ class TestNYUDepthV2(BaseTester):
 
     def test_exception_without_scipy_names_the_way_out(self, published, monkeypatch):
         monkeypatch.setitem(sys.modules, "scipy.io", None)
-        with pytest.raises(ImportError, match="needs SciPy: pip install scipy, or give split= a text file"):
+        with pytest.raises(ImportError, match=r"pip install 'kornia-tidy\[data\]', or give split= a text file"):
             NYUDepthV2(published[0], "train")
         assert len(NYUDepthV2(published[0], "all")) == 5
 

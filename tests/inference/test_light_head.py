@@ -12,7 +12,7 @@ from kornia.color import linear_rgb_to_rgb
 from torch import nn
 
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light, reconstruct_opencv
-from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
 from kornia_tidy.reconstruction import receptive_field
@@ -33,7 +33,7 @@ class Passing(nn.Module):
 
 
 def light_head(task, color_space=None, head=None, **settings):
-    settings = TrainingSettings(task=task, masks=1, window=23, color_space=color_space, **settings)
+    settings = SystemSettings(task=task, masks=1, window=23, color_space=color_space, **settings)
     return LightHead(TrainedSystem(build_optics(settings), head or Passing(task), settings, 0))
 
 
@@ -51,7 +51,7 @@ class TestLightHead(BaseTester):
 
     def test_feature_it_is_the_encoding_of_the_camera(self):
         head, light = light_head("edof"), torch.rand(1, 3, 9, 8)
-        optics = build_optics(TrainingSettings(masks=1, window=23))
+        optics = build_optics(SystemSettings(masks=1, window=23))
         self.assert_close(head(light)[0], optics.encode(light))
 
     @pytest.mark.filterwarnings("ignore::kornia_tidy.psf.paper.AliasingWarning")
@@ -63,7 +63,7 @@ class TestLightHead(BaseTester):
         self.assert_close(seen[0], light)
 
     def test_feature_looks_as_far_as_its_network(self):
-        settings = TrainingSettings(head="plain", width=2)
+        settings = SystemSettings(head="plain", width=2)
         assert receptive_field(light_head("edof", head=build_head(settings).eval())) == 31
 
 

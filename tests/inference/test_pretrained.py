@@ -29,8 +29,8 @@ class TestPretrained(BaseTester):
         system = load_pretrained(name)
         captures = []
 
-        def note(looked):
-            captures.append(-10 * (looked.coded - looked.truth["image"]).square().mean().log10())
+        def note(result):
+            captures.append(-10 * (result.coded - result.truth["image"]).square().mean().log10())
 
         scenes = DeadLeaves(4, 128, 128, depth_range=system.optics.camera.depth_range, seed=31)
         scores = mean_row(evaluate(system, scenes, each=note))

@@ -162,11 +162,11 @@ def paper_psfs(heights: Array, psi: Sequence[float]) -> Array:
     return out
 
 
-def switching_shares(masks: int, exposure: float, swap: float) -> tuple[list[float], list[float]]:
+def switching_shares(masks: int, exposure: float, swap: float, cyclic: bool = False) -> tuple[list[float], list[float]]:
     """Return the shares of the exposure T of masks, (T - S t) / (K T), and of the swaps between them, t / T.
 
-    The first mask is set before the shutter opens, so there are S = K - 1 swaps. Source: Shah et al., TiDy-PSFs, ICCV
-    2023, "Modeling State Switching in SLMs".
+    The first mask is set before the shutter opens, so there are S = K - 1 swaps. A cyclic exposure swaps back to it at
+    the end: S = K. Source: Shah et al., TiDy-PSFs, ICCV 2023, "Modeling State Switching in SLMs".
     """
-    swaps = masks - 1
+    swaps = masks if cyclic else masks - 1
     return [(exposure - swaps * swap) / (masks * exposure)] * masks, [swap / exposure] * swaps

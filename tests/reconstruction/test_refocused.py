@@ -45,7 +45,7 @@ class Shown(ReconstructionHead):
 
 def refocused(network, dtype=torch.float32):
     head = Refocused(network, layers=4).eval()
-    head.look_through(bank(dtype))
+    head.set_psfs(bank(dtype))
     return head
 
 
@@ -92,7 +92,7 @@ class TestRefocused(BaseTester):
     def test_feature_gradients_reach_what_the_filters_come_from(self):
         psfs = discs()[:, None].requires_grad_()
         head = Refocused(PlainHead(7, 1, width=2), layers=4)
-        head.look_through(PSFBank.from_measured(psfs, torch.arange(4.0)))
+        head.set_psfs(PSFBank.from_measured(psfs, torch.arange(4.0)))
         head(torch.rand(1, 3, 20, 20)).square().sum().backward()
         assert psfs.grad.abs().max() > 0
 
@@ -117,10 +117,10 @@ class TestRefocused(BaseTester):
 
     def test_exception(self):
         head = Refocused(Shown(7, 7), layers=4)
-        with pytest.raises(ValueError, match=r"does not know its camera: call look_through\(optics.psf_bank\(...\)\)"):
+        with pytest.raises(ValueError, match=r"does not know its camera: call set_psfs\(optics.psf_bank\(...\)\)"):
             head(torch.rand(1, 3, 8, 8))
         with pytest.raises(ValueError, match="a network for 3 layers needs as many PSFs, got 4"):
-            Refocused(Shown(7, 7), layers=3).look_through(bank())
+            Refocused(Shown(7, 7), layers=3).set_psfs(bank())
         with pytest.raises(ValueError, match="in_channels must be a whole number of at least 1, got 0"):
             Refocused(Shown(4, 7), layers=4)
         with pytest.raises(ValueError, match="layers must be a whole number of at least 1, got 0"):

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tests import oracle
+
 
 @dataclass(frozen=True)
 class Bank:
@@ -36,6 +38,13 @@ def make_scene(bank: Bank, batch=2, height=9, width=12) -> tuple[Tensor, Tensor]
     image = torch.rand(batch, bank.psfs.shape[1], height, width, **like)
     lowest, highest = bank.defocus[0] - 2, bank.defocus[-1] + 2
     return image, lowest + (highest - lowest) * torch.rand(batch, 1, height, width, **like)
+
+
+def modelled(image: Tensor, defocus: Tensor, bank: Bank, compositing: str, border: str) -> Tensor:
+    """Return what tests/oracle makes of the first scene of a batch with nearest layers."""
+    weights = oracle.layer_weights(defocus[0, 0].numpy(), bank.defocus.tolist(), "nearest")
+    psfs = bank.psfs.numpy()[None]
+    return torch.from_numpy(oracle.capture(image[0].numpy(), weights, psfs, [1.0], compositing, border, "discard"))
 
 
 def brute_weights(psi: np.ndarray, nodes: np.ndarray, mode: str) -> np.ndarray:

@@ -13,9 +13,9 @@ from scipy.signal import convolve2d
 
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import gather, render, scatter
-from tests.base import BaseTester, oracle
+from tests.base import BaseTester
 from tests.render.render_tester import METHODS
-from tests.render.scenes import Bank, brute_render, brute_weights, make_bank, make_scene
+from tests.render.scenes import Bank, brute_render, brute_weights, make_bank, make_scene, modelled
 
 COMPOSITINGS = ("gather", "scatter")
 
@@ -63,22 +63,18 @@ class TestRender(BaseTester):
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
     @pytest.mark.parametrize("method", METHODS)
     def test_feature_equals_the_independent_model(self, compositing, border, method):
-        model = oracle()
         bank = make_bank(6, 3, 11)
         image, defocus = make_scene(bank, 1, 33, 40)
-        label = model.nearest(defocus[0, 0].numpy(), bank.defocus.numpy())
-        expected = getattr(model, compositing)(image[0].numpy(), label, bank.psfs.numpy(), border)
+        expected = modelled(image, defocus, bank, compositing, border)
         coded = render(image, defocus, bank, compositing, layers="nearest", border=border, method=method)
-        self.assert_close(coded[0], torch.from_numpy(expected), rtol=0, atol=1e-12)
+        self.assert_close(coded[0], expected, rtol=0, atol=1e-12)
 
     def test_feature_correlation_equals_the_independent_model(self):
-        model = oracle()
         bank = make_bank(6, 3, 11)
         image, defocus = make_scene(bank, 1, 33, 40)
-        label = model.nearest(defocus[0, 0].numpy(), bank.defocus.numpy())
-        expected = model.gather(image[0].numpy(), label, bank.psfs.numpy(), correlate=True)
+        expected = modelled(image, defocus, Bank(bank.psfs.flip((-2, -1)), bank.defocus), "gather", "reflect")
         coded = render(image, defocus, bank, layers="nearest", correlate=True)
-        self.assert_close(coded[0], torch.from_numpy(expected), rtol=0, atol=1e-12)
+        self.assert_close(coded[0], expected, rtol=0, atol=1e-12)
 
     @pytest.mark.parametrize(
         ("border", "code"),

@@ -22,10 +22,10 @@ import torch
 from torch import nn
 
 from kornia_tidy.inference import heads
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.training import callbacks, run
 from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.settings import TrainingSettings
 from tests.forks import fork, wait
 
 SETTINGS = TrainingSettings(

@@ -12,11 +12,11 @@ import torch
 
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves
-from kornia_tidy.inference.settings import TrainingSettings
-from kornia_tidy.inference.tasks import nearness
+from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.data_sets import SCENES, make_scenes
 from kornia_tidy.training.scenes import SceneLoader
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
 from tests.data.published import write_flying_things, write_nyu
 
@@ -132,7 +132,9 @@ class TestMakeScenes(BaseTester):
         settings = settings_of(name, roots, depth_range=depth_range)
         sample = make_scenes(settings, "test", 1)[0]
         disparity = sample["image"][:1] * 255 / 8
-        self.assert_close(nearness(settings.camera(), sample["depth"]), disparity / 160, rtol=1e-5, atol=1e-6)
+        self.assert_close(
+            normalised_inverse_depth(settings.camera(), sample["depth"]), disparity / 160, rtol=1e-5, atol=1e-6
+        )
 
     def test_convention_the_seeds_of_dead_leaves_are_fixed(self):
         """Runs that were begun must see the same scenes when they go on."""

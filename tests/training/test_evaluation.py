@@ -11,20 +11,20 @@ from torch import nn
 
 from kornia_tidy import DefocusRange, FresnelLens, ThinLensCamera, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.settings import TrainingSettings
-from kornia_tidy.inference.tasks import nearness
+from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.inference.trained import TrainedSystem
-from kornia_tidy.training.evaluation import Looked, depth_row, evaluate, image_row, mean_row, table
+from kornia_tidy.training.evaluation import SceneResult, depth_row, evaluate, image_row, mean_row, table
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 INF = float("inf")
 
 
-def looked(camera, depth, estimate, mask=None):
+def result(camera, depth, estimate, mask=None):
     depth = torch.tensor(depth).view(1, 1, -1)
     maps = {"depth": torch.tensor(estimate).view(1, 1, -1)}
     mask = torch.ones_like(depth, dtype=torch.bool) if mask is None else torch.tensor(mask).view(1, 1, -1)
-    return Looked(0, "a", depth, maps, {"depth": nearness(camera, depth)}, depth, mask)
+    return SceneResult(0, "a", depth, maps, {"depth": normalised_inverse_depth(camera, depth)}, depth, mask)
 
 
 class TestDepthRow(BaseTester):
@@ -32,7 +32,7 @@ class TestDepthRow(BaseTester):
         """From 0.3 m to infinity nearness is 0.3 / z: by hand, without the camera."""
         camera = ThinLensCamera.for_scene((0.3, INF))
         depth, guess = np.array([0.3, 0.5, 1.0, 2.0, 9.0]), np.array([0.9, 0.5, 0.4, 0.1, 0.05])
-        row = depth_row(camera, looked(camera, depth, guess))
+        row = depth_row(camera, result(camera, depth, guess))
         away = guess - 0.3 / depth
         assert row["depth_rmse"] == pytest.approx(math.sqrt((away**2).mean()), rel=1e-5)
         assert row["depth_rmse_radians"] == pytest.approx(40 * math.sqrt((away**2).mean()), rel=1e-5)
@@ -48,7 +48,7 @@ class TestDepthRow(BaseTester):
     def test_convention_infinity_counts_as_nearness_and_not_in_metres(self):
         """Beyond 32 near ends and unknown pixels do not count; an estimate of infinity is taken as 32 near ends."""
         camera = ThinLensCamera.for_scene((0.25, INF))
-        scene = looked(camera, [INF, 9.0, 0.2, 8.0, 0.5], [1.0, 1.0, 1.0, -0.5, 0.5], [True] * 4 + [False])
+        scene = result(camera, [INF, 9.0, 0.2, 8.0, 0.5], [1.0, 1.0, 1.0, -0.5, 0.5], [True] * 4 + [False])
         row = depth_row(camera, scene)
         assert row["depth_counted"] == pytest.approx(1 / 5)
         assert row["depth_rmse_metres"] == pytest.approx(0, abs=1e-6)
@@ -57,18 +57,18 @@ class TestDepthRow(BaseTester):
 
     def test_feature_a_range_with_a_far_end_counts_to_it(self):
         camera = ThinLensCamera.for_scene((0.5, 1.7))
-        row = depth_row(camera, looked(camera, [0.5, 1.7, 1.8], [1.0, 0.0, 0.0]))
+        row = depth_row(camera, result(camera, [0.5, 1.7, 1.8], [1.0, 0.0, 0.0]))
         assert row["depth_counted"] == pytest.approx(2 / 3)
         assert row["depth_abs_rel"] == pytest.approx(0, abs=1e-6)
 
     def test_feature_normalised_disparity_has_no_metres(self):
         camera = DefocusRange(-10, 10)
-        row = depth_row(camera, looked(camera, [0.0, 0.5], [0.1, 0.4]))
+        row = depth_row(camera, result(camera, [0.0, 0.5], [0.1, 0.4]))
         assert row == pytest.approx({"depth_rmse": 0.1, "depth_rmse_radians": 2.0})
 
     def test_feature_a_scene_without_known_depth_has_no_score(self):
         camera = ThinLensCamera()
-        row = depth_row(camera, looked(camera, [1.0, 1.0], [0.5, 0.5], [False, False]))
+        row = depth_row(camera, result(camera, [1.0, 1.0], [0.5, 0.5], [False, False]))
         assert row.pop("depth_counted") == 0
         assert all(math.isnan(value) for value in row.values())
 
@@ -77,7 +77,7 @@ class TestImageRow(BaseTester):
     def test_feature_scores_are_their_definitions(self):
         truth = torch.full((3, 16, 16), 0.5)
         maps = {"image": truth + 0.1}
-        row = image_row(Looked(0, "a", truth, maps, {"image": truth}, truth[:1], truth[:1] > 0))
+        row = image_row(SceneResult(0, "a", truth, maps, {"image": truth}, truth[:1], truth[:1] > 0))
         assert row["image_rmse"] == pytest.approx(0.1, rel=1e-5)
         assert row["image_psnr"] == pytest.approx(20, rel=1e-5)
         assert row["image_ssim"] == pytest.approx((2 * 0.5 * 0.6 + 1e-4) / (0.25 + 0.36 + 1e-4), rel=1e-4)

@@ -6,9 +6,9 @@ from torch import nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.inference.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.training.scenes import Broken, SceneLoader
+from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 pl = pytest.importorskip("lightning.pytorch")
@@ -50,12 +50,12 @@ class TestTidyTraining(BaseTester):
     @pytest.mark.parametrize("task", ["edof", "depth", "joint"])
     def test_cardinality_every_task_sees_its_maps(self, task):
         module = made(task=task)
-        seen = module.see(batch())
+        result = module.reconstruct(batch())
         wanted = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}[task]
-        assert {name: maps.shape for name, maps in seen.estimate.items()} == {
+        assert {name: maps.shape for name, maps in result.estimate.items()} == {
             name: (2, channels, 48, 48) for name, channels in wanted.items()
         }
-        assert all(seen.truth[name].shape == maps.shape for name, maps in seen.estimate.items())
+        assert all(result.truth[name].shape == maps.shape for name, maps in result.estimate.items())
 
     def test_feature_the_loss_reaches_masks_and_network(self, monkeypatch):
         module = made()
@@ -69,8 +69,8 @@ class TestTidyTraining(BaseTester):
         module = made(lr=1e-4)
         optimizer = module.configure_optimizers()
         heights, weight = module.optics.masks.heights().detach().clone(), module.head.layers[0].weight.detach().clone()
-        seen = module.see(batch())
-        (seen.estimate["image"] - seen.truth["image"]).square().mean().backward()
+        result = module.reconstruct(batch())
+        (result.estimate["image"] - result.truth["image"]).square().mean().backward()
         optimizer.step()
         moved = (module.optics.masks.heights() - heights).detach().abs()[module.optics.masks.phase.grad != 0]
         self.assert_close(moved, torch.full_like(moved, 1e-8), rtol=2e-3, atol=1e-12)
@@ -111,23 +111,23 @@ class TestTidyTraining(BaseTester):
     def test_feature_a_valid_border_crops_truth_and_mask_alike(self):
         module, sample = made(border="valid"), batch()
         sample["mask"][..., 11, 11], sample["mask"][..., 0, 0] = False, False
-        seen = module.see(sample)
-        assert seen.coded.shape[-1] == seen.truth["depth"].shape[-1] == seen.mask.shape[-1] == 26
-        assert torch.equal(seen.truth["image"], sample["image"][..., 11:-11, 11:-11])
-        assert (~seen.mask).nonzero()[:, 2:].tolist() == [[0, 0], [0, 0]]
+        result = module.reconstruct(sample)
+        assert result.coded.shape[-1] == result.truth["depth"].shape[-1] == result.mask.shape[-1] == 26
+        assert torch.equal(result.truth["image"], sample["image"][..., 11:-11, 11:-11])
+        assert (~result.mask).nonzero()[:, 2:].tolist() == [[0, 0], [0, 0]]
 
     def test_feature_noise_follows_from_the_batch(self):
         module, sample = made(), batch()
         torch.manual_seed(1)
-        one = module.see(sample).coded
-        assert torch.equal(one, module.see(sample).coded)
-        assert not torch.equal(one, module.see({**sample, "noise_seed": 1}).coded)
+        one = module.reconstruct(sample).coded
+        assert torch.equal(one, module.reconstruct(sample).coded)
+        assert not torch.equal(one, module.reconstruct({**sample, "noise_seed": 1}).coded)
         plain = {name: sample[name] for name in ("image", "depth")}
-        assert not torch.equal(module.see(plain).coded, module.see(plain).coded)
+        assert not torch.equal(module.reconstruct(plain).coded, module.reconstruct(plain).coded)
 
     def test_exception_a_broken_batch_tells_why(self):
         with pytest.raises(ValueError, match="scene 3 is gone"):
-            made().see(Broken("scene 3 is gone"))
+            made().reconstruct(Broken("scene 3 is gone"))
 
     def test_exception_unknown_task(self):
         with pytest.raises(ValueError, match="task must be one of"):
@@ -153,7 +153,7 @@ class TestCheckpoint(BaseTester):
         coded = system.optics(sample["image"], sample["depth"], generator=noise)
         assert torch.equal(coded, module.optics(sample["image"], sample["depth"], generator=noise.manual_seed(1)))
         assert torch.equal(system.head(coded), module(coded))
-        assert system.settings == module.settings
+        assert TrainingSettings.of(system) == module.settings
         assert system.step == 2
 
     def test_feature_a_network_that_refocuses_looks_through_the_masks_as_they_were_learnt(self, tmp_path):
@@ -163,7 +163,7 @@ class TestCheckpoint(BaseTester):
         run.save_checkpoint(tmp_path / "a.safetensors")
         system = load_trained(tmp_path / "a.safetensors")
         assert not torch.equal(module.optics.masks.phase, before)
-        coded = module.eval().see(batch()).coded
+        coded = module.eval().reconstruct(batch()).coded
         # PSFs with and without gradients are computed in two ways, equal to round-off.
         torch.testing.assert_close(system.head(coded), module(coded), rtol=1e-5, atol=1e-5)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import random
 
 import numpy as np
@@ -12,11 +13,15 @@ from torch import nn
 
 from kornia_tidy import DefocusRange, ThinLensCamera
 from kornia_tidy.inference.heads import make_head
-from kornia_tidy.inference.settings import TrainingSettings
+from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, load_pretrained
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
-from kornia_tidy.inference.tasks import LOSSES, centre_crop, metres, nearness, split_maps, task_loss
+from kornia_tidy.inference.tasks import centre_crop, metres, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
+from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.task_loss import LOSSES, task_loss
 from tests.base import BaseTester
 
 
@@ -80,9 +85,9 @@ class TestTasks(BaseTester):
     def test_feature_nearness_is_linear_in_inverse_depth(self):
         depth = torch.tensor([0.3, 0.4, 0.8, 3.0, float("inf")])
         camera = ThinLensCamera(depth_range=(0.3, float("inf")))
-        self.assert_close(nearness(camera, depth), 0.3 / depth, atol=1e-6)
-        assert nearness(camera, torch.tensor([0.1]))[0] == 1
-        self.assert_close(nearness(DefocusRange(), torch.tensor([0.25])), torch.tensor([0.25]))
+        self.assert_close(normalised_inverse_depth(camera, depth), 0.3 / depth, atol=1e-6)
+        assert normalised_inverse_depth(camera, torch.tensor([0.1]))[0] == 1
+        self.assert_close(normalised_inverse_depth(DefocusRange(), torch.tensor([0.25])), torch.tensor([0.25]))
 
     @pytest.mark.parametrize("name", LOSSES)
     def test_feature_masked_pixels_have_no_part_in_loss_and_gradient(self, name):
@@ -121,7 +126,7 @@ class TestTasks(BaseTester):
     def test_feature_metres_bring_back_the_depth_that_was_learnt_as_nearness(self, depth_range):
         depth = torch.tensor([*depth_range, 0.6, 1.5, 3.9], dtype=torch.float64)
         camera = ThinLensCamera.for_scene(depth_range)
-        self.assert_close(metres(camera, nearness(camera, depth)), depth, rtol=1e-12)
+        self.assert_close(metres(camera, normalised_inverse_depth(camera, depth)), depth, rtol=1e-12)
         ends = metres(camera, torch.tensor([-0.5, 1.5]))
         self.assert_close(ends, torch.tensor(depth_range[::-1]))
 
@@ -171,6 +176,21 @@ class TestSettings(BaseTester):
     def test_exception(self, change, sentence):
         with pytest.raises(ValueError, match=sentence):
             TrainingSettings(**change)
+
+    @pytest.mark.parametrize("name", PRETRAINED)
+    def test_feature_a_checkpoint_tells_the_settings_of_its_run(self, name):
+        stored = read_state(FOLDER / f"{name}.safetensors")["settings"]
+        settings = json.loads(json.dumps(TrainingSettings.of(load_pretrained(name)).as_dict()))
+        assert {key: settings[key] for key in stored} == stored
+
+    @pytest.mark.parametrize(
+        ("run", "sentence"),
+        [({"augment": 1}, "augment must be true or false, got 1"), ({"a" * 5000: 1}, "hold unknown names: a{1,200}$")],
+    )
+    def test_exception_settings_of_a_run_that_cannot_be(self, run, sentence):
+        system = TrainedSystem(nn.Identity(), nn.Identity(), SystemSettings(), 0, run)
+        with pytest.raises(ValueError, match=sentence):
+            TrainingSettings.of(system)
 
     @pytest.mark.parametrize("text", ["{", '{"maskz": 5}', "[1]", '{"masks": "five"}'])
     def test_exception_a_file_that_holds_no_settings_is_named(self, text, tmp_path):

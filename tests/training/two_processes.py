@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from kornia_tidy.inference.settings import TrainingSettings
 from kornia_tidy.training.run import train
+from kornia_tidy.training.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(
     task="joint", masks=2, head="plain", width=4, size=48, scenes=40, validation_scenes=2, batch=1, epochs=1,

@@ -1,6 +1,6 @@
-"""Small trained systems that come with the library: a camera with its learnt masks, and the network that reads it.
+"""Small trained systems that are shipped with the package.
 
-``heads.json`` beside this file tells how each was trained and how well it does on scenes it never saw.
+``heads.json`` holds how each was trained, and its scores on test scenes.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from kornia_tidy.inference.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
 PRETRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0")
-"""Task and number of masks; 0 is a plain lens, for comparison."""
+"""Names: task and number of masks; 0 masks are a plain lens, for comparison."""
 
 
 def load_pretrained(name: str) -> TrainedSystem:
-    """Return a camera and the network that reads its captures, trained together.
+    """Load a shipped system, a camera and a network trained together.
 
     Args:
         name: one of :data:`PRETRAINED`.
 
     Returns:
-        Camera, network, training settings and steps, in eval mode on the CPU. The network takes captures of that
-        camera, (B, 3, H, W) as :class:`~kornia_tidy.TiDyOptics` returns them, with a noise of 0.002 of full scale, and
-        returns the maps of its task, which :func:`~kornia_tidy.inference.tasks.split_maps` names.
+        The system in eval mode, on the CPU. Its network takes captures of its camera, (B, 3, H, W) as
+        :class:`~kornia_tidy.TiDyOptics` returns them, with a noise of 0.002 of full scale, and returns the maps of its
+        task; :func:`~kornia_tidy.inference.tasks.split_maps` returns them by name.
 
     Raises:
         ValueError: if there is no system of this name.
@@ -47,16 +47,16 @@ def load_pretrained(name: str) -> TrainedSystem:
 
 
 def about_pretrained() -> dict[str, Any]:
-    """Return how the systems were trained and how well they do: settings, steps, machine, date, scores."""
+    """Return settings, steps, machine, date and scores of the shipped systems."""
     return json.loads((FOLDER / "heads.json").read_text())
 
 
 def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Write of a checkpoint only what :func:`~kornia_tidy.inference.trained.load_trained` reads: half its size.
+    """Write a checkpoint without the state of the run, in half the size, for shipping.
 
     Args:
-        checkpoint: a file that ``kornia-tidy train`` wrote with a moving average.
-        path: where to.
+        checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
+        path: of the new file.
 
     Raises:
         ValueError: if it is no checkpoint, or has no moving average.

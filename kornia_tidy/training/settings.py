@@ -1,0 +1,120 @@
+"""Settings of a training run: those of the system that is trained, and data, optimiser and duration of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.inference.settings import SystemSettings
+from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.reconstruction.head import check_count
+from kornia_tidy.training.task_loss import LOSSES
+
+SCHEDULES = ("constant", "cosine")
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSettings(SystemSettings):
+    """A training run. The defaults are the paper's, with our camera; see :func:`kornia_tidy.training.run.train`.
+
+    Checkpoints and ``settings.json`` hold all of them in one dictionary.
+
+    Args:
+        design: gradient steps that optimise the masks for the task before training, without scenes or network, see
+            :func:`~kornia_tidy.training.designed.design_masks`; for the task ``"edof"`` only. 0: none. A fixed lens
+            is not changed.
+        data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
+        root: folder of the data, where they are files. None: ``data/NAME``.
+        size: side of the scenes in pixels; larger scenes are cropped, at random for training.
+        scenes: number of training scenes, for data whose number of scenes is not fixed.
+        validation_scenes: largest number of validation scenes.
+        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does.
+        lr: learning rate of the network.
+        lr_metres: learning rate of the masks in metres of height.
+        schedule: of both rates: ``"constant"``, or ``"cosine"``: a rise over the first tenth of the steps, then a fall
+            to zero.
+        batch: scenes in a batch.
+        accumulate: batches in a step of the optimiser.
+        epochs: passes over the data.
+        pretrain_epochs: earlier passes in which only the network is trained, with a fixed Fresnel lens. The paper
+            takes 300 for the tasks edof and joint.
+        patience: epochs without improvement after which the run stops. None: it does not stop early.
+        ema: decay of the exponential moving average of the network's weights. 0: none.
+        depth_weight: of the depth loss in the joint task.
+        image_weight: of the image loss in the joint task.
+        loss: name of the loss, see :data:`kornia_tidy.training.task_loss.LOSSES`.
+        precision: of the network.
+        **system: the settings of :class:`~kornia_tidy.inference.settings.SystemSettings`.
+
+    Raises:
+        ValueError: if a value is not allowed.
+
+    Example:
+        >>> TrainingSettings(task="depth", masks=5).lr_metres
+        1e-08
+    """
+
+    design: int = 0
+    data: str = "dead-leaves"
+    root: str | None = None
+    size: int = 278
+    scenes: int = 5077
+    validation_scenes: int = 64
+    augment: bool = True
+    lr: float = 1e-4
+    lr_metres: float = 1e-8
+    schedule: str = "constant"
+    batch: int = 32
+    accumulate: int = 1
+    epochs: int = 300
+    pretrain_epochs: int = 0
+    patience: int | None = None
+    ema: float = 0.999
+    depth_weight: float = 1.0
+    image_weight: float = 1.0
+    loss: str = "mse"
+    precision: str = "32-true"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("loss", self.loss, tuple(LOSSES))
+        check_choice("precision", self.precision, PRECISIONS)
+        check_choice("schedule", self.schedule, SCHEDULES)
+        for name in ("lr", "lr_metres"):
+            check_positive(name, getattr(self, name))
+        for name in ("size", "scenes", "validation_scenes", "batch", "accumulate", "epochs"):
+            check_count(name, getattr(self, name), 1)
+        for name in ("pretrain_epochs", "design"):
+            check_count(name, getattr(self, name), 0)
+        if self.design and self.task != "edof":
+            raise ValueError(f"masks can be designed before training for the task 'edof' only, got {self.task!r}")
+        if self.patience is not None and self.patience < 1:
+            raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
+        if not 0 <= self.ema < 1:
+            raise ValueError(f"ema must be in [0, 1), got {self.ema}")
+
+    @classmethod
+    def of(cls, system: TrainedSystem) -> Self:
+        """Return the settings of the run that trained a system.
+
+        Raises:
+            ValueError: if the system's checkpoint holds a name that is unknown or a value that is not allowed.
+        """
+        try:
+            return cls.from_dict({**system.settings.as_dict(), **system.run})
+        except ValueError as error:
+            raise ValueError(f"the checkpoint's settings of its run cannot be used: {error}") from error
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the entries in which two descriptions differ, each as ``name (one / other)``.
+
+    Example:
+        >>> differences({"masks": 5, "task": "edof"}, {"masks": 3, "task": "edof"})
+        ['masks (5 / 3)']
+    """
+    names = dict.fromkeys([*one, *other])
+    return [f"{n} ({one.get(n)} / {other.get(n)})" for n in names if one.get(n) != other.get(n)]

@@ -1,0 +1,273 @@
+"""Every block of code in the README, in docs/ and in CONTRIBUTING.md: it is run, or says in its page why it cannot be.
+
+The blocks of a page are run in their order, in a folder of their own that holds photo.png and depth.png. Python blocks
+share one namespace. Shell lines are commands of `kornia-tidy`, given to its entry point. A ```text block tells what the
+block before it prints; ... in it stands for anything. A block after <!-- not run: reason --> is only checked: its names
+can be imported, its commands and options exist.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import doctest
+import glob
+import importlib
+import importlib.util
+import io
+import re
+import runpy
+import shlex
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+
+from kornia_tidy.cli import build_parser, main
+from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
+from tests.base import BaseTester
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
+MOST_NOT_RUN = 8  # in all pages: a block that is not run can be wrong
+SLOW: set[str] = set()  # pages that take more than about ten seconds
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+REASON = re.compile(r"<!-- not run: ((?:(?!-->).)+) -->\n\Z", re.DOTALL)
+LINK = re.compile(r"\]\(([^)\s]*?)(?:#([^)\s]*))?\)")
+
+
+class Block(NamedTuple):
+    """A block of code in a page."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+    reason: str  # why it is not run, or nothing
+
+    @property
+    def place(self) -> str:
+        return f"{self.page}:{self.line}"
+
+
+def blocks(name: str, text: str) -> list[Block]:
+    """Return the blocks of a page in their order."""
+    found = []
+    for fence in FENCE.finditer(text):
+        before = text[: fence.start()]
+        marker = REASON.search(before)
+        found.append(
+            Block(name, before.count("\n") + 1, fence[1], fence[2], " ".join(marker[1].split()) if marker else "")
+        )
+    return found
+
+
+def shell_lines(block: Block) -> list[list[str]]:
+    """Return the words of each command of a shell block; wildcards are files."""
+    lines = [shlex.split(line, comments=True) for line in block.text.replace("\\\n", " ").splitlines()]
+    return [[found for word in words for found in (sorted(glob.glob(word)) or [word])] for words in lines if words]
+
+
+def run_page(name: str, text: str) -> None:
+    """Run the blocks of a page in the current folder; an error names the page and the line."""
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    printed = ""
+    for block in blocks(name, text):
+        if block.language == "text":
+            if not block.reason:
+                same = doctest.OutputChecker().check_output(
+                    block.text, printed, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+                )
+                assert same, f"{block.place} shows\n{block.text}but printed is\n{printed}"
+        elif block.language in RUN and not block.reason:
+            out = io.StringIO()
+            with contextlib.redirect_stdout(out):
+                if block.language == "python":  # the empty lines give errors the page's own line numbers
+                    exec(compile("\n" * block.line + block.text, str(ROOT / name), "exec"), namespace)
+                else:
+                    run_shell(block)
+            printed = out.getvalue()
+
+
+def run_shell(block: Block) -> None:
+    for words in shell_lines(block):
+        assert words[0] == "kornia-tidy", f"{block.place} is not run: only kornia-tidy can be, not {words[0]}"
+        status = main(words[1:])
+        assert status == 0, f"{block.place} ends with {status}: {shlex.join(words)}"
+
+
+def check_names(block: Block) -> None:
+    """Compile a Python block and import the names that it imports."""
+    tree = ast.parse("\n" * block.line + block.text, block.place)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                importlib.import_module(alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(node.module or "")
+            missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+            assert not missing, f"{block.place} imports {missing}, which {node.module} has not"
+
+
+def check_command(block: Block, words: list[str]) -> None:
+    """Look up a command and its options."""
+    while "=" in words[0]:  # a variable of the environment
+        words = words[1:]
+    program, *rest = words
+    if program == "kornia-tidy":
+        status: object = 0
+        try:
+            build_parser().parse_args(rest)
+        except SystemExit as leaving:
+            status = leaving.code
+        assert status == 0, f"{block.place}: kornia-tidy refuses {shlex.join(rest)}"
+    elif program == "make":
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        wanted = [word for word in rest if "=" not in word]
+        assert set(wanted) <= set(targets), f"{block.place}: the Makefile has no target {wanted}"
+    elif program.rpartition("/")[2].startswith("python"):
+        file = rest[1] if rest[0] == "-m" else rest[0]
+        there = importlib.util.find_spec(file) if rest[0] == "-m" else (ROOT / file).is_file()
+        assert there, f"{block.place}: there is no {file}"
+    elif program == "pip":
+        with (ROOT / "pyproject.toml").open("rb") as file:
+            extras = tomllib.load(file)["project"]["optional-dependencies"]
+        wanted = [extra for word in rest for found in re.findall(r"\[([\w,]+)\]", word) for extra in found.split(",")]
+        assert set(wanted) <= set(extras), f"{block.place}: there are no extras {wanted}"
+    else:
+        assert program in ("cd", "git"), f"{block.place}: {program} is not known here"
+
+
+def anchors(page: Path) -> set[str]:
+    """Return what links to the headings of a page end with, as GitHub makes them."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a scene in two files, which commands and scripts are run in."""
+    image, depth = dead_leaves(96, 128, depth_range=(0.4, 3.0), num_leaves=60)
+    write_image(tmp_path / "photo.png", image)
+    write_depth(tmp_path / "depth.png", depth, scale=0.001)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["kornia-tidy"])
+    torch.manual_seed(0)
+    return tmp_path
+
+
+class TestEveryPage(BaseTester):
+    @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")  # Lightning
+    @pytest.mark.filterwarnings("ignore::kornia_tidy.psf.AliasingWarning")  # of fidelity="paper", told in its page
+    @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in NAMES])
+    def test_feature_its_blocks_run_and_print_what_they_show(self, name, folder):
+        run_page(name, (ROOT / name).read_text(encoding="utf-8"))
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_what_is_not_run_names_what_is_there(self, name):
+        for block in blocks(name, (ROOT / name).read_text(encoding="utf-8")):
+            if block.reason and block.language == "python":
+                check_names(block)
+            elif block.reason and block.language == "bash":
+                for words in shell_lines(block):
+                    check_command(block, words)
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_every_block_tells_its_language(self, name):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert [b.place for b in blocks(name, text) if b.language not in (*RUN, *SHOWN)] == []
+        assert text.count("```") == 2 * len(blocks(name, text)), "a block is not closed, or is indented"
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_links_lead_somewhere(self, name):
+        page = ROOT / name
+        gone = []
+        for file, anchor in LINK.findall(FENCE.sub("", page.read_text(encoding="utf-8"))):
+            target = page.parent / file if file else page
+            if "://" not in file and not (target.exists() and (not anchor or anchor in anchors(target))):
+                gone.append(f"{file}#{anchor}")
+        assert gone == []
+
+    def test_feature_few_blocks_are_not_run(self):
+        """Each gives its reason; the list is printed with -s."""
+        found = [b for name in NAMES for b in blocks(name, (ROOT / name).read_text(encoding="utf-8")) if b.reason]
+        for block in found:
+            print(f"{block.place}: {block.reason}")
+        assert len(found) <= MOST_NOT_RUN
+
+    def test_feature_the_picture_of_the_readme_is_drawn(self, tmp_path):
+        script = ROOT / "docs" / "make_picture.py"
+        namespace = runpy.run_path(str(script))
+        path = namespace["main"](["--size", "64", "--output", str(tmp_path / "new" / "camera.png")])
+        assert read_image(path).shape == read_image(namespace["PICTURE"]).shape
+        assert namespace["PICTURE"].stat().st_size < 300_000
+
+    def test_feature_the_readme_is_short(self):
+        assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 200
+
+    def test_feature_the_readme_links_every_page(self):
+        links = {file for file, _ in LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))}
+        assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} <= links
+
+
+def page(*parts: str) -> str:
+    return "\n".join(parts) + "\n"
+
+
+class TestRunPage(BaseTester):
+    """Faults that are planted in a page are found."""
+
+    def test_feature_blocks_share_names_and_prints_are_compared(self, folder):
+        run_page(
+            "p.md", page("```python", "x = 1", "```", "", "```python", "print(x, 2)", "```", "```text", "1 ...", "```")
+        )
+
+    def test_exception_another_print(self, folder):
+        with pytest.raises(AssertionError, match=r"p\.md:4 shows\s+2\s+but printed is\s+1"):
+            run_page("p.md", page("```python", "print(1)", "```", "```text", "2", "```"))
+
+    def test_exception_an_error_has_the_line_of_the_page(self, folder):
+        with pytest.raises(ZeroDivisionError) as raised:
+            run_page("p.md", page("Words.", "", "```python", "1 / 0", "```"))
+        assert raised.traceback[-1].lineno + 1 == 4
+
+    def test_exception_a_command_that_fails(self, folder):
+        with pytest.raises(AssertionError, match=r"p\.md:1 ends with 2: kornia-tidy simulate gone\.png --depth depth"):
+            run_page("p.md", page("```bash", "kornia-tidy simulate gone.png \\", "    --depth depth.png", "```"))
+
+    def test_exception_another_command(self, folder):
+        with pytest.raises(AssertionError, match="only kornia-tidy can be, not ls"):
+            run_page("p.md", page("```bash", "ls", "```"))
+
+    def test_feature_a_marked_block_is_not_run_and_the_next_one_is(self, folder):
+        text = page(
+            "<!-- not run: why -->", "```python", "1 / 0", "```", "", "<!-- not run: that -->", "```text", "```"
+        )
+        run_page("p.md", text)
+        assert [block.reason for block in blocks("p.md", text)] == ["why", "that"]
+        with pytest.raises(ZeroDivisionError):
+            run_page("p.md", page(text, "```python", "1 / 0", "```"))
+
+    @pytest.mark.parametrize(
+        ("language", "line", "match"),
+        [
+            ("python", "from kornia_tidy import Gone", "imports .'Gone'., which kornia_tidy has not"),
+            ("bash", "make gone", "the Makefile has no target"),
+            ("bash", "kornia-tidy render --gone", "kornia-tidy refuses render --gone"),
+            ("bash", "python gone.py", r"there is no gone\.py"),
+            ("bash", "OMP_NUM_THREADS=1 python -m tests.gone", r"there is no tests\.gone"),
+            ("bash", "pip install '.[plot,gone]'", r"there are no extras .*'gone'"),
+            ("bash", "gone", "gone is not known here"),
+        ],
+    )
+    def test_exception_what_is_not_run_and_not_there(self, language, line, match):
+        (block,) = blocks("p.md", page("<!-- not run: why -->", f"```{language}", line, "```"))
+        assert block.reason == "why"
+        with pytest.raises(AssertionError, match=match):
+            check_names(block) if language == "python" else check_command(block, shell_lines(block)[0])
