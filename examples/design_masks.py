@@ -38,7 +38,7 @@ from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum
 from kornia_tidy.mask_design.fisher_information import crlb
 from kornia_tidy.mask_design.objectives import design, restoration_error
 from kornia_tidy.masks import CubicMask, PhaseMasks, SpiralMask, ZernikeMask
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 
 # Light that leaves the window is lost, not given back: a mask is not rewarded for throwing light far away.
 FIDELITY = Fidelity("design", pixel_tolerance=0.1, layer_spacing=1.0, window=33, stray_light="discard")
@@ -74,13 +74,13 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, tuple[float, float
     return scores
 
 
-def lens_with(masks: PhaseMasks, options: argparse.Namespace) -> CodedLens:
+def lens_with(masks: PhaseMasks, options: argparse.Namespace) -> PSFModel:
     """Return the lens that all masks share, at 530 nm."""
     camera = DefocusRange(-options.limit, options.limit)
-    return CodedLens(masks, camera, fidelity=FIDELITY, spectrum=Spectrum.monochrome())
+    return PSFModel(masks, camera, fidelity=FIDELITY, spectrum=Spectrum.monochrome())
 
 
-def draw(path: Path, lenses: dict[str, CodedLens], bounds: dict[str, np.ndarray]) -> None:
+def draw(path: Path, lenses: dict[str, PSFModel], bounds: dict[str, np.ndarray]) -> None:
     """Draw masks, PSFs over defocus and the bound over defocus."""
     figure = Figure(figsize=(12, 12), layout="constrained")
     montage, chart = figure.subfigures(2, 1, height_ratios=(1.9, 1))

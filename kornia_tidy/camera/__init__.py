@@ -1,7 +1,8 @@
 """The whole camera: an image and its depth come in, a coded capture goes out, and gradients reach the masks.
 
 Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burst.py``), scenes that move during the
-exposure (``motion.py``) and the transform of a data set (``dataset_transform.py``).
+exposure (``motion.py``) and the transform of a data set (``dataset_transform.py``). ``samples.py`` reads what a camera
+is given, ``banding.py`` takes large images in bands, ``psf_model_owner.py`` and ``camera_state.py`` are its bases.
 """
 
 from kornia_tidy.camera.burst import burst

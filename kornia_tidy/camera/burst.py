@@ -8,6 +8,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera.samples import read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -86,23 +87,21 @@ def burst(
         >>> burst(optics, torch.rand(3, 80, 80), torch.ones(1, 80, 80), dead_time=10e-3).shape
         torch.Size([2, 3, 80, 80])
     """
-    image, depth, batched = optics._checked(image, depth)
-    optics = optics._now(image)  # all shots see the masks of one moment
-    light = optics.decode(image)
+    sample = read_sample(image, depth, optics)
+    now = optics.snapshot(sample.dtype)  # all shots see the masks of one moment
+    light = now.decode(sample.image)
     shots = []
-    for k, share in enumerate(burst_shares(_dwell_shares(optics, light.dtype), dead_time, exposure)):
-        one = linear_through_moment(optics, k)
-        one.check_inputs = optics.check_inputs and k == 0  # say once what is wrong
-        shot = one(light, depth) * share.to(light)
-        optics._clamped = one._clamped  # every shot sees the same depths
-        shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
+    for k, share in enumerate(burst_shares(_dwell_shares(now, sample.dtype), dead_time, exposure)):
+        one = linear_through_moment(now, k)
+        one.check_inputs = now.check_inputs and k == 0  # warnings come once
+        shot = one(light, sample.depth) * share.to(light)
+        shots.append(shot if now.sensor is None else _sensor_for(now.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1)
-    return stack if batched else stack[0]
+    return stack if sample.batched else stack[0]
 
 
-def _dwell_shares(optics: TiDyOptics, image_dtype: torch.dtype) -> Tensor:
-    """Return the dwell shares of the masks: a modulator's first K moments, without what lies between."""
-    dtype = torch.float64 if optics.fidelity.double or image_dtype == torch.float64 else torch.float32
+def _dwell_shares(optics: TiDyOptics, dtype: torch.dtype) -> Tensor:
+    """Return the dwell shares of the K masks, scaled to sum to one; transitions between masks are left out."""
     shown = optics.timeline(dtype).durations[: optics.masks.phase.shape[0]]
     if not bool(shown.sum() > 0):
         raise ValueError("a burst needs masks that are shown for a time, but switching takes the whole exposure")

@@ -9,6 +9,7 @@ from kornia.geometry import remap
 from torch import Tensor
 
 from kornia_tidy.camera.burst import linear_through_moment
+from kornia_tidy.camera.samples import check_light, compute_dtype
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.modulator.modulator import Timeline
@@ -71,12 +72,11 @@ def moving_capture(
     batched = not isinstance(images, Tensor) or images.ndim != 4
     check_float_tensor("images", images, 5 if batched else 4, "(B, M, C, H, W) or (M, C, H, W)")
     check_float_tensor("depths", depths, images.ndim, "(B, M, 1, H, W) or (M, 1, H, W), as images are batched or not")
-    optics._check_values(images)
+    check_light(images, optics)
     if not batched:
         images, depths = images[None], depths[None]
-    optics = optics._now(images)  # every moment is of the same masks
-    wide = optics.fidelity.double or images.dtype == torch.float64
-    dtype = torch.float64 if wide else torch.float32
+    dtype = compute_dtype(images.dtype, optics.fidelity)
+    optics = optics.snapshot(dtype)  # every moment is of the same masks
     with torch.autocast(images.device.type, enabled=False):
         durations = optics.timeline(dtype).durations
         for name, scenes in (("images", images), ("depths", depths)):
@@ -85,14 +85,13 @@ def moving_capture(
                     f"{name} must have one scene for each of the {len(durations)} moments of the exposure, got "
                     f"{scenes.shape[1]}"
                 )
-        total, warned, clamped = torch.zeros(()), False, 0
+        total, clamped = torch.zeros(()), 0
         for moment, share in enumerate(durations):
             one = linear_through_moment(optics, moment)
-            one._warned |= warned  # say once what is beyond the camera's range
             light = one(optics.decode(images[:, moment].to(dtype)), depths[:, moment]) * share
-            total, warned = light if moment == 0 else total + light, one._warned
+            total = light if moment == 0 else total + light
             clamped += one.clamped_pixels
-        optics._clamped = torch.tensor(clamped)
+        optics.notes.of_thread.clamped = clamped
         if optics.sensor is not None:
             total = optics.sensor(total, params=params, generator=generator)
         coded = optics.encode(total).to(images.dtype)
@@ -103,7 +102,7 @@ def moment_times(optics: TiDyOptics) -> Tensor:
     """Return when each moment of the exposure is: its middle, as a share of the exposure in [0, 1].
 
     Args:
-        optics: the camera. Moments are those of :meth:`~kornia_tidy.psf.psf_model.CodedLens.timeline`; the states
+        optics: the camera. Moments are those of :meth:`~kornia_tidy.psf.psf_model.PSFModel.timeline`; the states
             of a modulator that does not say when it shows them are taken to follow one another.
 
     Returns:

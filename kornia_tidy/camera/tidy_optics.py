@@ -2,47 +2,42 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Mapping
-from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
-from torch.utils.data import get_worker_info
 
+from kornia_tidy.camera.advice import explain_capture, plan_capture
+from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
+from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
+from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
-from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_part, check_positive
+from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus, tell_of_defocus, zero_of
+from kornia_tidy.checks import check_choice, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks.base import PhaseMasks, adam_groups
+from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.units import check_image, layout_remedy, misread_depth, tell_once
-from kornia_tidy.psf.camera_settings import settings_of
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_model import CodedLens
-from kornia_tidy.render.bands import padded_band
-from kornia_tidy.render.borders import BORDERS, check_border
+from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.runtime.threads import CaptureNotes
-from kornia_tidy.runtime.tracing import is_followed, is_value_unknown, refuse_torchscript
-from kornia_tidy.sensor.noise import STRIP, SensorNoise
+from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
+from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.systems.presets import published_system
 
 if TYPE_CHECKING:
     from kornia_tidy.planning.render_plan import RenderPlan
+    from kornia_tidy.render.dispatch import Explanation
 
-_OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")
-COLOR_SPACES = ("srgb", "linear", "paper")
-DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
-# What a capture in float32 of three channels takes at its peak beyond image and capture: for tiles, and a pixel.
-_BYTES_OF_TILES, _BYTES_A_PIXEL = 24 << 20, 120
+Banks = list[tuple[Tensor | float, PSFBank]]
 _DEFAULT_SENSOR = SensorNoise(0.01)
-_BEYOND = "depths beyond the camera's range"
 
 
-class TiDyOptics(CodedLens):
+class TiDyOptics(CameraState):
     r"""A programmable camera: an image and its depth go in, a coded capture comes out, gradients reach the masks.
 
     The chain is: decode to linear light, blur by the PSFs of each pixel's depth (averaged over the masks shown during
@@ -95,7 +90,7 @@ class TiDyOptics(CodedLens):
         - The capture is detached inside a DataLoader's worker, and only there; see :meth:`as_transform`.
         - Threads may share a camera: each capture sees masks, parts and window as they are at one moment. The order in
           which threads draw from the global generator is open: give each capture its ``generator=``.
-        - ``state_dict()`` holds settings and PSF window too; see :class:`~kornia_tidy.psf.camera_state.CameraState`.
+        - ``state_dict()`` holds settings and PSF window too; see :class:`~kornia_tidy.camera.camera_state.CameraState`.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023.
 
@@ -109,8 +104,6 @@ class TiDyOptics(CodedLens):
         >>> optics.masks.phase.grad.shape
         torch.Size([5, 23, 23])
     """
-
-    _SETTABLE: ClassVar = {**CodedLens._SETTABLE, **{name: name for name in _OWN_SETTINGS}}
 
     def __init__(
         self,
@@ -139,9 +132,9 @@ class TiDyOptics(CodedLens):
                 f"fidelity 'paper' means color_space='paper' and compositing='gather', got {color_space!r} and "
                 f"{compositing!r}: leave them out, or use another fidelity"
             )
-        super().__init__(masks, camera, modulator, fidelity, spectrum, aperture)
+        super().__init__(PSFModel(masks, camera, modulator, fidelity, spectrum, aperture))
         if compositing == "occlusion" and self.spectrum.basis is not None:
-            # What hides is normalised by the light of its PSF; those between colours hold as much below zero as above.
+            # Occlusion divides by the sum of each PSF; the PSFs between two colours sum to zero.
             raise ValueError(
                 "compositing 'occlusion' needs colours without spectra of their own, got a spectrum with a basis: "
                 "leave reflectance=True out, or use 'gather' or 'scatter'"
@@ -154,7 +147,7 @@ class TiDyOptics(CodedLens):
         self.border = border
         self.check_inputs = check_inputs
         self.memory_budget = memory_budget
-        self._notes = CaptureNotes()
+        self.notes = CaptureNotes()  # shared with cameras made by _replace
 
     @classmethod
     def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
@@ -203,124 +196,102 @@ class TiDyOptics(CodedLens):
             params: noise drawn before by :meth:`draw`, to repeat a capture or to compile one.
             generator: source of the noise (not while compiling).
         """
-        if isinstance(image, Mapping):
-            return self._map_sample(image, depth, params, generator)
-        if isinstance(image, (tuple, list)):
-            if len(image) < 2 or depth is not None:
-                raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
-            now = self._now(image[0])
-            coded = now.capture(image[0], image[1], params, generator)
-            parts = (coded, now._cropped(image[1]), *image[2:])
-            return type(image)(*parts) if hasattr(image, "_fields") else type(image)(parts)
-        return self.capture(image, depth, params, generator)
+        sample = read_sample(image, depth, self, generator)
+        with torch.autocast(sample.image.device.type, enabled=False):  # float32 or better throughout
+            now = self.snapshot(sample.dtype)
+            if sample.bytes_at_once > now.memory_budget and (rows := rows_at_once(now, sample)):
+                return sample.coded(capture_in_bands(now, sample, rows, params, generator))
+            light = now.decode(sample.image.to(sample.dtype))
+            defocus = now.defocus(sample.depth.to(sample.dtype))
+            reach = survey_defocus([defocus], now).reach
+            banks = now.psf_model.scene_banks(light.shape[1], sample.dtype, reach, now.compositing == "occlusion")
+            irradiance = now.render(light, defocus, banks, now.border)
+            coded = now.encode(now.expose(irradiance, params, generator))
+        return sample.coded(coded.to(sample.image.dtype))
 
     def capture(
         self,
         image: Tensor,
-        depth: Tensor | None,
+        depth: Tensor,
         params: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Take a picture of an image and its depth. See :meth:`forward`."""
-        if torch.jit.is_tracing():
-            refuse_torchscript()
-        check_generator(generator)
-        image, depth, batched = self._checked(image, depth)
-        with torch.autocast(image.device.type, enabled=False):
-            now = self._now(image)
-            check_border(now.border, *image.shape[-2:], now.window)
-            if len(image) == 0:
-                coded = now._no_capture(image, depth)
-            elif (rows := now._rows_at_once(image, depth)) is None:
-                coded = now._capture_at_once(image, depth, params, generator)
-            else:
-                coded = now._capture_in_bands(image, depth, rows, params, generator)
-        if not torch.compiler.is_compiling() and get_worker_info() is not None:
-            coded = coded.detach()  # collation in a worker cannot carry gradients
-        return coded if batched else coded[0]
+        return self.forward(image, depth, params, generator)
 
-    def _no_capture(self, image: Tensor, depth: Tensor) -> Tensor:
-        """Return the captures of a batch of no images, of which gradients are zero."""
-        self._survey([])
-        states, weights = self._states(self._compute_dtype(image))
-        return self._cropped(image) + (states.sum() + weights.sum() + depth.sum()).to(image)
+    def snapshot(self, dtype: torch.dtype) -> Self:
+        """Return the camera as it is now, for one capture; later changes by other threads reach the next one.
 
-    def _capture_at_once(
-        self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor] | None, generator: torch.Generator | None
-    ) -> Tensor:
-        defocus = self._defocus(depth, image)
-        self._survey([defocus])
-        banks = self._scene_banks(image.shape[1], defocus)
-        return self._expose(image, defocus, banks, self.border, params, generator)
+        Masks that another thread changes in place, as an optimiser does, are copied until they stand still. The parts
+        themselves are shared. The compiler sees the camera itself.
 
-    def _capture_in_bands(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        rows: int,
-        params: Mapping[str, Tensor] | None,
-        generator: torch.Generator | None,
-    ) -> Tensor:
-        """Take the picture some rows at a time, each with as much of its neighbours as the PSFs reach."""
-        radius = self.window // 2
-        height, width = self._cropped(image).shape[-2:]
-        bands = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-        extremes = self._survey(self._defocus(part, image) for part in depth.split(rows, dim=-2))
-        banks = self._scene_banks(image.shape[1], extremes)
-        sides = "replicate" if self.border == "zero" else self.border  # what is black may lie anywhere
-        coded = image.new_empty(*image.shape[:2], height, width)
-        for band in bands:
-            piece = padded_band(image, band, radius, self.border)
-            there = self._defocus(padded_band(depth, band, radius, sides), image)
-            own = None if params is None else {name: field[..., band, :] for name, field in params.items()}
-            coded[..., band, :] = self._expose(piece, there, banks, "valid", own, generator)
-        return coded
+        Args:
+            dtype: float32 or float64, in which the masks are needed.
+        """
+        if is_followed():
+            return self
+        with self.psf_model.lock:
+            return self._replace(psf_model=self.psf_model.snapshot(dtype))
 
-    def _expose(
-        self,
-        image: Tensor,
-        defocus: Tensor,
-        banks: list[tuple[Tensor | float, PSFBank]],
-        border: str,
-        params: Mapping[str, Tensor] | None,
-        generator: torch.Generator | None,
-    ) -> Tensor:
-        """Take a picture of encoded light at known defocus."""
-        light = self.decode(image.to(defocus.dtype))
+    def _replace(self, **attributes: Any) -> Self:
+        """Return a camera with other attributes. Parts, notes, lock and remembered PSFs are shared."""
+        other = object.__new__(type(self))
+        modules, parameters, buffers = dict(self._modules), dict(self._parameters), dict(self._buffers)
+        vars(other).update(vars(self), _modules=modules, _parameters=parameters, _buffers=buffers, **attributes)
+        return other
+
+    def decode(self, image: Tensor) -> Tensor:
+        """Return linear light from an image (B, C, H, W) in the camera's colour space."""
+        if self.color_space != "srgb":
+            return image
+        return rgb_to_linear_rgb(image) if image.shape[1] == 3 else any_channels(rgb_to_linear_rgb, image)
+
+    def encode(self, light: Tensor) -> Tensor:
+        """Return an image in the camera's colour space from linear light (B, C, H, W)."""
+        if self.color_space != "srgb":
+            return light
+        return linear_rgb_to_rgb(light) if light.shape[1] == 3 else any_channels(linear_rgb_to_rgb, light)
+
+    def defocus(self, depth: Tensor) -> Tensor:
+        """Return the defocus map of a depth map in radians at 530 nm, checked as the camera's inputs are.
+
+        Raises:
+            ValueError: if the camera checks its inputs and a depth is NaN or not positive.
+        """
+        return self.psf_model.camera.defocus(depth, check_inputs=self.check_inputs and not is_value_unknown())
+
+    def render(self, light: Tensor, defocus: Tensor, banks: Banks, border: str) -> Tensor:
+        """Return the irradiance of a scene on the sensor, over the whole exposure.
+
+        Args:
+            light: (B, C, H, W) linear light.
+            defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+            banks: PSFs, each with its share of the exposure.
+            border: what lies beyond the image.
+        """
         # Where colours have spectra, each channel of the sensor sees a plane for each channel of the scene.
-        reflectances = banks[0][1].psfs.shape[1] // image.shape[1]
+        reflectances = banks[0][1].psfs.shape[1] // light.shape[1]
         if reflectances > 1:
             light = light.repeat(1, reflectances, 1, 1)
-        look = partial(
-            render,
-            light,
-            defocus,
-            compositing=self.compositing,
-            layers="nearest" if self.fidelity.layers == "nearest" else "linear",
-            border=border,
-            correlate=self.fidelity.correlate,
-        )
-        (share, bank), *others = banks
-        light = look(bank=bank)
-        if others:
-            light = light * share
-            for share, bank in others:
-                light = light + look(bank=bank) * share
-        if reflectances > 1:
-            light = light.unflatten(1, (-1, reflectances)).sum(2)
-        if self.sensor is not None:
-            light = self.sensor(light, params=params, generator=generator)
-        return self.encode(light).to(image.dtype)
+        if len(light) == 0:  # an empty batch: gradients are zero
+            margin = banks[0][1].window // 2 if border == "valid" else 0
+            return cropped(light, margin) + zero_of(defocus, *(bank.psfs for _, bank in banks))
+        fidelity = self.psf_model.fidelity
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        total = light
+        for index, (share, bank) in enumerate(banks):
+            seen = render(
+                light, defocus, bank, self.compositing, layers=layers, border=border, correlate=fidelity.correlate
+            )
+            seen = seen if len(banks) == 1 else seen * share
+            total = total + seen if index else seen
+        return total.unflatten(1, (-1, reflectances)).sum(2) if reflectances > 1 else total
 
-    def _scene_banks(self, channels: int, defocus: Tensor) -> list[tuple[Tensor | float, PSFBank]]:
-        """PSFs that a scene is rendered through, and for what share of the exposure.
-
-        Their average does for the whole exposure, except where layers hide one another: there each state of its own.
-        """
-        bank = partial(self.scene_bank, channels, defocus.dtype, defocus)
-        if self.compositing != "occlusion" or self.fidelity.occlusion_states == "mean":
-            return [(1.0, bank())]
-        return [(share, bank(state=state)) for state, share in enumerate(self.state_weights(defocus.dtype))]
+    def expose(
+        self, irradiance: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return what the sensor reports of an irradiance, in linear light. See :meth:`forward` for the noise."""
+        return irradiance if self.sensor is None else self.sensor(irradiance, params=params, generator=generator)
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.
@@ -331,10 +302,11 @@ class TiDyOptics(CodedLens):
         """
         if self.sensor is None:
             return {}
-        height, width = self._cropped(image).shape[-2:]
+        height, width = cropped(image, self.window // 2 if self.border == "valid" else 0).shape[-2:]
         shape = (*(image.shape[:2] if image.ndim == 4 else (1, image.shape[0])), height, width)
         sensor = cast("SensorNoise", self.sensor)
-        return sensor.draw(shape, device=image.device, dtype=self._compute_dtype(image), generator=generator)
+        dtype = compute_dtype(image.dtype, self.fidelity)
+        return sensor.draw(shape, device=image.device, dtype=dtype, generator=generator)
 
     # ------------------------------------------------------------------ how exactly to compute
 
@@ -360,26 +332,25 @@ class TiDyOptics(CodedLens):
             >>> plan.predicted_error <= 1e-2
             True
         """
-        from kornia_tidy.planning.planner import Planner  # noqa: PLC0415 (only who plans waits for it)
+        return plan_capture(self, depth, image, tolerance)
 
-        shape = (len(self.spectrum.weights), *depth.shape[-2:])
-        blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
-        blank, depth, _ = self._checked(blank, depth)
-        if len(blank) == 0 or len(depth) == 0:
-            raise ValueError(f"a plan needs at least one image and its depth, got {len(blank)} and {len(depth)}")
-        light = None if image is None else self.decode(blank.to(self._compute_dtype(blank)))
-        defocus = self._defocus(depth, depth)
-        return Planner(self, blank.shape[1]).scene(defocus, light).plan(tolerance)
+    @torch.no_grad()
+    def explain(self, image: Tensor, depth: Tensor) -> Explanation:
+        """Return which backend renders a scene and why, with the estimated time of each.
 
-    # ------------------------------------------------------------------ colour
+        Args:
+            image: (B, C, H, W) or (C, H, W), as for a capture.
+            depth: its depth.
 
-    def decode(self, image: Tensor) -> Tensor:
-        """Return linear light from an image in the camera's colour space."""
-        return _any_channels(rgb_to_linear_rgb, image) if self.color_space == "srgb" else image
+        Raises:
+            ValueError: if the batch holds no image, or as for a capture.
 
-    def encode(self, light: Tensor) -> Tensor:
-        """Return an image in the camera's colour space from linear light."""
-        return _any_channels(linear_rgb_to_rgb, light) if self.color_space == "srgb" else light
+        Example:
+            >>> print(TiDyOptics(compositing="scatter").explain(torch.rand(3, 64, 64), torch.ones(1, 64, 64)))
+            scatter of 1 x 3 channels of 64x64 px, ...
+              direct: direct convolution gathers light and does not scatter it
+        """
+        return explain_capture(self, image, depth)
 
     # ------------------------------------------------------------------ training, data sets, people
 
@@ -396,12 +367,7 @@ class TiDyOptics(CodedLens):
             >>> optimizer.param_groups[0]["eps"]
             1e-15
         """
-        groups: list[dict[str, Any]] = [adam_groups(self.masks, lr_metres)]
-        in_masks = {id(p) for p in self.masks.parameters()}
-        others = [p for p in self.parameters() if id(p) not in in_masks]
-        if others:
-            groups.append({"params": others} if lr is None else {"params": others, "lr": lr})
-        return groups
+        return parameter_groups(self, self.masks, lr_metres, lr)
 
     def as_transform(self, seed: int | None = None, key: Any = "index") -> DatasetTransform:
         """Return the camera as a transform of single samples, without gradients. See :class:`DatasetTransform`."""
@@ -414,24 +380,14 @@ class TiDyOptics(CodedLens):
         Of a burst, those of one shot; of a moving scene, those of all its moments. Each thread sees those of the last
         capture that it took itself, be it with this camera or with a view of it such as ``with_fidelity`` returns.
         """
-        return 0 if self._clamped is None else int(self._clamped)
+        return int(self.notes.clamped)
 
-    @property
-    def _clamped(self) -> Tensor | None:
-        return self._notes.clamped
-
-    @_clamped.setter
-    def _clamped(self, count: Tensor | None) -> None:
-        self._notes.clamped = count
-
-    @property
-    def _warned(self) -> bool:
-        return self._notes.is_told(_BEYOND)
-
-    @_warned.setter
-    def _warned(self, told: bool) -> None:
-        if told:
-            self._notes.first_time(_BEYOND)
+    def check_scene(self, image: Tensor, depth: Tensor) -> None:
+        """Check the values of an image and its depth as a capture does, and warn of other units."""
+        sample = read_sample(image, depth, self)
+        defocus = self.defocus(sample.depth.to(sample.dtype)).detach()
+        if self.check_inputs:
+            tell_of_defocus(torch.stack(torch.aminmax(defocus)), self)
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""
@@ -441,149 +397,3 @@ class TiDyOptics(CodedLens):
             f"{self.window}x{self.window} px holding {held[0]:.0%} to {held[1]:.0%} of the light "
             f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
         )
-
-    def settings(self) -> dict[str, Any]:
-        """Return what shapes a capture besides the weights, by the names of the parts."""
-        return {**super().settings(), **{name: settings_of(getattr(self, name)) for name in _OWN_SETTINGS}}
-
-    def _take_over(self, saved: Mapping[str, Any]) -> None:
-        for name, allowed in (("compositing", COMPOSITING), ("color_space", COLOR_SPACES), ("border", BORDERS)):
-            if name in saved:
-                check_choice(name, saved[name], tuple(allowed))
-        super()._take_over(saved)
-
-    # ------------------------------------------------------------------ inside
-
-    def _now(self, image: Any) -> Self:
-        """Return the camera at this moment, for a capture of an image."""
-        if not isinstance(image, Tensor):
-            return self
-        with torch.autocast(image.device.type, enabled=False):
-            return self.snapshot(self._compute_dtype(image))
-
-    def _rows_at_once(self, image: Tensor, depth: Tensor) -> int | None:
-        """Rows whose capture fits the memory allowed; None where all do, or where the whole image is needed."""
-        learning = torch.is_grad_enabled() and (
-            image.requires_grad or depth.requires_grad or any(p.requires_grad for p in self.parameters())
-        )
-        veiled = self.fidelity.stray_light == "veil"
-        # Beyond a zero border there is nothing that hides, which black pixels would.
-        unseen = self.compositing == "occlusion" and self.border == "zero"
-        if learning or is_followed() or veiled or unseen:
-            return None
-        itemsize = self._compute_dtype(image).itemsize
-        row = _BYTES_A_PIXEL * itemsize // 4 * image.shape[0] * image.shape[-1]
-        rows = max(STRIP, (self.memory_budget - _BYTES_OF_TILES) // row // STRIP * STRIP)
-        return None if rows >= image.shape[-2] else rows
-
-    def _defocus(self, depth: Tensor, image: Tensor) -> Tensor:
-        """The defocus of a depth map in the type that an image is computed in."""
-        look = self.check_inputs and not is_value_unknown()
-        return self.camera.defocus(depth.to(self._compute_dtype(image)), check_inputs=look)
-
-    def _compute_dtype(self, image: Tensor) -> torch.dtype:
-        return torch.float64 if self.fidelity.double or image.dtype == torch.float64 else torch.float32
-
-    def _checked(self, image: Any, depth: Any) -> tuple[Tensor, Tensor, bool]:
-        """Check a sample's types and shapes, and eagerly its values; return it batched."""
-        if depth is None:
-            raise ValueError("depth is missing: call optics(image, depth), optics((image, depth)) or optics(mapping)")
-        batched = not isinstance(image, Tensor) or image.ndim != 3
-        check_float_tensor("image", image, 4 if batched else 3, "(B, C, H, W) or (C, H, W)")
-        check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
-        remedy = layout_remedy(tuple(image.shape), len(self.spectrum.weights))
-        if not batched:
-            image, depth = image[None], depth[None]
-        self._spectrum(image.shape[1], remedy)
-        if 0 in image.shape[-2:]:
-            raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
-        if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
-            raise ValueError(
-                f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
-                f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
-            )
-        self._check_values(image)
-        return image, depth, batched
-
-    def check_scene(self, image: Tensor, depth: Tensor) -> None:
-        """Look at an image and its depth as a capture does: refuse what makes no sense, warn of other units."""
-        image, depth, _ = self._checked(image, depth)
-        self._tell_of_depth(*torch.aminmax(self._defocus(depth, image).detach()))
-
-    def _tell_of_depth(self, lowest: Tensor, highest: Tensor) -> bool:
-        """Warn once of depths that seem to be in another unit; return whether they do."""
-        said = misread_depth(self.camera, lowest, highest) if self.check_inputs else None
-        if said is not None:
-            tell_once(self._notes, "depth", said, stacklevel=9)
-        return said is not None
-
-    def _check_values(self, image: Tensor) -> None:
-        """Refuse values without sense; warn once of those that seem to be in another unit."""
-        if self.check_inputs and not is_value_unknown():
-            said = check_image(image, encoded=self.color_space != "linear")
-            if said is not None:
-                tell_once(self._notes, "image", said, stacklevel=8)
-
-    def _survey(self, parts: Iterable[Tensor]) -> Tensor:
-        """Return the lowest and highest defocus of a map given in parts; count pixels beyond the range, say so once.
-
-        Half a thousandth of a radian of rounding is not beyond.
-        """
-        if is_value_unknown():
-            return torch.zeros(2)
-        lo, hi = self.camera.defocus_range
-        extremes, pixels, clamped = [], 0, torch.tensor(0)
-        for defocus in parts:
-            own = defocus.detach()
-            lowest, highest = torch.aminmax(own)
-            extremes.append(torch.stack([lowest, highest]))
-            pixels += own.numel()
-            if not bool((lowest >= lo - 5e-4) & (highest <= hi + 5e-4)):
-                clamped = clamped.to(own.device) + ((own < lo - 5e-4) | (own > hi + 5e-4)).sum()
-        self._clamped = clamped
-        if not extremes:
-            return torch.zeros(2)
-        lowest, highest = torch.stack(extremes).amin(0)[0], torch.stack(extremes).amax(0)[1]
-        told = self._tell_of_depth(lowest, highest)
-        if self.check_inputs and not told and (count := int(clamped)) and self._notes.first_time(_BEYOND):
-            warnings.warn(
-                f"{count} of {pixels} pixels have a defocus between {float(lowest):+.2f} and {float(highest):+.2f} "
-                f"rad, beyond the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
-                f"ThinLensCamera.for_scene, or its depth_range)",
-                stacklevel=5,
-            )
-        return torch.stack([lowest, highest])
-
-    def _cropped(self, tensor: Tensor) -> Tensor:
-        """Crop a map to the capture's view, which is smaller only with the border ``"valid"``."""
-        margin = self.window // 2 if self.border == "valid" else 0
-        return tensor[..., margin : tensor.shape[-2] - margin, margin : tensor.shape[-1] - margin]
-
-    def _map_sample(
-        self,
-        sample: Mapping[str, Any],
-        depth: Tensor | None,
-        params: Mapping[str, Tensor] | None,
-        generator: torch.Generator | None,
-    ) -> dict[str, Any]:
-        keys = [key for key in DEPTH_KEYS if key in sample]
-        if "image" not in sample:
-            raise KeyError(f"a mapping sample needs an 'image', got the keys {list(sample)}")
-        if depth is not None or len(keys) != 1:
-            raise KeyError(
-                f"a mapping sample needs its depth under 'depth' or 'mask_depth', and in one place only, got the keys "
-                f"{list(sample)}"
-            )
-        image, depth = sample["image"], sample[keys[0]]
-        now = self._now(image)
-        coded = now.capture(image, depth, params, generator)
-        cropped = {name: now._cropped(sample[name]) for name in (keys[0], "mask") if name in sample}
-        return {**sample, "image": coded, "all_in_focus": now._cropped(image), **cropped}
-
-
-def _any_channels(function: Any, image: Tensor) -> Tensor:
-    """Apply a function of kornia's that wants three channels to images of any number."""
-    if image.shape[1] == 3:
-        return function(image)
-    planes = image.flatten(0, 1)[:, None]
-    return function(planes.expand(-1, 3, -1, -1))[:, 0].reshape(image.shape)

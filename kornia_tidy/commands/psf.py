@@ -201,7 +201,7 @@ def _without_mask(optics: TiDyOptics) -> Tensor:
     rows, columns = optics.masks.phase.shape[-2:]
     masks = PixelwiseMask(1, (rows, columns), initial="flat")
     plain = TiDyOptics(
-        masks, optics.camera, fidelity=optics.fidelity, spectrum=optics.spectrum, aperture=optics._aperture
+        masks, optics.camera, fidelity=optics.fidelity, spectrum=optics.spectrum, aperture=optics.aperture
     )
     return plain.psf_bank(defocus=[0.0]).psfs
 

@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
                 masks = torch.Generator().manual_seed(args.seed)
                 optics = TiDyOptics.from_preset(system.name, generator=masks, camera=camera)
             with stages("statistics"):
-                seen = system_statistics(optics)
+                seen = system_statistics(optics.psf_model)
             with stages("captures"):
                 generator = torch.Generator().manual_seed(args.seed)
                 capture = optics(image, metres(camera, nearness), generator=generator)

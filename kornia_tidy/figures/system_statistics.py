@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.mask_design.fisher_information import crlb
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 
 
 class SystemStatistics(NamedTuple):
@@ -25,7 +25,7 @@ class SystemStatistics(NamedTuple):
 
 
 @torch.no_grad()
-def system_statistics(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -> SystemStatistics:
+def system_statistics(lens: PSFModel, nodes: int = 49, frequencies: int = 32) -> SystemStatistics:
     """Compute PSFs, contrast and Cramér-Rao bound of a lens over the defocus range of its camera.
 
     Args:
@@ -35,7 +35,7 @@ def system_statistics(lens: CodedLens, nodes: int = 49, frequencies: int = 32) -
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
-        >>> seen = system_statistics(CodedLens(PixelwiseMask(1, initial="flat")), nodes=5)
+        >>> seen = system_statistics(PSFModel(PixelwiseMask(1, initial="flat")), nodes=5)
         >>> int(seen.contrast.mean((1, 2)).argmax())  # a plain lens is sharpest in the middle, in focus
         2
     """

@@ -26,7 +26,7 @@ from kornia_tidy.checks import check_positive
 from kornia_tidy.masks.base import MASK_SPAN, central_square, mask_coordinates
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.propagation import sensor_kernels
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.pupil import gapped_cells, gapped_pupil_field, pupil_field
 
 PHOTONS, BACKGROUND = 3000.0, 5.0
@@ -45,7 +45,7 @@ class PointResponse(NamedTuple):
     """(3, D, C, P, P): per radian of defocus at 530 nm, and per pixel of shift of the image along x and along y."""
 
 
-def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) -> PointResponse:
+def defocus_response(lens: PSFModel, defocus: Sequence[float] | None = None) -> PointResponse:
     r"""Return the time-averaged PSFs of a lens and their derivatives with respect to defocus and position.
 
     The wave on the sensor is :math:`W = K U K^T` with the pupil field U (see :mod:`~kornia_tidy.psf.propagation`). With
@@ -63,7 +63,7 @@ def defocus_response(lens: CodedLens, defocus: Sequence[float] | None = None) ->
         PSFs and derivatives in float64, differentiable twice with respect to masks and modulator.
 
     Example:
-        >>> psfs, derivatives = defocus_response(CodedLens(), [-8.0, 0.0, 8.0])
+        >>> psfs, derivatives = defocus_response(PSFModel(), [-8.0, 0.0, 8.0])
         >>> psfs.shape[:2], derivatives.shape[:3]
         (torch.Size([3, 3]), torch.Size([3, 3, 3]))
     """
@@ -189,7 +189,7 @@ def defocus_bound(information: Tensor, known_position: bool = False) -> Tensor:
 
 
 def crlb(
-    lens: CodedLens,
+    lens: PSFModel,
     defocus: Sequence[float] | None = None,
     photons: float = PHOTONS,
     background: float = BACKGROUND,
@@ -224,7 +224,7 @@ def crlb(
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
-        >>> flat = CodedLens(PixelwiseMask(1, initial="flat"))
+        >>> flat = PSFModel(PixelwiseMask(1, initial="flat"))
         >>> [round(value, 3) for value in crlb(flat, [-8.0, 0.0, 8.0]).tolist()]
         [0.041, inf, 0.041]
     """

@@ -42,8 +42,8 @@ def design(
 
     Example:
         >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
-        >>> from kornia_tidy.psf.psf_model import CodedLens
-        >>> lens = CodedLens(PixelwiseMask(1), fidelity="draft")
+        >>> from kornia_tidy.psf.psf_model import PSFModel
+        >>> lens = PSFModel(PixelwiseMask(1), fidelity="draft")
         >>> history = design(lens.masks, lambda: point_error(lens.psf_bank(channels=1)), iterations=10)
         >>> len(history), history[-1] < history[0]
         (10, True)

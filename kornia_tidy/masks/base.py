@@ -88,7 +88,8 @@ class PhaseMasks(nn.Module):
     @property
     def phase(self) -> Tensor:
         """Phase with the constraint applied, (K, N, N) radians at 530 nm."""
-        return limited_phase(self.free_phase(), self.constraint, self.max_phase)
+        free = self.free_phase()
+        return free if self.constraint == "none" else limited_phase(free, self.constraint, self.max_phase)
 
     def free_phase(self) -> Tensor:
         """Return the phase before the constraint: here the parameter or buffer registered as ``phase``."""
@@ -268,3 +269,28 @@ def adam_groups(masks: nn.Module, lr_metres: float, **options: float) -> dict[st
         "eps": 1e-15,
         **options,
     }
+
+
+def parameter_groups(
+    module: nn.Module, masks: nn.Module, lr_metres: float, lr: float | None = None
+) -> list[dict[str, object]]:
+    """Return the Adam parameter groups of a module that has masks: theirs, then one of its other parameters.
+
+    Args:
+        module: with the masks as a submodule.
+        masks: see :func:`adam_groups`.
+        lr_metres: learning rate of the masks in metres of height.
+        lr: learning rate of the other parameters. Default: the optimiser's.
+
+    Example:
+        >>> from kornia_tidy.masks.pixelwise import PixelwiseMask
+        >>> len(parameter_groups(module := nn.ModuleList([PixelwiseMask(), nn.Linear(1, 1)]), module[0], 1e-8))
+        2
+    """
+    of_masks = {id(parameter) for parameter in masks.parameters()}
+    others = [parameter for parameter in module.parameters() if id(parameter) not in of_masks]
+    groups = [adam_groups(masks, lr_metres)]
+    if others:
+        group: dict[str, object] = {"params": others}
+        groups.append(group if lr is None else {**group, "lr": lr})
+    return groups

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_part, described
+
+READS = 100  # of masks that another thread changes all the time; what is read last is taken
 
 
 class Timeline(NamedTuple):
@@ -48,7 +51,8 @@ class Timeline(NamedTuple):
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Timeline:
         """Return the timeline with a function applied to each of its tensors."""
-        mixture, middles = (None if part is None else function(part) for part in (self.mixture, self.middles))
+        mixture = None if self.mixture is None else function(self.mixture)
+        middles = None if self.middles is None else function(self.middles)
         return Timeline(function(self.states), function(self.durations), mixture, middles)
 
     def moment(self, index: int) -> tuple[Tensor, Tensor]:
@@ -87,6 +91,45 @@ def timeline_of(modulator: nn.Module, phase: Tensor) -> Timeline:
         phase: masks, (K, N, N) radians.
     """
     return modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
+
+
+def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype) -> Timeline:
+    """Return a copy of what a modulator shows of masks, read while no other thread changes their parameters.
+
+    Where other threads run, the parameters are compared before and after, and the states read again if they differ.
+
+    Args:
+        masks: the phase masks: a module with the property ``phase``.
+        modulator: turns their phase into states and weights.
+        dtype: float32 or float64.
+
+    Returns:
+        States in radians at 530 nm, and when they are shown. Gradients reach masks and modulator.
+
+    Convention:
+        - A thread that is halted in the middle of writing a parameter cannot be told from one that is done. Where that
+          matters, let it write through ``load_state_dict`` of the camera, or assign new masks: both are one step.
+
+    Example:
+        >>> from kornia_tidy import PixelwiseMask
+        >>> shown = settled_timeline(PixelwiseMask(2), DwellTimes(), torch.float64)
+        >>> shown.states.shape, shown.weights
+        (torch.Size([2, 23, 23]), tensor([0.5000, 0.5000], dtype=torch.float64))
+    """
+    alone = threading.active_count() == 1
+    for _ in range(READS):
+        now = [] if alone else [*masks.parameters(), *modulator.parameters()]
+        before = list(map(Tensor.clone, map(Tensor.detach, now)))
+        phase = cast("Tensor", masks.phase).to(dtype)
+        shown = modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
+        if shown.mixture is None and shown.middles is None:
+            shown = Timeline(shown.states.clone(), shown.durations.clone())
+        else:
+            shown = shown.map(Tensor.clone)
+        after = [] if alone else [*masks.parameters(), *modulator.parameters()]
+        if all(map(torch.equal, before, after)):
+            break
+    return shown
 
 
 class Modulator(nn.Module):

@@ -43,8 +43,10 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
         tensor([ 20.0200, -20.0200])
     """
     scale = math.pi * aperture_radius**2 / REFERENCE_WAVELENGTH
+    focus = _at_least_float32(focus_distance) if isinstance(focus_distance, Tensor) else focus_distance
+    wide = depth.to(torch.promote_types(depth.dtype, torch.float32))
     # Infinite depth has an inverse of exactly zero.
-    return (scale * (_at_least_float32(depth).reciprocal() - 1 / _at_least_float32(focus_distance))).to(depth.dtype)
+    return (scale * (wide.reciprocal() - 1 / focus)).to(depth.dtype)
 
 
 def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
@@ -209,7 +211,7 @@ class ThinLensCamera(nn.Module):
         """
         if check_inputs:
             check_depth(depth)
-        return thin_lens_defocus(depth, self.aperture_radius, self.focus_distance)
+        return thin_lens_defocus(depth, self.aperture_diameter / 2, self.focus_distance)
 
     def depth(self, defocus: Tensor) -> Tensor:
         r"""Return the depth map of a defocus map, the inverse of :meth:`defocus`.

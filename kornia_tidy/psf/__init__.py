@@ -1,18 +1,20 @@
 """From the pupil to point spread functions: propagation, interpolation over defocus, the PSF bank and its cache.
 
-Masks, modulator, camera, spectrum and fidelity come in as a lens; PSFs at the defocus of each layer go out as a bank.
-Read ``psf_model.py`` first; ``exact.py`` and ``paper.py`` are the two propagations.
+Masks, modulator, camera, spectrum and fidelity come in as a PSF model; PSFs at each layer's defocus go out as a bank.
+Read ``psf_model.py`` first, then ``scene_psfs.py``; ``exact.py`` and ``paper.py`` are the two propagations.
 """
 
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.paper import AliasingWarning, paper_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.state_bank import StateBank
 
 __all__ = [
     "AliasingWarning",
     "PSFBank",
+    "PSFModel",
     "Pupil",
     "StateBank",
     "exact_psf_bank",

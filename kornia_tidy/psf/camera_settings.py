@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 EXTRA_STATE = "_extra_state"  # how PyTorch calls the entry of a state that is neither parameter nor buffer
 _PAGE = 4096  # bytes; settings of about the same length fill the same tensor, as distributed checkpoints want it
-_MOST_VALUES = 1 << 16  # of a tensor that is written out; larger ones are told apart by their digest
+_MOST_VALUES = 1 << 16  # of a tensor written in full; of larger ones the digest is written
 _WORDS = ("name", "source")  # fields that name a setting and change nothing
 _NOT_SET = object()
 _REMEDY = f"without its {EXTRA_STATE!r} entry the state is loaded as weights alone"
@@ -195,7 +195,7 @@ def _short(value: Any) -> str:
 
 
 def _collect(owner: Any, attribute: str, saved: Any, place: str, changes: list[tuple[Any, str, Any]]) -> None:
-    """List what has to be set so that an attribute gets its saved settings."""
+    """List the attributes to set so that a part gets its saved settings."""
     current = getattr(owner, attribute)
     here = settings_of(current)
     if not isinstance(current, nn.Module):

@@ -1,4 +1,4 @@
-"""Sums over blocks of which the backward pass makes each block again, so that none is kept."""
+"""Checkpointed sums over blocks: the backward pass computes each block again instead of keeping it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Gradients = Callable[..., tuple[Tensor | None, ...]]
 
 
 def recomputed(energies: Energies, gradients: Gradients, *matrices: Tensor) -> Tensor:
-    """Return energies of matrices, of which nothing but the matrices is kept for the backward pass.
+    """Return energies of matrices; only the matrices are kept for the backward pass.
 
     Args:
         energies: of the matrices.

@@ -1,4 +1,4 @@
-"""What a coded lens may be made of, and how much defocus its PSFs can hold."""
+"""Limits of a PSF model: the types of its parts, and the defocus that its PSFs can hold."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_LAYERS = 4096
 def check_defocus_range(
     defocus_range: tuple[float, float], step: float | Tensor, fidelity: Fidelity, window: int | None
 ) -> None:
-    """Refuse a range of defocus whose PSFs would take minutes and gigabytes, before any work.
+    """Refuse a range of defocus with too many layers or too wide PSFs, before any work.
 
     Out of focus a point is a disc, by rays of diameter ``2 |psi| 530 nm / (pi s)`` pixels: the gradient of the phase
     ``psi rho^2`` at the edge of the pupil.
@@ -58,4 +58,25 @@ Fidelity.max_window or layer_spacing
             f"a defocus from {lo:.4g} to {hi:.4g} rad needs {layers:.0f} layers of PSFs {blur:.0f} px wide, of which "
             f"at most {MOST_LAYERS} and {widest} px are allowed: give lengths in metres, choose a smaller aperture or "
             f"depth_range, or raise Fidelity.max_window or layer_spacing"
+        )
+
+
+def check_layer_spacing(spacing: float, band: float, shortest_wavelength: float) -> None:
+    """Refuse layers too far apart to be interpolated without error.
+
+    Args:
+        spacing: between layers in radians of defocus.
+        band: highest frequency of a PSF along defocus, in radians per radian.
+        shortest_wavelength: in metres, for the message.
+
+    Raises:
+        ValueError: if the spacing is not below pi / band.
+
+    Example:
+        >>> check_layer_spacing(1.0, 1.13, 470e-9)
+    """
+    if spacing >= (limit := math.pi / band):
+        raise ValueError(
+            f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
+            f"{shortest_wavelength * 1e9:.0f} nm, got {spacing}"
         )

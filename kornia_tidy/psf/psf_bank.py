@@ -76,7 +76,7 @@ class PSFBank:
         return PSFBank(self.psfs, self.defocus, self.energy, veil)
 
     def _with_stray_light_of_basis(self, kind: str, basis: int) -> PSFBank:
-        """Deal with the light of a spectral scene: white light as ever, and colours that are even stay what they are.
+        """Return the bank of a spectral scene with its stray light; white and uniform colours keep their values.
 
         A channel sees all light of its own reflectance and none of the others'. What the window holds of each differs,
         as it does between wavelengths; "renormalize" makes it up in the shape of the channel's PSF for white light.

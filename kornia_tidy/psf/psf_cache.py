@@ -1,16 +1,31 @@
-"""PSFs that need not be computed again: while masks and camera stay as they are, each depth is computed once."""
+"""A cache of PSFs: while masks and camera stay as they are, each depth is computed once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.runtime.threads import SharedLock
 
 KINDS = 4  # banks remembered side by side: of RGB and of grey images, in float32 and in float64
+_OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among them, which are no plain attributes
+
+
+@dataclass(eq=False)
+class _Remembered:
+    """PSFs of one kind of bank, by their defocus, for one setting of masks and camera."""
+
+    setting: Sequence[object]
+    states: Tensor
+    weights: Tensor
+    psfs: dict[float, Tensor] = field(default_factory=dict)
+    last: tuple[Hashable, PSFBank] | None = None  # the bank asked for last, ready to be rendered through
+    lock: SharedLock = field(default_factory=SharedLock)
 
 
 class BankMemory:
@@ -38,13 +53,14 @@ class BankMemory:
     def recall(
         self,
         kind: Hashable,
-        setting: tuple[object, ...],
+        setting: Sequence[object],
         states: Tensor,
         weights: Tensor,
-        defocus: Sequence[float],
+        defocus: tuple[float, ...],
         build: Callable[[tuple[float, ...]], PSFBank],
+        stray_light: tuple[str, int] | None = None,
     ) -> PSFBank:
-        """Return the bank for these nodes, building only what is not remembered.
+        """Return the bank for these nodes; only PSFs that are not remembered are computed.
 
         Args:
             kind: of bank, such as its spectrum. Banks of another kind, data type or device are remembered beside it.
@@ -53,33 +69,51 @@ class BankMemory:
             weights: share of the exposure of each, (S,).
             defocus: nodes in radians.
             build: makes a bank of these states, before anything is done about stray light, for some nodes.
+            stray_light: arguments of :meth:`PSFBank.with_stray_light`; the last bank is then kept whole and given out
+                again, so its tensors must not be changed. Default: light outside the window is left alone.
         """
-        with torch.inference_mode(False), torch.no_grad():  # what is remembered must serve in training too
+        with torch.inference_mode(False), torch.no_grad():  # remembered PSFs serve in training too
+            kind = (kind, states.dtype, states.device)
             with self._lock:
-                kind = (kind, states.dtype, states.device)
                 known = self._banks.pop(kind, None)
-                if known is None or not known.holds_for(setting, states, weights):
-                    known = _Remembered(setting, states, weights)
+                if (
+                    known is None
+                    or known.setting != setting
+                    or not (torch.equal(known.states, states) and torch.equal(known.weights, weights))
+                ):
+                    known = _Remembered(setting, states.clone(), weights.clone())
                     while len(self._banks) >= KINDS:
                         del self._banks[next(iter(self._banks))]
                 self._banks[kind] = known
-            psfs = known.psfs(tuple(defocus), build)  # other kinds need not wait for it
-            return PSFBank(psfs, psfs.new_tensor(tuple(defocus)), psfs.sum((2, 3)))
+            with known.lock:  # other kinds need not wait for it
+                if stray_light is not None and known.last is not None and known.last[0] == (defocus, stray_light):
+                    return known.last[1]
+                missing = tuple(psi for psi in defocus if psi not in known.psfs)
+                if missing:
+                    known.psfs.update(zip(missing, build(missing).psfs, strict=True))
+                psfs = torch.stack([known.psfs[psi] for psi in defocus])
+                bank = PSFBank(psfs, psfs.new_tensor(defocus), psfs.sum((2, 3)))
+                if stray_light is not None:
+                    bank = bank.with_stray_light(*stray_light)
+                    known.last = (defocus, stray_light), bank
+                return bank
 
 
-class _Remembered:
-    def __init__(self, setting: tuple[object, ...], states: Tensor, weights: Tensor) -> None:
-        self._lock = SharedLock()
-        self._setting, self._states, self._weights = setting, states.clone(), weights.clone()
-        self._psfs: dict[float, Tensor] = {}
+def plain_attributes(*parts: nn.Module) -> list[Any]:
+    """Return the attributes of modules and their submodules but parameters, buffers and hooks, to compare by equality.
 
-    def holds_for(self, setting: tuple[object, ...], states: Tensor, weights: Tensor) -> bool:
-        same = self._setting == setting
-        return same and torch.equal(self._states, states) and torch.equal(self._weights, weights)
-
-    def psfs(self, defocus: tuple[float, ...], build: Callable[[tuple[float, ...]], PSFBank]) -> Tensor:
-        with self._lock:
-            missing = tuple(psi for psi in defocus if psi not in self._psfs)
-            if missing:
-                self._psfs.update(zip(missing, build(missing).psfs, strict=True))
-            return torch.stack([self._psfs[psi] for psi in defocus])
+    Example:
+        >>> from kornia_tidy.modulator.modulator import DwellTimes
+        >>> plain_attributes(DwellTimes((3, 1)))
+        ['shares', (0.75, 0.25)]
+    """
+    found: list[Any] = []
+    for part in parts:
+        for module in part.modules():
+            for name, value in vars(module).items():
+                if name not in _OF_EVERY_MODULE:
+                    # Containers are compared by their present values.
+                    found += name, value.tolist() if hasattr(value, "tolist") else value
+                    if isinstance(value, (list, dict, set)):
+                        found[-1] = repr(value)
+    return found

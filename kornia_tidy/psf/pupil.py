@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+
+from kornia_tidy.masks.base import MASK_SPAN
+from kornia_tidy.optics.aperture import circular_aperture
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,31 @@ class Pupil:
         object.__setattr__(self, "light", float(self.amplitude.double().square().sum()) * self.cell_pitch**2)
         object.__setattr__(self, "extent", (float(cells.abs().max()) + 0.5) * self.cell_pitch)
         object.__setattr__(self, "max_rho2", float(cells.square().sum(1).max()) * self.cell_pitch**2)
+
+
+def pupil_over(mask_shape: Sequence[int], aperture: Tensor | None, fill_factor: float) -> Pupil:
+    """Return the pupil over the pixels of a mask.
+
+    Args:
+        mask_shape: pixels of the masks; the shorter of the last two sides spans the pupil.
+        aperture: amplitude over these pixels, or finer by a whole factor. Default: the binary disc.
+        fill_factor: share of the area of each mask pixel that modulates.
+
+    Raises:
+        ValueError: if the aperture is not finer by a whole factor.
+
+    Example:
+        >>> pupil_over((5, 23, 31), None, 1.0).amplitude.shape
+        torch.Size([23, 23])
+    """
+    size = min(mask_shape[-2:])
+    amplitude = circular_aperture(size, MASK_SPAN / size) if aperture is None else aperture
+    if amplitude.shape[-1] % size:
+        raise ValueError(
+            f"aperture must have a whole number of cells for each of the {size} mask pixels, got "
+            f"{tuple(amplitude.shape)}"
+        )
+    return Pupil(amplitude, MASK_SPAN / amplitude.shape[-1], fill_factor)
 
 
 def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Fewer wavelengths: a spectrum of a few that stands for one of many."""
+"""Spectral binning: a few wavelengths in the place of many."""
 
 from __future__ import annotations
 

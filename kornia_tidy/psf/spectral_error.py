@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 
 from kornia_tidy.optics.spectrum import Spectrum
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 
 
 @torch.no_grad()
-def spectral_error(lens: CodedLens, few: Spectrum, many: Spectrum, defocus: Sequence[float] | None = None) -> float:
+def spectral_error(lens: PSFModel, few: Spectrum, many: Spectrum, defocus: Sequence[float] | None = None) -> float:
     """Return how far a lens's PSFs of some wavelengths are from those of many more.
 
     Args:
@@ -28,14 +28,14 @@ def spectral_error(lens: CodedLens, few: Spectrum, many: Spectrum, defocus: Sequ
     Example:
         >>> from kornia_tidy import PixelwiseMask
         >>> from kornia_tidy.optics.spectrum import camera_spectrum
-        >>> lens = CodedLens(PixelwiseMask(1, initial="flat"))
+        >>> lens = PSFModel(PixelwiseMask(1, initial="flat"))
         >>> few, some, many = (camera_spectrum(samples=n) for n in (2, 6, 18))
         >>> spectral_error(lens, some, many, [-20.0, 0.0]) < spectral_error(lens, few, many, [-20.0, 0.0])
         True
     """
     banks = []
     for spectrum in (few, many):
-        other = lens.with_fidelity(lens.fidelity.replace(window=lens.window))
-        other.spectrum = spectrum
+        fidelity = lens.fidelity.replace(window=lens.window)
+        other = lens.replace(spectrum=spectrum, fidelity=fidelity)
         banks.append(other.psf_bank(defocus=defocus).psfs)
     return float((banks[0] - banks[1]).abs().sum((2, 3)).mean())

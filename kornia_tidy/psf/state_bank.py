@@ -1,4 +1,4 @@
-"""The PSFs of each state of an exposure: for what is not linear in the PSF, where their average does not do."""
+"""The PSFs of each state of an exposure, for renderers that are not linear in the PSF, such as occlusion."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class StateBank:
 
     @classmethod
     def of(cls, banks: Sequence[PSFBank], weights: Tensor) -> Self:
-        """Return the bank of states whose PSFs are known at the same defocus."""
+        """Return the bank of several states with PSFs at the same defocus."""
         veils = [bank.veil for bank in banks if bank.veil is not None]
         return cls(
             torch.stack([bank.psfs for bank in banks]),

@@ -38,7 +38,7 @@ class ReconstructionHead(nn.Module, ABC):
     """
 
     stride: int
-    _looked = False
+    looked = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -53,8 +53,8 @@ class ReconstructionHead(nn.Module, ABC):
         if image.shape[1] != self.in_channels:
             remedy = layout_remedy(tuple(image.shape), self.in_channels)
             raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}{remedy}")
-        if not self._looked and not is_value_unknown():
-            self._looked = True  # for the first image only, as the check waits for the device
+        if not self.looked and not is_value_unknown():
+            self.looked = True  # for the first image only, as the check waits for the device
             if (said := check_head_image(image)) is not None:
                 warnings.warn(said, stacklevel=4)
         height, width = image.shape[-2:]

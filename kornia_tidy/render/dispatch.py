@@ -144,8 +144,9 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return BACKENDS[method]
     key = _fingerprint(scene)
-    if key in _choices and refusal(_choices[key][0], scene) is None:
-        best, grids = _choices[key]
+    known = None if key is None else _choices.get(key)  # another thread may empty the memory meanwhile
+    if known is not None and refusal(known[0], scene) is None:
+        best, grids = known
         scene.grids.update(grids)
         return best
     able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]

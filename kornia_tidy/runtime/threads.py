@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Hashable, Iterable
-from typing import Any, Self
+from typing import Any
+from weakref import WeakSet
 
 from torch import Tensor
 
+_RLock: Any = type(threading.RLock())  # a lock in C, of which the typing stubs say that it cannot be inherited from
 
-class SharedLock:
+
+class SharedLock(_RLock):
     """A re-entrant lock for objects that are copied, pickled and carried into forked processes.
 
     A copy has a new lock. So has a forked child, since the thread that held the lock does not exist there.
@@ -23,20 +26,24 @@ class SharedLock:
     """
 
     def __init__(self) -> None:
-        self._lock, self._process = threading.RLock(), os.getpid()
-
-    def __enter__(self) -> Self:
-        if self._process != os.getpid():
-            self._lock, self._process = threading.RLock(), os.getpid()
-        self._lock.acquire()
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._lock.release()
+        super().__init__()
+        _LOCKS.add(self)
 
     def __reduce__(self) -> tuple[type[SharedLock], tuple[()]]:
         """Copy and pickle as a new, open lock."""
         return SharedLock, ()
+
+
+_LOCKS: WeakSet[SharedLock] = WeakSet()
+
+
+def _open_locks() -> None:
+    for lock in _LOCKS:
+        lock._at_fork_reinit()  # as threading does with its own
+
+
+if hasattr(os, "register_at_fork"):  # Windows has no fork
+    os.register_at_fork(after_in_child=_open_locks)
 
 
 class CaptureNotes:
@@ -53,7 +60,8 @@ class CaptureNotes:
 
     def __init__(self, told: Iterable[Hashable] = ()) -> None:
         self._told: dict[Hashable, object] = dict.fromkeys(told)
-        self._of_thread = threading.local()
+        self.of_thread = threading.local()
+        """Of the calling thread: ``clamped``, the number of clamped pixels in its last capture."""
 
     def first_time(self, warning: Hashable) -> bool:
         """Return True the first time that a warning is requested, in any thread."""
@@ -65,13 +73,9 @@ class CaptureNotes:
         return warning in self._told
 
     @property
-    def clamped(self) -> Tensor | None:
-        """Number of clamped pixels in the last capture that this thread took, None before the first."""
-        return getattr(self._of_thread, "clamped", None)
-
-    @clamped.setter
-    def clamped(self, count: Tensor | None) -> None:
-        self._of_thread.clamped = count
+    def clamped(self) -> Tensor | int:
+        """Number of clamped pixels in the last capture that this thread took, 0 before the first."""
+        return getattr(self.of_thread, "clamped", 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle with the warnings already given, without the captures."""

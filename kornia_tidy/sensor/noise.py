@@ -155,11 +155,11 @@ class SensorNoise(nn.Module):
         check_float_tensor("image", image, 4, "(B, C, H, W)")
         value = image.to(torch.promote_types(image.dtype, torch.float32))
         if params is None:
-            params = self.draw(image.shape, device=image.device, generator=generator, dtype=value.dtype)
+            fields = self.draw(image.shape, device=image.device, generator=generator, dtype=value.dtype)
         elif generator is not None:
             raise ValueError("give params to replay or generator to draw, got both")
-        fields = {name: self._field(params, name, value) for name in self._field_names()}
-
+        else:
+            fields = {name: self._field(params, name, value) for name in self._field_names()}
         if self.full_well is not None:
             electrons = shot_noise(value.clamp(min=0) * self.full_well + self.dark, fields["shot"])
             if self.clip:
@@ -204,16 +204,22 @@ class SensorNoise(nn.Module):
             ['read', 'shot']
         """
         check_choice("dtype", dtype, (torch.float32, torch.float64))
-        check_generator(generator)
+        if generator is not None:
+            check_generator(generator)
         source = device if generator is None else generator.device
-        samplers = {"read": torch.randn, "shot": torch.rand}
+        samplers = {"read": torch.randn} if self.sigma > 0 else {}
+        if self.full_well is not None:
+            samplers["shot"] = torch.rand
         *outer, height, width = shape
-        strips: dict[str, list[Tensor]] = {name: [] for name in self._field_names()}
+        fields: dict[str, Tensor] = {}
         for top in range(0, max(height, 1), STRIP):
             part = (*outer, min(STRIP, height - top), width)
-            for name, fields in strips.items():
-                fields.append(samplers[name](part, generator=generator, device=source, dtype=dtype).to(device))
-        return {name: torch.cat(fields, dim=-2) for name, fields in strips.items()}
+            for name, sampler in samplers.items():
+                drawn = sampler(part, generator=generator, device=source, dtype=dtype)
+                if name not in fields:
+                    fields[name] = drawn.new_empty(*shape, device=device)
+                fields[name][..., top : top + STRIP, :] = drawn.to(device)
+        return fields
 
     def _field_names(self) -> list[str]:
         return ["read"] * (self.sigma > 0) + ["shot"] * (self.full_well is not None)

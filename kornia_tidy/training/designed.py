@@ -5,15 +5,15 @@ from __future__ import annotations
 from torch import Tensor
 from tqdm import tqdm
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.mask_design.objectives import design, restoration_error
-from kornia_tidy.psf.psf_model import CodedLens
 
 LEAST_SIGMA = 1e-3  # in units of full scale; without noise every blur can be inverted
 SCENE_SPREAD = 0.2  # standard deviation of a scene's light, in units of full scale
 LR_METRES = 8e-8  # restoration error of five masks after 120 steps is within 0.2 % of that after 200
 
 
-def design_masks(lens: CodedLens, steps: int, sigma: float = 0.01, *, progress: bool = False) -> list[float]:
+def design_masks(lens: TiDyOptics, steps: int, sigma: float = 0.01, *, progress: bool = False) -> list[float]:
     """Optimise a camera's masks in place for extended depth of field, by the error of the best linear restoration.
 
     End-to-end training then starts from these masks. A short training moves masks little: random masks trained for 640

@@ -128,7 +128,9 @@ def learning_rows(image: Tensor, psi: Tensor) -> Iterator[Row]:
 
     def loop_step() -> Tensor:
         # The mean of unscaled PSFs, scaled by the light of the mean: what one exposure records.
-        banks = [single._computed_bank(single.spectrum, torch.float32, single.defocus_nodes) for single in singles]
+        banks = [
+            single.psf_model._computed_bank(single.spectrum, torch.float32, single.defocus_nodes) for single in singles
+        ]
         held = torch.stack([bank.energy for bank in banks]).mean(0)[..., None, None]
         states = torch.stack([bank.psfs / held for bank in banks])
         for single in singles:
@@ -219,7 +221,7 @@ def fresh(image: Tensor, disparity: Tensor, *cameras: TiDyOptics) -> dict[str, C
     """Captures that compute their PSFs anew."""
 
     def capture(optics: TiDyOptics) -> Tensor:
-        optics._memories.clear()
+        optics.psf_model._memories.clear()
         return optics(image, disparity)
 
     return {str(number): lambda o=optics: capture(o) for number, optics in enumerate(cameras)}

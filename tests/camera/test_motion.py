@@ -12,6 +12,7 @@ from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask
 from kornia_tidy.camera.motion import moving_capture, scenes_by_flow, scenes_by_homography, state_times
 from kornia_tidy.modulator.modulator import SpatialLightModulator
 from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=10.0, stray_light="discard")
@@ -177,8 +178,8 @@ class TestMovingCapture(BaseTester):
     def test_feature_psfs_are_computed_once_for_scenes_that_follow(self, monkeypatch):
         optics, (image, depth) = camera(), scene(torch.float32)
         built = []
-        build = TiDyOptics._build
-        monkeypatch.setattr(TiDyOptics, "_build", lambda self, *a: built.append(1) or build(self, *a))
+        build = PSFModel._build
+        monkeypatch.setattr(PSFModel, "_build", lambda self, *a: built.append(1) or build(self, *a))
         with torch.no_grad():
             for _ in range(3):
                 moving_capture(optics, *at_rest(optics, image, depth))

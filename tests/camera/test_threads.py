@@ -18,7 +18,8 @@ from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNois
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.psf import psf_model as module
+from kornia_tidy.psf import scene_psfs as module
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.runtime.threads import CaptureNotes, SharedLock
 from tests.base import BaseTester
 
@@ -172,13 +173,13 @@ class TestThreads(BaseTester):
         for wavelength in range(460, 640, 20):
             optics.spectrum = module.Spectrum.monochrome(wavelength * 1e-9)
             optics(*SAMPLES[2])
-        (memory,) = optics._memories.values()
+        (memory,) = optics.psf_model._memories.values()
         assert len(memory._banks) == 4
 
     def test_feature_the_window_is_measured_once_and_by_all_alike(self, monkeypatch):
         optics = TiDyOptics(PixelwiseMask(2), sensor=None, fidelity="draft")
-        expected, fitted, real = optics.window, [], TiDyOptics._fitted_window
-        monkeypatch.setattr(TiDyOptics, "_fitted_window", lambda self: fitted.append(1) or real(self))
+        expected, fitted, real = optics.window, [], PSFModel._fitted_window
+        monkeypatch.setattr(PSFModel, "_fitted_window", lambda self: fitted.append(1) or real(self))
         optics.camera = optics.camera  # to be measured anew
         image, depth = torch.rand(1, 3, 48, 48), torch.ones(1, 1, 48, 48)
         sides = in_threads(lambda i: (optics(image, depth) is None, optics.window)[1])
@@ -244,11 +245,11 @@ class TestThreads(BaseTester):
                 return burst(optics, image, depth)
             return moving_capture(optics, torch.stack([image] * 2, 1), torch.stack([depth] * 2, 1))
 
-        optics, real = camera(), TiDyOptics._expose
+        optics, real = camera(), TiDyOptics.render
         with torch.no_grad():
             expected = take()
             monkeypatch.setattr(
-                TiDyOptics, "_expose", lambda self, *given: (real(self, *given), optics.masks.phase.add_(1))[0]
+                TiDyOptics, "render", lambda self, *given: (real(self, *given), optics.masks.phase.add_(1))[0]
             )
             assert torch.equal(take(), expected)
             assert not torch.equal(take(), expected)
@@ -289,10 +290,11 @@ class TestParts(BaseTester):
 
     def test_feature_notes_travel_without_captures(self):
         notes = CaptureNotes()
-        notes.clamped = torch.tensor(3)
+        notes.of_thread.clamped = torch.tensor(3)
+        assert int(notes.clamped) == 3
         assert notes.first_time("a")
         twin = copy.deepcopy(notes)
-        assert twin.clamped is None
+        assert twin.clamped == 0
         assert twin.is_told("a")
         assert twin.first_time("b")
         assert not notes.is_told("b")

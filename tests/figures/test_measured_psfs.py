@@ -7,7 +7,7 @@ from kornia_tidy import PSFBank
 from kornia_tidy.calibration.psf import MeasuredPSFs, PointReport
 from kornia_tidy.calibration.psf.phase_retrieval import MaskFit
 from kornia_tidy.figures.measured_psfs import draw_measured
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 
@@ -20,7 +20,7 @@ class TestDrawMeasured(BaseTester):
             bank, 0.01 * torch.rand(3, channels, 9, 9), torch.tensor([2.0, 1.0, 0.5]), (report,) * 6
         )
         fit = (
-            MaskFit(CodedLens(), 0.0, torch.zeros(3, 2), bank.psfs, torch.full((3, channels), 0.02)) if fitted else None
+            MaskFit(PSFModel(), 0.0, torch.zeros(3, 2), bank.psfs, torch.full((3, channels), 0.02)) if fitted else None
         )
         figure = draw_measured(measured, fit)
         assert sum(bool(axes.get_images()) for axes in figure.findobj(lambda x: hasattr(x, "get_images"))) == (

@@ -23,7 +23,7 @@ from kornia_tidy.masks.initial_heights import fisher_mask
 from kornia_tidy.modulator import DwellTimes
 from kornia_tidy.optics import ThinLensCamera, circular_aperture
 from kornia_tidy.optics.materials import PMMA
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester, shared
 
 APERTURE = circular_aperture(23)
@@ -150,7 +150,7 @@ class TestDefocusResponse(BaseTester):
     def test_feature_is_the_bank_and_its_derivative(self, case):
         """Against the PSF bank and its central differences over defocus, which are exact to second order."""
         masks, parts = LENSES[case]()
-        lens = CodedLens(masks, fidelity=FINE, **parts)
+        lens = PSFModel(masks, fidelity=FINE, **parts)
         nodes, h = [-17.0, 0.0, 3.0], 1e-4
         psfs, derivatives = defocus_response(lens, nodes)
         with torch.no_grad():
@@ -162,13 +162,13 @@ class TestDefocusResponse(BaseTester):
     @pytest.mark.parametrize("axis", [1, 2])
     def test_feature_derivatives_of_position_are_those_of_a_tilted_wave(self, axis):
         """A tilt on fine mask pixels shifts the PSF; `pixel` cycles per pupil radius shift it by one sensor pixel."""
-        lens = CodedLens(PixelwiseMask(1, size=115, initial="flat"), fidelity=FINE, spectrum=Spectrum.monochrome())
+        lens = PSFModel(PixelwiseMask(1, size=115, initial="flat"), fidelity=FINE, spectrum=Spectrum.monochrome())
         camera, h = lens.camera, 1e-3
         pixel = camera.pixel_pitch * camera.aperture_radius / camera.image_distance / 530e-9
         x = (torch.arange(115, dtype=torch.float64) - 57) * 0.02
         tilt = 2 * math.pi * pixel * h * (x if axis == 1 else x[:, None]).expand(115, 115)
         moved = [
-            CodedLens(
+            PSFModel(
                 PixelwiseMask(initial=sign * tilt * (530e-9 / math.pi)).double(),
                 fidelity=FINE,
                 spectrum=Spectrum.monochrome(),
@@ -183,7 +183,7 @@ class TestDefocusResponse(BaseTester):
         )
 
     def test_feature_a_learnable_focus_and_default_nodes(self):
-        lens = CodedLens(PixelwiseMask(1), ThinLensCamera(focus_distance=torch.tensor(0.595)), fidelity="draft")
+        lens = PSFModel(PixelwiseMask(1), ThinLensCamera(focus_distance=torch.tensor(0.595)), fidelity="draft")
         psfs, derivatives = defocus_response(lens)
         assert psfs.shape == (len(lens.defocus_nodes), 3, lens.window, lens.window)
         assert derivatives.shape == (3, *psfs.shape)
@@ -199,7 +199,7 @@ class TestFisherInformation(BaseTester):
         self.assert_close(information, torch.full((1, 3, 3), 50 * 0.09 / 0.16).double())
 
     def test_feature_channels_add_up(self):
-        lens = CodedLens(PixelwiseMask(1), fidelity="draft")
+        lens = PSFModel(PixelwiseMask(1), fidelity="draft")
         both = defocus_response(lens, [5.0])
         parts = [PointResponse(both.psfs[:, [c]], both.derivatives[:, :, [c]]) for c in range(3)]
         self.assert_close(fisher_information(both), sum(fisher_information(part) for part in parts))
@@ -237,7 +237,7 @@ class TestDefocusBound(BaseTester):
 class TestCRLB(BaseTester):
     def test_feature_is_the_scatter_of_the_score_of_simulated_photons(self):
         """Fisher information is the variance of the log-likelihood's derivative, here over simulated photon counts."""
-        lens = CodedLens(PixelwiseMask(1), fidelity=Fidelity(window=33, stray_light="discard"))
+        lens = PSFModel(PixelwiseMask(1), fidelity=Fidelity(window=33, stray_light="discard"))
         with torch.no_grad():
             psfs = lens.psf_bank(defocus=[4.99, 5.0, 5.01], dtype=torch.float64).psfs
             bound = float(crlb(lens, [5.0], known_position=True))
@@ -248,7 +248,7 @@ class TestCRLB(BaseTester):
 
     def test_smoke_any_mask_has_a_bound_in_double_precision(self, device, dtype):
         masks = PixelwiseMask(2).to(device, dtype)
-        bound = crlb(CodedLens(masks, fidelity="draft").to(device), [-5.0, 5.0])
+        bound = crlb(PSFModel(masks.to(device), fidelity="draft"), [-5.0, 5.0])
         assert (bound.dtype, bound.device.type, bound.shape) == (torch.float64, device.type, (2,))
         bound.sum().backward()
         (gradient,) = (p.grad for p in masks.parameters())
@@ -260,14 +260,14 @@ class TestCRLB(BaseTester):
     @pytest.mark.parametrize("kind", ["flat", "cubic"])
     def test_feature_symmetric_images_tell_nothing_in_focus(self, kind):
         masks = PixelwiseMask(1, initial="flat") if kind == "flat" else CubicMask(15.0)
-        bound = crlb(CodedLens(masks, fidelity="draft"), [-1.0, 0.0, 1.0])
+        bound = crlb(PSFModel(masks, fidelity="draft"), [-1.0, 0.0, 1.0])
         assert bound[1] == math.inf
         self.assert_close(bound[0], bound[2])
         bound[[0, 2]].sum().backward()
         assert all(bool(p.grad.isfinite().all()) for p in masks.parameters())
 
     def test_feature_the_bound_of_one_node_does_not_know_the_others(self):
-        lens = CodedLens(PixelwiseMask(1), fidelity="draft")
+        lens = PSFModel(PixelwiseMask(1), fidelity="draft")
         self.assert_close(crlb(lens, [-3.0, 7.0])[1:], crlb(lens, [7.0]))
 
     def test_feature_matches_the_sampled_setting_on_the_same_pixels(self):
@@ -277,7 +277,7 @@ class TestCRLB(BaseTester):
         camera = DefocusRange(-10, 10, ThinLensCamera(pixel_pitch=pitch))
         fidelity = Fidelity("as sampled", pixel_tolerance=1e-3, window=65, stray_light="discard")
         heights = smooth_mask() * (530e-9 / math.pi)
-        lens = CodedLens(PixelwiseMask(initial=heights), camera, fidelity=fidelity, spectrum=Spectrum.monochrome())
+        lens = PSFModel(PixelwiseMask(initial=heights), camera, fidelity=fidelity, spectrum=Spectrum.monochrome())
         nodes = [-8.0, 0.0, 8.0]
         sampled = defocus_bound(fisher_information(sampled_response(smooth_mask(), APERTURE, nodes)))
         ratio = crlb(lens, nodes).detach() / sampled
@@ -286,25 +286,25 @@ class TestCRLB(BaseTester):
     def test_feature_an_average_tells_at_most_what_its_masks_tell_on_average(self):
         """Fisher information is convex in the expected image, so averaging PSFs cannot increase it."""
         masks = PixelwiseMask(3).double()
-        together = crlb(CodedLens(masks, fidelity=FINE), [-6.0, 6.0], known_position=True)
-        lenses = [CodedLens(PixelwiseMask(initial=h).double(), fidelity=FINE) for h in masks.heights().detach()]
+        together = crlb(PSFModel(masks, fidelity=FINE), [-6.0, 6.0], known_position=True)
+        lenses = [PSFModel(PixelwiseMask(initial=h).double(), fidelity=FINE) for h in masks.heights().detach()]
         alone = torch.stack([crlb(lens, [-6.0, 6.0], known_position=True) for lens in lenses])
         assert bool((together > alone.square().reciprocal().mean(0).rsqrt()).all())
 
     def test_feature_the_spiral_tells_defocus_alike_at_all_depths(self):
         """A rotating PSF changes equally fast at every depth; a plain lens has no information in focus."""
         mask = SpiralMask(1, size=92, num_zones=3, initial="rotating")
-        lens = CodedLens(mask, DefocusRange(-10, 10), fidelity=FINE, spectrum=Spectrum.monochrome())
+        lens = PSFModel(mask, DefocusRange(-10, 10), fidelity=FINE, spectrum=Spectrum.monochrome())
         bound = crlb(lens, np.linspace(-8, 8, 9)).detach()
         assert bound.max() / bound.min() < 1.15
-        flat = CodedLens(PixelwiseMask(1, initial="flat"), fidelity=FINE, spectrum=Spectrum.monochrome())
+        flat = PSFModel(PixelwiseMask(1, initial="flat"), fidelity=FINE, spectrum=Spectrum.monochrome())
         assert crlb(flat, [-0.5]) > 1.5 * bound.max()
 
     def test_gradcheck(self):
         settings = FINE.replace(window=9)
 
         def bound(phase):
-            lens = CodedLens(GivenPhase(phase), fidelity=settings, spectrum=Spectrum.monochrome())
+            lens = PSFModel(GivenPhase(phase), fidelity=settings, spectrum=Spectrum.monochrome())
             return crlb(lens, [-4.0, 2.0])
 
         self.gradcheck(bound, (torch.cat([smooth_mask(1), smooth_mask(2)]),))

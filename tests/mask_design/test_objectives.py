@@ -12,14 +12,14 @@ from kornia_tidy.mask_design.objectives import design, design_fisher_mask, point
 from kornia_tidy.masks import CubicMask
 from kornia_tidy.masks.initial_heights import fisher_mask
 from kornia_tidy.psf import PSFBank
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 COARSE = Fidelity("coarse", pixel_tolerance=0.1, window=33, stray_light="discard")
 
 
 def lens_with(masks, limit=10.0):
-    return CodedLens(masks, DefocusRange(-limit, limit), fidelity=COARSE, spectrum=Spectrum.monochrome())
+    return PSFModel(masks, DefocusRange(-limit, limit), fidelity=COARSE, spectrum=Spectrum.monochrome())
 
 
 def bank_of(*psfs):
@@ -50,7 +50,7 @@ class TestDesign(BaseTester):
     def test_feature_the_bound_of_a_lens_falls(self):
         """The design works for two masks in three colours too, not only for one mask in the published setting."""
         masks = PixelwiseMask(2)
-        lens = CodedLens(masks, DefocusRange(-10, 10), fidelity=COARSE.replace(window=17, layer_spacing=5.0))
+        lens = PSFModel(masks, DefocusRange(-10, 10), fidelity=COARSE.replace(window=17, layer_spacing=5.0))
         history = design(masks, lambda: crlb(lens).mean(), iterations=15, lr_metres=3e-8)
         assert history[-1] < 0.8 * history[0]
 
@@ -100,7 +100,7 @@ class TestFisherDesign(BaseTester):
     def test_feature_is_better_than_defocus_alone(self):
         """A plain lens focused outside the range has information at every depth in it, but its PSFs are large."""
         nodes, wide = np.linspace(-10, 10, 11), COARSE.replace(window=65)
-        plain = CodedLens(PixelwiseMask(1, initial="flat"), fidelity=wide, spectrum=Spectrum.monochrome())
+        plain = PSFModel(PixelwiseMask(1, initial="flat"), fidelity=wide, spectrum=Spectrum.monochrome())
         ours = crlb(lens_with(PixelwiseMask(initial=fisher_mask())), nodes).detach().mean()
         for beside in (11, 12, 15):
             assert ours < 0.7 * crlb(plain, nodes + beside).detach().mean()

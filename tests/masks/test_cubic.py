@@ -12,6 +12,14 @@ from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.pupil import Pupil
 from tests.base import BaseTester
 
+TWO_MASKS = {"cubic": lambda **o: CubicMask([4.0, -3.0], **o)}
+ONE_MASK = {
+    "weak cubic": lambda g: CubicMask(5.0),
+    "cubic": lambda g: CubicMask(),
+    "strong cubic": lambda g: CubicMask(80.0),
+}
+OVER_PUPIL = True
+
 
 class TestCubicMask(BaseTester):
     def test_feature_modulation_is_that_of_dowski_and_cathey_whatever_the_defocus(self):

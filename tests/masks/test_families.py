@@ -11,24 +11,18 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import Fidelity, ThinLensCamera, TiDyOptics
-from kornia_tidy.masks import CubicMask, FourierMask, PhaseMasks, PixelwiseMask, RadialMask, SpiralMask, ZernikeMask
+from kornia_tidy import masks as package
+from kornia_tidy.masks import PhaseMasks
 from kornia_tidy.masks.limits import CONSTRAINTS
 from kornia_tidy.optics import PMMA, Spectrum, circular_aperture, constant_index
 from kornia_tidy.psf import Pupil, exact_psf_bank
 from tests.base import BaseTester
+from tests.masks.registry import ONE_MASK, OVER_PUPIL, TWO_MASKS
 
-FAMILIES = {
-    "pixelwise": lambda **o: PixelwiseMask(2, **o),
-    "Zernike": lambda **o: ZernikeMask(2, num_modes=15, **o),
-    "radial": lambda **o: RadialMask(2, **o),
-    "spiral": lambda **o: SpiralMask(2, num_zones=3, **{"size": 23, **o}),
-    "Fourier": lambda **o: FourierMask(2, max_frequency=3, **o),
-    "cubic": lambda **o: CubicMask([4.0, -3.0], **o),
-}
 FIDELITY = Fidelity(window=9, layer_spacing=20.0)
 
 
-@pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES.keys())
+@pytest.mark.parametrize("family", TWO_MASKS.values(), ids=TWO_MASKS.keys())
 class TestEveryFamily(BaseTester):
     @pytest.mark.parametrize("size", [23, 24, (23, 41), (40, 24)])
     def test_cardinality(self, family, size):
@@ -119,11 +113,22 @@ class TestEveryFamily(BaseTester):
         assert torch.equal(compiled(), masks.heights() * 1e6)
 
 
-@pytest.mark.parametrize("name", ["Zernike", "radial", "spiral", "cubic"])  # defined on the pupil
+@pytest.mark.parametrize("name", OVER_PUPIL)
 @pytest.mark.parametrize("size", [(23, 41), (41, 23)])
 class TestLongerMasks(BaseTester):
     def test_feature_a_longer_side_changes_nothing_over_the_pupil(self, name, size):
-        square, longer = FAMILIES[name](), FAMILIES[name](size=size)
+        square, longer = TWO_MASKS[name](), TWO_MASKS[name](size=size)
         longer.load_state_dict(square.state_dict())
         one, two = (TiDyOptics(masks, fidelity=FIDELITY).psf_bank().psfs for masks in (square, longer))
         self.assert_close(one, two)
+
+
+class TestRegistry(BaseTester):
+    def test_feature_every_family_is_in_it(self):
+        """A test file that names no masks would leave its family out of the tests above."""
+        kinds = [kind for kind in vars(package).values() if isinstance(kind, type)]
+        families = {kind for kind in kinds if issubclass(kind, PhaseMasks) and kind is not PhaseMasks}
+        single = [make(torch.Generator().manual_seed(0)) for make in ONE_MASK.values()]
+        assert {type(masks) for masks in single} == families
+        learning = {type(masks) for masks in single if list(masks.parameters())}
+        assert {type(make()) for make in TWO_MASKS.values()} == learning

@@ -6,6 +6,13 @@ import torch
 
 from kornia_tidy.masks.fourier import FourierMask
 from tests.base import BaseTester
+from tests.masks.strong import strong
+
+TWO_MASKS = {"Fourier": lambda **o: FourierMask(2, max_frequency=3, **o)}
+ONE_MASK = {
+    "Fourier": lambda g: FourierMask(1, generator=g),
+    "strong Fourier": lambda g: strong(FourierMask(1, generator=g), 4),
+}
 
 
 class TestFourierMask(BaseTester):

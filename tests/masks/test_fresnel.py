@@ -8,6 +8,8 @@ from kornia_tidy.masks.base import mask_coordinates
 from kornia_tidy.masks.fresnel import FresnelLens
 from tests.base import BaseTester
 
+ONE_MASK = {"Fresnel": lambda g: FresnelLens(), "strong Fresnel": lambda g: FresnelLens(40.0)}
+
 
 class TestFresnelLens(BaseTester):
     def test_feature_equals_defocus_up_to_whole_waves(self):

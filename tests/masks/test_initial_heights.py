@@ -6,7 +6,7 @@ import torch
 from kornia_tidy import PixelwiseMask
 from kornia_tidy.mask_design.objectives import design_fisher_mask
 from kornia_tidy.masks.initial_heights import CLEAN, STARTS, SWEEP, fisher_mask, initial_heights
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 
@@ -73,7 +73,7 @@ class TestInitialHeights(BaseTester):
         depths = torch.arange(-20.0, 21.0).tolist()
         sharpest = []
         for heights in drawn("focal sweep"):
-            psfs = CodedLens(PixelwiseMask(initial=heights[None])).psf_bank(1, defocus=depths).psfs
+            psfs = PSFModel(PixelwiseMask(initial=heights[None])).psf_bank(1, defocus=depths).psfs
             sharpest.append(depths[int(psfs.amax((1, 2, 3)).argmax())])
         self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; the noise shifts them
 

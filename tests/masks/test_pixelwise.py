@@ -7,8 +7,15 @@ import torch
 
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.materials import FUSED_SILICA, constant_index
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
+
+TWO_MASKS = {"pixelwise": lambda **o: PixelwiseMask(2, **o)}
+ONE_MASK = {
+    "flat": lambda g: PixelwiseMask(1, initial="flat"),
+    "random": lambda g: PixelwiseMask(1, generator=g),
+    "random, 3 um": lambda g: PixelwiseMask(initial=3e-6 * torch.rand(1, 23, 23, generator=g)),
+}
 
 
 class TestPixelwiseMask(BaseTester):
@@ -55,7 +62,7 @@ class TestPixelwiseMask(BaseTester):
         heights = torch.rand(2, 23, 23) * 1e-6
         wide = torch.rand(2, 23, 41) * 1e-6
         wide[..., 9:32] = heights
-        banks = [CodedLens(PixelwiseMask(initial=h)).psf_bank(defocus=[-3.0]) for h in (heights, wide, wide.mT)]
+        banks = [PSFModel(PixelwiseMask(initial=h)).psf_bank(defocus=[-3.0]) for h in (heights, wide, wide.mT)]
         self.assert_close(banks[1].psfs, banks[0].psfs, rtol=0, atol=1e-7)
         self.assert_close(banks[2].psfs, banks[0].psfs.mT, rtol=0, atol=1e-5)
 

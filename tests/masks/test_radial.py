@@ -8,6 +8,14 @@ from scipy.ndimage import rotate
 from kornia_tidy.masks.base import mask_axes
 from kornia_tidy.masks.radial import RadialMask
 from tests.base import BaseTester
+from tests.masks.strong import strong
+
+TWO_MASKS = {"radial": lambda **o: RadialMask(2, **o)}
+ONE_MASK = {
+    "radial": lambda g: RadialMask(1, generator=g),
+    "strong radial": lambda g: strong(RadialMask(1, generator=g), 4),
+}
+OVER_PUPIL = True
 
 
 class TestRadialMask(BaseTester):

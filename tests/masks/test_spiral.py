@@ -14,6 +14,10 @@ from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.pupil import Pupil
 from tests.base import BaseTester
 
+TWO_MASKS = {"spiral": lambda **o: SpiralMask(2, num_zones=3, **{"size": 23, **o})}
+ONE_MASK = {"spiral": lambda g: SpiralMask(1, generator=g)}
+OVER_PUPIL = True
+
 
 def turn(before: np.ndarray, after: np.ndarray) -> float:
     """Return the rotation between two PSFs in degrees, from +x towards +y, by the best match of rings."""

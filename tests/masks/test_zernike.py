@@ -12,6 +12,14 @@ from kornia_tidy.masks.base import mask_axes
 from kornia_tidy.masks.zernike import ZernikeMask, zernike_polynomials
 from kornia_tidy.optics.aperture import circular_aperture
 from tests.base import BaseTester
+from tests.masks.strong import strong
+
+TWO_MASKS = {"Zernike": lambda **o: ZernikeMask(2, num_modes=15, **o)}
+ONE_MASK = {
+    "Zernike": lambda g: ZernikeMask(1, generator=g),
+    "strong Zernike": lambda g: strong(ZernikeMask(1, generator=g), 4),
+}
+OVER_PUPIL = True
 
 
 def disc_quadrature(order: int) -> tuple[Tensor, Tensor, Tensor]:

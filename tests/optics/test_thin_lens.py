@@ -10,7 +10,7 @@ from kornia_tidy.masks import PixelwiseMask
 from kornia_tidy.optics.materials import FUSED_SILICA, PMMA
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera, thin_lens_defocus
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 
@@ -169,7 +169,7 @@ class TestSinglet(BaseTester):
         camera = ThinLensCamera(lens_material=PMMA)
         fidelity = Fidelity(window=15, stray_light="discard", double=True)
         masks = PixelwiseMask(1, initial="flat")
-        lens = CodedLens(masks, camera, fidelity=fidelity, spectrum=Spectrum.monochrome(wavelength))
+        lens = PSFModel(masks, camera, fidelity=fidelity, spectrum=Spectrum.monochrome(wavelength))
         nodes = [-8 + 0.5 * i for i in range(33)]
         with torch.no_grad():
             peak = lens.psf_bank(defocus=nodes).psfs[:, 0, 7, 7]
@@ -194,7 +194,7 @@ class TestSinglet(BaseTester):
     def test_feature_swapping_the_lens_is_seen_at_once(self, fidelity):
         """The PSF cache depends on the lens material: with PMMA, red is sharp at its own focus and blue is not."""
         camera = DefocusRange(-10, 10)
-        optics = CodedLens(PixelwiseMask(1, initial="flat"), camera, fidelity=fidelity)
+        optics = PSFModel(PixelwiseMask(1, initial="flat"), camera, fidelity=fidelity)
         with torch.no_grad():
             corrected = optics.psf_bank(defocus=[-1.8]).psfs[0].amax((1, 2))
             camera.lens.lens_material = PMMA

@@ -30,7 +30,8 @@ class Rig:
             self._cameras[key] = deepcopy(self.optics).with_fidelity(fidelity)
         dtype = torch.float64 if fidelity.double else torch.float32
         light, defocus = light.to(dtype), defocus.to(dtype)
-        banks = self._cameras[key]._scene_banks(light.shape[1], defocus)
+        occluding = self.optics.compositing == "occlusion"
+        banks = self._cameras[key].psf_model.scene_banks(light.shape[1], dtype, defocus, occluding)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
         planes = light.repeat(1, banks[0][1].psfs.shape[1] // light.shape[1], 1, 1)  # one for each reflectance, if any
         options = {"layers": layers, "border": self.optics.border}

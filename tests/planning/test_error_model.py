@@ -138,7 +138,7 @@ class TestLayers(BaseTester):
         point[..., 7, 7] = 1
         with torch.no_grad():
             psf = torch.einsum("an,ncpq->acpq", weights, optics.psf_bank(3, torch.float64, tuple(at)).psfs)
-            bank = optics.scene_bank(3, torch.float64, psi)
+            bank = optics.psf_model.scene_bank(3, torch.float64, psi)
             mode = "nearest" if layers == "nearest" else "linear"
             coded = render(point, psi.expand(1, 1, 15, 15), bank, layers=mode, border="zero")
         self.assert_close(coded, psf, atol=1e-12, rtol=0)

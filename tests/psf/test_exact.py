@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.masks import CubicMask, FourierMask, FresnelLens, PhaseMasks, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.materials import FUSED_SILICA
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.propagation import gauss_legendre_order
 from kornia_tidy.psf.pupil import Pupil
 from tests.base import BaseTester, oracle
+from tests.masks.registry import ONE_MASK
 
 
 def brute_force(height: np.ndarray, psi: float, wavelength: float, window: int, step: float, samples: int, sub: int):
@@ -48,39 +48,15 @@ def by_quadrature(phase: np.ndarray, psi: float, wavelength: float, window: int,
     return intensity.reshape(window, 12, window, 12).sum((1, 3))
 
 
-def strong(masks: PhaseMasks, factor: float) -> PhaseMasks:
-    with torch.no_grad():
-        for parameter in masks.parameters():
-            parameter.mul_(factor)
-    return masks
-
-
-FAMILIES = {
-    "flat": lambda g: PixelwiseMask(1, initial="flat"),
-    "random": lambda g: PixelwiseMask(1, generator=g),
-    "random, 3 um": lambda g: PixelwiseMask(initial=3e-6 * torch.rand(1, 23, 23, generator=g)),
-    "Zernike": lambda g: ZernikeMask(1, generator=g),
-    "strong Zernike": lambda g: strong(ZernikeMask(1, generator=g), 4),
-    "radial": lambda g: RadialMask(1, generator=g),
-    "strong radial": lambda g: strong(RadialMask(1, generator=g), 4),
-    "Fourier": lambda g: FourierMask(1, generator=g),
-    "strong Fourier": lambda g: strong(FourierMask(1, generator=g), 4),
-    "spiral": lambda g: SpiralMask(1, generator=g),
-    "Fresnel": lambda g: FresnelLens(),
-    "strong Fresnel": lambda g: FresnelLens(40.0),
-    "weak cubic": lambda g: CubicMask(5.0),
-    "cubic": lambda g: CubicMask(),
-    "strong cubic": lambda g: CubicMask(80.0),
-}
 LIMITS = {"draft": 3e-2, "balanced": 1e-3, "reference": 1e-6}
 
 
 class TestFamilies(BaseTester):
     @pytest.mark.parametrize("wavelength", [400e-9, 450e-9, 470e-9, 530e-9, 570e-9, 700e-9])
-    @pytest.mark.parametrize("family", FAMILIES)
+    @pytest.mark.parametrize("family", ONE_MASK)
     def test_feature_presets_keep_their_promise(self, family, wavelength):
         """L1 error relative to the light in the window, at the default camera, in focus and far out of it."""
-        phase = FAMILIES[family](torch.Generator().manual_seed(3)).phase.detach().double()
+        phase = ONE_MASK[family](torch.Generator().manual_seed(3)).phase.detach().double()
         lens, psi, cells = ThinLensCamera(), [-60.0, -20.0, 0.0, 20.0, 60.0], phase.shape[-1]
         step = lens.pixel_pitch * lens.aperture_radius / lens.image_distance
         pupil, one = Pupil(circular_aperture(cells, 2.3 / cells), 2.3 / cells), torch.ones(1, dtype=torch.float64)
@@ -95,7 +71,7 @@ class TestFamilies(BaseTester):
     @pytest.mark.parametrize(("points", "share"), [(1, 0.3), (2, 1 / 6), (3, 1 / 8), (4, 1 / 8), (6, 1 / 8)])
     def test_feature_pixel_tolerance_bounds_whole_psfs_for_pixels_of_any_size(self, family, points, share):
         """The largest pixels that so many points are taken for: there the integral is off by the tolerance."""
-        phase = FAMILIES[family](torch.Generator().manual_seed(3)).phase.detach().double()
+        phase = ONE_MASK[family](torch.Generator().manual_seed(3)).phase.detach().double()
         pupil, one = Pupil(circular_aperture(23), 0.1), torch.ones(1, dtype=torch.float64)
         for tolerance in (1e-1, 1e-2, 1e-3):
             sizes = np.linspace(0.05, 1.8, 200)

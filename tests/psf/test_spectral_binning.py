@@ -82,7 +82,10 @@ class TestFewerWavelengths(BaseTester):
     def test_feature_psfs_come_nearer_with_more_and_beat_equal_slices(self):
         lens = TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(3)), fidelity=Fidelity(window=17))
         errors = {
-            n: [spectral_error(lens, few, MANY, (-20.0, 0.0, 12.0)) for few in (fewer_wavelengths(MANY, n), equal)]
+            n: [
+                spectral_error(lens.psf_model, few, MANY, (-20.0, 0.0, 12.0))
+                for few in (fewer_wavelengths(MANY, n), equal)
+            ]
             for n, equal in ((n, camera_spectrum(samples=n)) for n in (3, 6, 12))
         }
         ours = [own for own, _ in errors.values()]

@@ -12,6 +12,7 @@ from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.optics.spectrum import smoothest_reflectances
 from kornia_tidy.psf import PSFBank
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.spectral_error import spectral_error
 from tests.base import BaseTester
 
@@ -92,14 +93,13 @@ class TestSpectralScene(BaseTester):
         optics = camera(spectrum)
         one = torch.rand(6, 9, 9, dtype=torch.float64) / 90
 
-        def alike(states, weights, light, step, window, tolerance, nodes):
+        def alike(self, states, weights, light, window, tolerance, nodes):
             rows = torch.tensor(light.plane_weights, dtype=torch.float64).sum(1)
             psfs = one[: len(nodes), None] * rows[:, None, None]
             return PSFBank(psfs, torch.tensor(nodes, dtype=torch.float64), psfs.sum((2, 3)))
 
-        monkeypatch.setattr(optics, "_build", alike)
         plain = camera(spectrum.flat())
-        monkeypatch.setattr(plain, "_build", alike)
+        monkeypatch.setattr(PSFModel, "_build", alike)
         self.assert_close(optics(*scene), plain(*scene), rtol=0, atol=1e-12)
 
     def test_feature_equals_wavelength_by_wavelength(self, spectrum, scene):
@@ -138,7 +138,10 @@ class TestSpectralError(BaseTester):
         """And the banks of 31 and 61 wavelengths hold all their light in three channels."""
         optics = camera(Spectrum.rgb())
         many = camera_spectrum(samples=61)
-        errors = [spectral_error(optics, camera_spectrum(samples=n), many, (-20.0, 0.0, 12.0)) for n in (3, 7, 31, 61)]
+        errors = [
+            spectral_error(optics.psf_model, camera_spectrum(samples=n), many, (-20.0, 0.0, 12.0))
+            for n in (3, 7, 31, 61)
+        ]
         assert errors == sorted(errors, reverse=True)
         assert errors[2] < 0.03
         assert errors[3] == 0
@@ -155,6 +158,6 @@ class TestSpectralError(BaseTester):
 
     def test_feature_the_lens_keeps_its_spectrum_and_window(self):
         optics = camera(Spectrum.rgb())
-        spectral_error(optics, replace(Spectrum.rgb()), Spectrum.rgb(), (0.0,))
+        spectral_error(optics.psf_model, replace(Spectrum.rgb()), Spectrum.rgb(), (0.0,))
         assert optics.spectrum == Spectrum.rgb()
         assert optics.window == 9

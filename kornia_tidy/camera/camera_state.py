@@ -1,22 +1,35 @@
-"""The state of a camera: its weights, its settings and its PSF window, so that what is restored is what was saved."""
+"""The state of a camera: weights, settings and PSF window in one ``state_dict``."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from itertools import chain
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
-from kornia_tidy.checks import check_finite
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.psf.camera_settings import EXTRA_STATE, check_settings, read_settings, write_settings
-from kornia_tidy.runtime.threads import SharedLock
+from kornia_tidy.camera.psf_model_owner import PSFModelOwner
+from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.psf.camera_settings import (
+    EXTRA_STATE,
+    check_settings,
+    read_settings,
+    settings_of,
+    take_over,
+    write_settings,
+)
+from kornia_tidy.psf.lens_limits import PARTS
+from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf.psf_window import FittedWindow
+from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.compositing import COMPOSITING
+
+COLOR_SPACES = ("srgb", "linear", "paper")
+OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")  # of a camera, beside those of its PSF model
 
 
-class CameraState(nn.Module):
-    """A module whose ``state_dict`` also tells which camera it is: the base of all cameras.
+class CameraState(PSFModelOwner):
+    """A camera with a ``state_dict`` of weights, settings and PSF window.
 
     The settings of its parts and its PSF window are one entry, ``_extra_state``, a tensor of bytes. Loading a state
 
@@ -31,43 +44,30 @@ class CameraState(nn.Module):
     module obeys the same rules. To take settings over there, load the camera's part of the state into the camera first.
     """
 
-    fidelity: Fidelity
-    _lock: SharedLock  # of the parts and the window, which belong together
-    _window: int | None
-    _held: tuple[float, float]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._lock = SharedLock()
+    def __init__(self, psf_model: PSFModel) -> None:
+        super().__init__(psf_model)
         self.register_load_state_dict_post_hook(_measure_window)
 
-    @abstractmethod
     def settings(self) -> dict[str, Any]:
         """Return what shapes a capture besides the weights, by the names of the parts."""
+        return {**self.psf_model.settings(), **{name: settings_of(getattr(self, name)) for name in OWN_SETTINGS}}
 
-    @abstractmethod
-    def fit_window(self) -> int:
-        """Choose the PSF window for the weights as they are now."""
-
-    @abstractmethod
     def _take_over(self, saved: Mapping[str, Any]) -> None:
-        """Set the settings to saved ones."""
-
-    @abstractmethod
-    def _check_window(self, window: int) -> None:
-        """Raise ``ValueError`` if this camera cannot have this window."""
-
-    @property
-    @abstractmethod
-    def light_held(self) -> tuple[float, float]:
-        """Least and largest share of the light in the window, as it was when the window was chosen."""
+        for name, allowed in (("compositing", COMPOSITING), ("color_space", COLOR_SPACES), ("border", BORDERS)):
+            if name in saved:
+                check_choice(name, saved[name], tuple(allowed))
+        fidelity = saved.get("fidelity")
+        if isinstance(fidelity, dict):
+            saved = {**saved, "fidelity": {**fidelity, "window": saved.get("fixed_window")}}
+        take_over(self, saved, self.settings(), {name: name for name in (*PARTS, "aperture", *OWN_SETTINGS)})
+        self.psf_model = self.psf_model.with_window(None)
 
     def get_extra_state(self) -> Tensor:
         """Return settings and window, uint8."""
-        with self._lock:
-            held, fixed = self.light_held, self.fidelity.window
+        with self.psf_model.lock:
+            window, fixed = self.psf_model.fitted, self.fidelity.window
             return write_settings(
-                {**self.settings(), "window": self._window, "light_held": held, "fixed_window": fixed}
+                {**self.settings(), "window": window.side, "light_held": window.held, "fixed_window": fixed}
             )
 
     def set_extra_state(self, state: Tensor) -> None:
@@ -83,8 +83,7 @@ class CameraState(nn.Module):
             raise ValueError(f"the window in the state must be an odd number of pixels, got {window}")
         if not isinstance(held, list) or [type(share) for share in held] != [float, float]:
             raise ValueError(f"light_held in the state must be two shares of the light, got {held}")
-        self._check_window(window)
-        self.__dict__.update(_window=window, _held=tuple(held))
+        self.psf_model = self.psf_model.with_window(FittedWindow(window, (held[0], held[1])))
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False, *, take_over: bool = False
@@ -112,7 +111,7 @@ class CameraState(nn.Module):
             >>> optics.load_state_dict(saved, take_over=True), optics.camera.pixel_pitch
             (<All keys matched successfully>, 9e-06)
         """
-        with self._lock:  # captures of other threads see the camera before or after it
+        with self.psf_model.lock:  # captures of other threads see the camera before or after it
             if take_over:
                 if EXTRA_STATE not in state_dict:
                     raise ValueError(
@@ -138,7 +137,7 @@ class CameraState(nn.Module):
         for name, value in weights.items():
             check_finite(f"{name} in the state", value)
         if key not in state_dict and weights:
-            self.__dict__["_window"] = None  # measured when the weights are there
+            self.psf_model = self.psf_model.with_window(None)  # measured when the weights are there
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
         )
@@ -147,5 +146,4 @@ class CameraState(nn.Module):
 
 
 def _measure_window(camera: CameraState, _: Any) -> None:
-    if camera._window is None:
-        camera.fit_window()
+    _ = camera.psf_model.fitted

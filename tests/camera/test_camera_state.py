@@ -24,7 +24,6 @@ from kornia_tidy.optics import FUSED_SILICA
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_model import CodedLens
 from kornia_tidy.systems import SYSTEMS
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
@@ -154,8 +153,8 @@ class TestTheSameCamera(BaseTester):
         two.load_state_dict(stored(one.state_dict(), "torch"))
         assert torch.equal(capture(camera(two)), capture(camera(one)))
 
-    def test_feature_a_lens_alone_and_one_state_of_it(self):
-        one, two = (CodedLens(PixelwiseMask(2), fidelity="draft") for _ in range(2))
+    def test_feature_one_state_of_it(self):
+        one, two = (TiDyOptics(PixelwiseMask(2), fidelity="draft") for _ in range(2))
         trained(one)
         with torch.no_grad():
             two.load_state_dict(one.state_dict())

@@ -1,0 +1,54 @@
+"""Before a capture: the cheapest fidelity for a scene within an error, and the backend that renders the scene."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from kornia_tidy.camera.samples import compute_dtype, read_sample, survey_defocus
+from kornia_tidy.render.dispatch import Explanation, explain
+from kornia_tidy.render.scene import layered_scene
+
+if TYPE_CHECKING:
+    from kornia_tidy.planning.render_plan import RenderPlan
+
+
+def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: float) -> RenderPlan:
+    """Return the cheapest fidelity for a scene within an error. See :meth:`TiDyOptics.plan`."""
+    from kornia_tidy.planning.planner import Planner  # noqa: PLC0415 (a capture without a plan does not need it)
+
+    shape = (len(optics.spectrum.weights), *depth.shape[-2:])
+    blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
+    sample = read_sample(blank, depth, optics)
+    if len(sample.image) == 0 or len(sample.depth) == 0:
+        found = f"{len(sample.image)} and {len(sample.depth)}"
+        raise ValueError(f"a plan needs at least one image and its depth, got {found}")
+    light = None if image is None else optics.decode(sample.image.to(sample.dtype))
+    defocus = optics.defocus(sample.depth.to(compute_dtype(depth.dtype, optics.fidelity)))
+    return Planner(optics, sample.image.shape[1]).scene(defocus, light).plan(tolerance)
+
+
+def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
+    """Return which backend renders a scene. Of an exposure in states, the first. See :meth:`TiDyOptics.explain`."""
+    sample = read_sample(image, depth, optics)
+    if len(sample.image) == 0:
+        raise ValueError("an explanation needs at least one image, got a batch of none")
+    light = optics.decode(sample.image.to(sample.dtype))
+    defocus = optics.defocus(sample.depth.to(sample.dtype))
+    reach = survey_defocus([defocus], optics).reach
+    (_, bank), *_ = optics.psf_model.scene_banks(light.shape[1], sample.dtype, reach, optics.compositing == "occlusion")
+    fidelity = optics.psf_model.fidelity
+    return explain(
+        layered_scene(
+            light.repeat(1, bank.psfs.shape[1] // light.shape[1], 1, 1),
+            defocus,
+            bank.defocus,
+            bank.psfs,
+            bank.veil,
+            compositing=optics.compositing,
+            layers="nearest" if fidelity.layers == "nearest" else "linear",
+            border=optics.border,
+            correlate=fidelity.correlate,
+        )
+    )

@@ -1,0 +1,245 @@
+"""Samples: an image and its depth as tensors, a tuple or a mapping; checks of their values and of their defocus."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, cast
+
+import torch
+from torch import Tensor
+from torch.utils.data import get_worker_info
+
+from kornia_tidy.checks import check_float_tensor, check_generator
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
+from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.runtime.threads import CaptureNotes
+from kornia_tidy.runtime.tracing import is_followed, is_value_unknown, refuse_torchscript
+
+DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
+# Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
+BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
+ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
+
+
+class Watchful(Protocol):
+    """A camera that checks its inputs and warns once."""
+
+    psf_model: PSFModel
+    check_inputs: bool
+    color_space: str
+    notes: CaptureNotes
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """An image and its depth, batched, and the form in which they came.
+
+    Args:
+        image: (B, C, H, W).
+        depth: (B, 1, H, W) or (1, 1, H, W).
+        form: the mapping or tuple that was given, None for tensors.
+        batched: whether image and depth came with the axis of batches.
+        dtype: that the capture is computed in, float32 or float64.
+        bytes_at_once: about as many as a capture of the whole image takes beyond image and capture.
+    """
+
+    image: Tensor
+    depth: Tensor
+    form: Mapping[str, Any] | tuple[Any, ...] | list[Any] | None
+    batched: bool
+    dtype: torch.dtype
+    bytes_at_once: int
+
+    def coded(self, coded: Tensor) -> Any:
+        """Return the capture in the sample's form.
+
+        Args:
+            coded: the capture, (B, C, H, W), or smaller: then depth, mask and clean image are cropped to its middle.
+
+        Returns:
+            A tensor, the tuple with the capture in the place of the image, or the mapping with the capture under
+            ``"image"`` and the clean image under ``"all_in_focus"``. Detached inside a DataLoader's worker.
+        """
+        if not torch.compiler.is_compiling() and get_worker_info() is not None:
+            coded = coded.detach()  # collation in a worker cannot carry gradients
+        margin = (self.image.shape[-2] - coded.shape[-2]) // 2
+        if not self.batched:
+            coded = coded[0]
+        if self.form is None:
+            return coded
+        if not isinstance(self.form, Mapping):
+            parts, make = (coded, cropped(self.form[1], margin), *self.form[2:]), cast("Any", type(self.form))
+            return make(*parts) if hasattr(self.form, "_fields") else make(parts)
+        maps = {name: cropped(self.form[name], margin) for name in (*DEPTH_KEYS, "mask") if name in self.form}
+        return {**self.form, "image": coded, "all_in_focus": cropped(self.form["image"], margin), **maps}
+
+
+def read_sample(image: Any, depth: Any, camera: Watchful, generator: object = None) -> Sample:
+    """Return a sample given as tensors, a tuple or a mapping, with its types, shapes and light checked.
+
+    Args:
+        image: the image, or a whole sample.
+        depth: the depth map, if ``image`` is a tensor.
+        camera: says what it takes.
+        generator: source of the noise, to be checked before any work.
+
+    Raises:
+        TypeError: if image or depth are not floating-point tensors, or the generator is none.
+        ValueError: if shapes do not fit, there is no depth, or the light makes no sense.
+        KeyError: if a mapping has no image or no depth.
+    """
+    form = None
+    if isinstance(image, Mapping):
+        form = image
+        image, depth = _image_and_depth(image, depth)
+    elif isinstance(image, (tuple, list)):
+        if len(image) < 2 or depth is not None:
+            raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
+        form = image
+        image, depth = image[:2]
+    if torch.jit.is_tracing():
+        refuse_torchscript()
+    if generator is not None:
+        check_generator(generator)
+    if depth is None:
+        raise ValueError("depth is missing: call optics(image, depth), optics((image, depth)) or optics(mapping)")
+    batched = not isinstance(image, Tensor) or image.ndim != 3
+    check_float_tensor("image", image, 4 if batched else 3, "(B, C, H, W) or (C, H, W)")
+    check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
+    model, given = camera.psf_model, tuple(image.shape)
+    if not batched:
+        image, depth = image[None], depth[None]
+    channels = len(model.spectrum.weights)
+    if image.shape[1] not in (channels, 1):
+        model.spectrum_of(image.shape[1], layout_remedy(given, channels))  # raises
+    if 0 in image.shape[-2:]:
+        raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
+    if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
+        raise ValueError(
+            f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
+            f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
+        )
+    if camera.check_inputs and not is_value_unknown() and image.numel():
+        lowest, highest = torch.aminmax(image.detach())
+        if not bool((lowest >= 0) & (highest <= 1)):  # NaN too
+            check_light(image, camera)
+    wide = model.fidelity.double or image.dtype == torch.float64
+    bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * (2 if wide else 1)
+    return Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once)
+
+
+def compute_dtype(dtype: torch.dtype, fidelity: Fidelity) -> torch.dtype:
+    """Return the type that images of a type are computed in: float64 where either asks for it."""
+    return torch.float64 if fidelity.double or dtype == torch.float64 else torch.float32
+
+
+def check_light(image: Tensor, camera: Watchful) -> None:
+    """Refuse values of an image without sense; warn once of those that seem to be in another unit.
+
+    Args:
+        image: of any shape, in the camera's colour space.
+        camera: whether it looks at its inputs, and what white is to it.
+
+    Raises:
+        ValueError: if a value is NaN or infinite, an sRGB value is above 16, or light beyond 1e30.
+    """
+    if camera.check_inputs and not is_value_unknown():
+        said = check_image(image, encoded=camera.color_space != "linear")
+        if said is not None:
+            tell_once(camera.notes, "image", said, stacklevel=7)
+
+
+def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
+    """Return the image and the depth of a mapping."""
+    keys = [key for key in DEPTH_KEYS if key in sample]
+    if "image" not in sample:
+        raise KeyError(f"a mapping sample needs an 'image', got the keys {list(sample)}")
+    if depth is not None or len(keys) != 1:
+        raise KeyError(
+            f"a mapping sample needs its depth under 'depth' or 'mask_depth', and in one place only, got the keys "
+            f"{list(sample)}"
+        )
+    return sample["image"], sample[keys[0]]
+
+
+def cropped(tensor: Tensor, margin: int) -> Tensor:
+    """Return a map without so many pixels on each side.
+
+    Example:
+        >>> cropped(torch.zeros(3, 8, 9), 2).shape
+        torch.Size([3, 4, 5])
+    """
+    return tensor[..., margin : tensor.shape[-2] - margin, margin : tensor.shape[-1] - margin]
+
+
+def zero_of(*tensors: Tensor) -> Tensor:
+    """Return a number that depends on tensors: an empty capture, to which it is added, has their gradients, of zero."""
+    return cast("Tensor", sum(tensor.sum() for tensor in tensors)) * 0
+
+
+class DefocusSpan(NamedTuple):
+    """How far the defocus of a scene reaches, and how many of its pixels lie beyond the camera's range.
+
+    Args:
+        reach: lowest and highest defocus in radians, (2,); the map itself where it is learnt or cannot be looked at.
+        clamped: number of pixels that are rendered as the ends of the range.
+    """
+
+    reach: Tensor
+    clamped: Tensor | int = 0
+
+
+def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
+    """Return how far the defocus of a scene reaches; note and, once, tell of pixels beyond the camera's range.
+
+    Args:
+        parts: of the defocus map, in radians.
+        camera: its range of defocus.
+    """
+    lo, hi = camera.psf_model.camera.defocus_range
+    extremes, pixels, clamped, reach = torch.zeros(2), 0, 0, None
+    for defocus in parts:
+        if is_value_unknown():
+            return DefocusSpan(defocus)
+        own = defocus.detach()
+        if not own.numel():
+            continue
+        if defocus.requires_grad or is_followed():
+            reach = defocus
+        lowest, highest = torch.aminmax(own)
+        if not bool((lowest >= lo - ROUNDING) & (highest <= hi + ROUNDING)):
+            clamped = clamped + ((own < lo - ROUNDING) | (own > hi + ROUNDING)).sum()
+        if pixels:
+            lowest, highest = torch.minimum(lowest, extremes[0]), torch.maximum(highest, extremes[1])
+        extremes = torch.stack([lowest, highest])
+        pixels += own.numel()
+    camera.notes.of_thread.clamped = clamped
+    if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
+        tell_of_defocus(extremes, camera, pixels, int(clamped))
+    return DefocusSpan(extremes if reach is None else reach, clamped)
+
+
+def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped: int = 0) -> None:
+    """Warn once of depths in another unit, or else of those beyond the camera's range.
+
+    Args:
+        extremes: lowest and highest defocus in radians, (2,).
+        camera: its range of defocus, and what it has told before.
+        pixels: number of all pixels.
+        clamped: number of those beyond the range.
+    """
+    lens = camera.psf_model.camera
+    said = misread_depth(lens, *extremes)
+    if said is not None:
+        tell_once(camera.notes, "depth", said, stacklevel=7)
+    elif clamped and camera.notes.first_time("depths beyond the camera's range"):
+        (lo, hi), (lowest, highest) = lens.defocus_range, extremes.tolist()
+        warnings.warn(
+            f"{clamped} of {pixels} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "
+            f"the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
+            f"ThinLensCamera.for_scene, or its depth_range)",
+            stacklevel=6,
+        )
