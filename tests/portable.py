@@ -23,6 +23,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 KERNELS = (
+    "tests/kernels/test_gather_ops.py",
+    "tests/kernels/test_mutual_intensity_ops.py",
+    "tests/kernels/test_occlusion_ops.py",
     "tests/render/backends/test_direct.py",
     "tests/render/backends/test_direct_occlusion.py",
     "tests/psf/test_mutual_intensity.py",

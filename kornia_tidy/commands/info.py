@@ -17,9 +17,8 @@ import torch
 import kornia_tidy
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.tune import in_words
+from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops
 from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
-from kornia_tidy.psf import mutual_intensity
-from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.cost_store import read_profile
 
 DESCRIPTION = """\
@@ -32,7 +31,7 @@ PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
     *("lightning", "matplotlib", "h5py"),
 )
-SOURCES = (direct.SOURCE, direct_occlusion.SOURCE, mutual_intensity.SOURCE)
+SOURCES = (gather_ops.SOURCE, occlusion_ops.SOURCE, mutual_intensity_ops.SOURCE)
 
 
 def add_parser(subparsers: Any) -> None:

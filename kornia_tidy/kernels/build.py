@@ -38,7 +38,7 @@ THREADS = "-fopenmp"  # PyTorch has brought OpenMP's library along, but a compil
 SECONDS = 120  # to wait for a compiler, which needs two to seven on an idle processor
 COST = "takes 1.5 to 6 times as long"  # measured on one real scene: gather 1.6, PSFs 1.8, occlusion 5.6
 
-_hung: list[str] = []  # what is said of a compiler that was ended: it is not called again
+_hung: list[str] = []  # the reason, once a compiler was ended: no compiler is called again
 _warned: set[bool] = set()  # of a library that is missing (False), of one without threads (True)
 
 
@@ -112,9 +112,21 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
     return built.library
 
 
+def load(source: Path, dtype: torch.dtype) -> ctypes.CDLL:
+    """Return a C source as a library, see :func:`compiled`, or raise an error with the reason for its absence.
+
+    Raises:
+        NotBuiltError: if there is no library.
+    """
+    library = compiled(source, dtype)
+    if library is None:
+        raise NotBuiltError(f"{source.name} is not compiled: {build(source, dtype).remark}")
+    return library
+
+
 @cache
 def build(source: Path, dtype: torch.dtype) -> Build:
-    """Return what :func:`compiled` returns, with where it lies or why it is not there, and without a warning."""
+    """Build a C source and report the library's path or the reason for its absence, without a warning."""
     try:
         return _build(source, dtype, find_compiler(), cache_folder())
     except NotBuiltError as error:
@@ -234,7 +246,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:
-    """Write a library whole or not at all, named after what it depends on and after what it holds."""
+    """Compile and install a library in one step, under a name with the digests of its inputs and of its content."""
     with tempfile.TemporaryDirectory(dir=folder) as own:
         new = Path(own) / "library.so"
         _run([*command, "-o", str(new), str(source)])
@@ -309,7 +321,7 @@ def _digest(source: Path, compiler: Compiler, flags: tuple[str, ...]) -> str:
 
 @cache
 def processor_features() -> bytes:
-    """What the processor is and can do: a home folder may be shared by unlike machines."""
+    """Return the processor's model and instruction sets: unlike machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_bytes().split(b"\n\n")[0].splitlines()
     except OSError:

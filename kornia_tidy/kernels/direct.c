@@ -6,7 +6,7 @@
 // registers: one vector of light is loaded once and multiplied by a different PSF sample for each row of the strip. The
 // last blocks of a row and of a plane are shifted back inside and overlap with their neighbours.
 //
-// Layers are given as in tile_plan.py: a pixel belongs to layer `lower` or, with the weight `share`, to the next one. PSFs
+// Layers are given as in tile_plan.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one. PSFs
 // are flipped by 180 degrees, so output pixel (y, x) reads plane pixels (y, x) to (y + side - 1, x + side - 1).
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
@@ -22,16 +22,16 @@ enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share
 
 typedef REAL loose __attribute__((vector_size(64), aligned(sizeof(REAL)), may_alias));
 
-// The fields of `_Scene` in direct.py. Strides count elements; widths and heights are those of the output.
+// The fields of `_Scene` in gather_ops.py. Strides count elements; widths and heights are those of the output.
 typedef struct {
     int64_t images, channels, height, width, layers, side, threads, slabs;
-    int64_t plane_image, plane_channel, plane_row, lower_image, lower_row, share_image, share_row;
-    int64_t slope;              // 0: mix by shares; 1: the next layer less the lower one
+    int64_t plane_image, plane_channel, plane_row, index_image, index_row, weight_image, weight_row;
+    int64_t weight_gradient;    // 0: blend by weights; 1: the next layer less the pixel's own
     const REAL *plane;          // light, larger by side - 1
-    const REAL *psfs;           // (layers, channels, side, side), turned, columns first
-    const int64_t *lower;       // (images, height, width)
-    const REAL *share;          // like lower, or null
-    const REAL *own;            // (images, channels, height, width): what PSFs are correlated with
+    const REAL *psfs;           // (layers, channels, side, side), flipped, columns first
+    const int64_t *index;       // (images, height, width)
+    const REAL *weight;         // like index, or null
+    const REAL *gradient;       // (images, channels, height, width): of what `mix` returns, for `correlate`
     REAL *out;                  // mix: (images, channels, height, width); correlate: zeros (slabs, layers, channels, side, side)
 } scene;
 
@@ -105,37 +105,37 @@ INLINE int note(member *members, int count, int64_t layer, int strip) {
 }
 
 // Lists the layers of a block's pixels and returns their number; 0 if a layer index is invalid, as for a NaN depth.
-INLINE int list_members(const scene *s, const int64_t *lower, const REAL *share, member *members) {
+INLINE int list_members(const scene *s, const int64_t *index, const REAL *weight, member *members) {
     uint64_t other = 0, last = 0, layers = s->layers;
     for (int v = 0; v < ROWS; v++)
         for (int i = 0; i < WIDTH; i++) {
-            uint64_t layer = lower[v * s->lower_row + i];
-            other |= layer ^ (uint64_t)lower[0];
+            uint64_t layer = index[v * s->index_row + i];
+            other |= layer ^ (uint64_t)index[0];
             last = layer > last ? layer : last;
         }
     if (last >= layers) return 0;
-    if (!share && !other) {
-        members[0] = (member){lower[0], 3};
+    if (!weight && !other) {
+        members[0] = (member){index[0], 3};
         return 1;
     }
     int count = 0;
     for (int v = 0; v < ROWS; v++)
         for (int i = 0; i < WIDTH; i++) {
-            int64_t layer = lower[v * s->lower_row + i];
-            REAL f = share ? share[v * s->share_row + i] : 0;
-            if (s->slope || f != 1) count = note(members, count, layer, i / LANES);
-            if ((s->slope || f > 0) && layer + 1 < s->layers) count = note(members, count, layer + 1, i / LANES);
+            int64_t layer = index[v * s->index_row + i];
+            REAL f = weight ? weight[v * s->weight_row + i] : 0;
+            if (s->weight_gradient || f != 1) count = note(members, count, layer, i / LANES);
+            if ((s->weight_gradient || f > 0) && layer + 1 < s->layers) count = note(members, count, layer + 1, i / LANES);
         }
     return count;
 }
 
-// Computes the weights of a layer for the pixels of a strip; for gradients, -1 for `lower` and 1 for the next layer.
-INLINE void weigh(const scene *s, const int64_t *lower, const REAL *share, int64_t layer, vec weights[ROWS]) {
+// Computes the weights of a layer for the pixels of a strip; for gradients, -1 for `index` and 1 for the next layer.
+INLINE void weigh(const scene *s, const int64_t *index, const REAL *weight, int64_t layer, vec weights[ROWS]) {
     for (int v = 0; v < ROWS; v++) {
-        const int64_t *l = lower + v * s->lower_row;
-        const REAL *f = share ? share + v * s->share_row : 0;
+        const int64_t *l = index + v * s->index_row;
+        const REAL *f = weight ? weight + v * s->weight_row : 0;
         REAL *w = (REAL *)&weights[v];
-        if (s->slope)
+        if (s->weight_gradient)
             for (int i = 0; i < LANES; i++) w[i] = (REAL)(l[i] + 1 == layer) - (REAL)(l[i] == layer);
         else if (f)
             for (int i = 0; i < LANES; i++) w[i] = l[i] == layer ? 1 - f[i] : l[i] + 1 == layer ? f[i] : 0;
@@ -150,23 +150,23 @@ int64_t count_pairs(const scene *s, int64_t every) {
 #pragma omp parallel for num_threads(s->threads) reduction(+ : pairs)
     for (int64_t band = 0; band < s->images * bands; band += every) {
         int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
-        const int64_t *lower = s->lower + image * s->lower_image + y * s->lower_row;
-        const REAL *share = s->share ? s->share + image * s->share_image + y * s->share_row : 0;
+        const int64_t *index = s->index + image * s->index_image + y * s->index_row;
+        const REAL *weight = s->weight ? s->weight + image * s->weight_image + y * s->weight_row : 0;
         member members[TERMS];
         for (int64_t left = 0; left < s->width; left += WIDTH) {
             int64_t x = least(left, s->width - WIDTH);
-            int count = list_members(s, lower + x, share ? share + x : 0, members);
+            int count = list_members(s, index + x, weight ? weight + x : 0, members);
             for (int n = 0; n < count; n++) pairs += 1 + (members[n].strips == 3);
         }
     }
     return pairs;
 }
 
-static void mix_block(const scene *s, const REAL *light, const int64_t *lower, const REAL *share, const member *members,
+static void mix_block(const scene *s, const REAL *light, const int64_t *index, const REAL *weight, const member *members,
                       int count, const REAL *psfs, REAL *out, int skip) {
     vec total[2][ROWS], own[2][ROWS], weights[ROWS];
     int64_t stride = s->channels * s->side * s->side;
-    if (count == 1 && !share)
+    if (count == 1 && !weight)
         convolve_block(light, s->plane_row, psfs + members->layer * stride, s->side, total);
     else {
         memset(total, 0, sizeof total);
@@ -177,7 +177,7 @@ static void mix_block(const scene *s, const REAL *light, const int64_t *lower, c
             else convolve_strip(light + first * LANES, s->plane_row, psf, s->side, own + first);
             for (int strip = first; strip <= last; strip++) {
                 int at = strip * LANES;
-                weigh(s, lower + at, share ? share + at : 0, members[n].layer, weights);
+                weigh(s, index + at, weight ? weight + at : 0, members[n].layer, weights);
                 for (int v = 0; v < ROWS; v++) total[strip][v] += weights[v] * own[strip][v];
             }
         }
@@ -187,20 +187,20 @@ static void mix_block(const scene *s, const REAL *light, const int64_t *lower, c
 }
 
 // Gathers light: each pixel is convolved with the PSFs of its layers. Guided scheduling gives threads long runs of
-// adjacent bands, which share light in the cache, and short runs at the end. Returns 0, or 1 for an invalid layer index.
+// adjacent bands, which weight light in the cache, and short runs at the end. Returns 0, or 1 for an invalid layer index.
 int mix(const scene *s) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH;
     int failed = 0;
 #pragma omp parallel for schedule(guided, 8) num_threads(s->threads)
     for (int64_t band = 0; band < s->images * bands; band++) {
         int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
-        const int64_t *lower = s->lower + image * s->lower_image + y * s->lower_row;
-        const REAL *share = s->share ? s->share + image * s->share_image + y * s->share_row : 0;
+        const int64_t *index = s->index + image * s->index_image + y * s->index_row;
+        const REAL *weight = s->weight ? s->weight + image * s->weight_image + y * s->weight_row : 0;
         int skip = band % bands * ROWS - y;  // rows of the previous band, which another thread may be writing
         member members[TERMS];
         for (int64_t block = 0; block < blocks; block++) {
             int64_t x = least(block * WIDTH, s->width - WIDTH);
-            int count = list_members(s, lower + x, share ? share + x : 0, members);
+            int count = list_members(s, index + x, weight ? weight + x : 0, members);
             if (count == 0) {
 #pragma omp atomic write
                 failed = 1;
@@ -208,7 +208,7 @@ int mix(const scene *s) {
             for (int64_t c = 0; c < s->channels; c++) {
                 const REAL *light = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
                 REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
-                mix_block(s, light, lower + x, share ? share + x : 0, members, count, s->psfs + c * s->side * s->side, out,
+                mix_block(s, light, index + x, weight ? weight + x : 0, members, count, s->psfs + c * s->side * s->side, out,
                           skip);
             }
         }
@@ -262,7 +262,7 @@ typedef struct {
 static void correlate_piece(const scene *s, int64_t image, int64_t channel, int64_t layer, const place *places, int count,
                             const member *members, vec *sums) {
     const REAL *plane = s->plane + image * s->plane_image + channel * s->plane_channel;
-    const REAL *own = s->own + (image * s->channels + channel) * s->height * s->width;
+    const REAL *gradient = s->gradient + (image * s->channels + channel) * s->height * s->width;
     memset(sums, 0, s->side * s->side * sizeof(vec));
     for (const place *p = places; p < places + count; p++)
         for (int64_t n = p->start; n < p->stop; n++) {
@@ -271,9 +271,9 @@ static void correlate_piece(const scene *s, int64_t image, int64_t channel, int6
             vec weights[2][ROWS];
             for (int strip = first; strip <= last; strip++) {
                 int64_t x = p->x + strip * LANES;
-                weigh(s, s->lower + image * s->lower_image + p->y * s->lower_row + x,
-                      s->share ? s->share + image * s->share_image + p->y * s->share_row + x : 0, layer, weights[strip]);
-                for (int v = 0; v < ROWS; v++) weights[strip][v] *= *(const loose *)(own + (p->y + v) * s->width + x);
+                weigh(s, s->index + image * s->index_image + p->y * s->index_row + x,
+                      s->weight ? s->weight + image * s->weight_image + p->y * s->weight_row + x : 0, layer, weights[strip]);
+                for (int v = 0; v < ROWS; v++) weights[strip][v] *= *(const loose *)(gradient + (p->y + v) * s->width + x);
                 // Pixels of the overlap belong to the previous blocks.
                 if (p->skip_rows || p->skip_columns)
                     for (int v = 0; v < ROWS; v++)
@@ -313,8 +313,8 @@ int correlate(const scene *s) {
                             int64_t y = least(band % bands * ROWS, s->height - ROWS);
                             int64_t x = least(block * WIDTH, s->width - WIDTH);
                             int found = list_members(
-                                s, s->lower + image * s->lower_image + y * s->lower_row + x,
-                                s->share ? s->share + image * s->share_image + y * s->share_row + x : 0, members + end);
+                                s, s->index + image * s->index_image + y * s->index_row + x,
+                                s->weight ? s->weight + image * s->weight_image + y * s->weight_row + x : 0, members + end);
                             for (int n = 0; n < found; n++) present[members[end + n].layer] = 1;
                             places[count++] = (place){y, x, band % bands * ROWS - y, block * WIDTH - x, end, end + found};
                             end += found;

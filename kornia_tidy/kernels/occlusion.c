@@ -26,7 +26,7 @@ typedef REAL part __attribute__((vector_size(DOUBLES * sizeof(REAL))));
 
 static const REAL EPSILON = 1e-6;  // as in dense_occlusion.py
 
-// The fields of `_Panes` in direct_occlusion.py. Widths and heights are those of the output; planes are larger by side - 1.
+// The fields of `_Scene` in occlusion_ops.py. Widths and heights are those of the output; planes are larger by side - 1.
 typedef struct {
     int64_t images, channels, height, width, layers, side, threads;
     int64_t plane_image, plane_channel, plane_row, map_image, map_row;

@@ -15,19 +15,26 @@ Source: Goodman, Statistical Optics, 5.2, for the mutual intensity.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.build import KERNELS, REALS, compiled
-from kornia_tidy.psf.checkpointed_sum import recomputed
-from kornia_tidy.runtime.tracing import is_followed
+from kornia_tidy.kernels.build import REALS, compiled
+from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
+from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
-SOURCE = KERNELS / "mutual_intensity.c"
 LARGEST_WINDOW = (
     65  # px, in C: 0.6 (23 px) to 0.85 (61 px) of the time of matrix products, beyond 100 px more than they
+)
+
+torch.library.define(
+    "kornia_tidy::mutual_energies", "(Tensor field, Tensor weights, Tensor kernels, bool learning) -> Tensor"
+)
+torch.library.define(
+    "kornia_tidy::mutual_energies_gradients",
+    "(Tensor field, Tensor weights, Tensor kernels, Tensor gradient, bool[] wanted) -> Tensor[]",
 )
 
 _BLOCK_NUMBERS = 2**20  # held at once, if a single depth allows it: they stay near a core
@@ -48,15 +55,11 @@ def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
         >>> mutual_energies(torch.full((1, 2, 2), 1j), torch.ones(1), torch.ones(1, 1, 1, 2) + 0j)
         tensor([[[16.]]])
     """
-    if _is_plain(field, weights, kernels) and goes_in_c(kernels.shape[1], field.real.dtype):
-        return _energies_in_c(field, weights, kernels)
-    weights = weights.to(field.real.dtype)[:, None, None]
-    plain, turned = _columns(field), _columns(field * weights * (1 + 1j))
-    left = torch.view_as_real(kernels).flatten(-2)
-    with torch.autocast(left.device.type, enabled=False):
-        # B is packed as real less imaginary part: with J's sum of both, that leaves the real part of their product.
-        pixels = (_real_rows(kernels).mT @ _real_rows(kernels * (1 - 1j))).flatten(-2)
-    return recomputed(_energies, _gradients, plain, turned, left, pixels)
+    weights = weights.to(field.real.dtype)
+    if is_transformed():
+        return _energies(*_matrices(field, weights, kernels))
+    learning = torch.is_grad_enabled() and any(x.requires_grad for x in (field, weights, kernels))
+    return torch.ops.kornia_tidy.mutual_energies(field, weights, kernels, learning)
 
 
 def goes_in_c(window: int, dtype: torch.dtype) -> bool:
@@ -69,29 +72,21 @@ def goes_in_c(window: int, dtype: torch.dtype) -> bool:
     return window <= LARGEST_WINDOW and dtype in REALS and compiled(SOURCE, dtype) is not None
 
 
-def _is_plain(*tensors: Tensor) -> bool:
-    """Whether these are in a processor's memory, and no one asks for gradients or follows what is done with them."""
-    if is_followed() or any(x.device.type != "cpu" for x in tensors):
-        return False
-    return not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
+def _choose_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
+    """Return energies in C where no gradient is wanted, and otherwise from the matrices that gradients are made of."""
+    if not learning and field.device.type == "cpu" and goes_in_c(kernels.shape[1], field.real.dtype):
+        return mutual_intensity_energies(field, weights, kernels)
+    return _energies(*_matrices(field, weights, kernels))
 
 
-def _energies_in_c(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
-    """What :func:`mutual_energies` returns, by mutual_intensity.c: waves and intensities of a row stay in its cache."""
-    real = field.real.dtype
-    field, kernels = (x.detach().resolve_conj().contiguous() for x in (field, kernels))
-    weights = weights.detach().to(real).contiguous()
-    depths, window, order, cells = kernels.shape
-    energies = torch.empty(depths, window, window, dtype=real)
-    library = compiled(SOURCE, real)
-    assert library is not None
-    failed = library.mutual_energies(
-        *(ctypes.c_void_p(x.data_ptr()) for x in (field, weights, kernels, energies)),
-        *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
-    )
-    if failed:
-        raise MemoryError(f"no memory for PSFs of {window}x{window} pixels")
-    return energies
+def _matrices(field: Tensor, weights: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the real matrices that energies are products of: plain, flipped, left and pixels."""
+    plain, turned = _columns(field), _columns(field * weights[:, None, None] * (1 + 1j))
+    left = torch.view_as_real(kernels.resolve_conj()).flatten(-2)
+    with torch.autocast(left.device.type, enabled=False):
+        # B is packed as real less imaginary part: with J's sum of both, that leaves the real part of their product.
+        pixels = (_real_rows(kernels).mT @ _real_rows(kernels * (1 - 1j))).flatten(-2)
+    return plain, turned, left, pixels
 
 
 def _columns(field: Tensor) -> Tensor:
@@ -161,3 +156,60 @@ def _blocks(plain: Tensor, left: Tensor) -> Iterator[slice]:
     together = max(1, _BLOCK_NUMBERS // numbers)
     for depth in range(0, depths, together):
         yield slice(depth, depth + together)
+
+
+# ---------------------------------------------------------------------- operators
+# A compiler sees them as one node each: which of the ways is taken, and block by block, is decided when they run.
+
+
+def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
+    return weights.new_empty(kernels.shape[0], kernels.shape[1], kernels.shape[1])
+
+
+def _make_gradients(
+    field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor, wanted: Sequence[bool]
+) -> list[Tensor]:
+    """Return the gradients that are wanted, without the energies."""
+    inputs = [x.detach().requires_grad_(want) for x, want in zip((field, weights, kernels), wanted, strict=True)]
+    with recording_in_operator():
+        matrices = _matrices(*inputs)
+        needed = [x.requires_grad for x in matrices]
+        with torch.no_grad(), torch.autocast(gradient.device.type, enabled=False):
+            found = _gradients(*matrices, gradient, needed)
+        outputs, gradients = zip(*((x, g) for x, g in zip(matrices, found, strict=True) if g is not None), strict=True)
+        leaves = [x for x in inputs if x.requires_grad]
+        return [x.resolve_conj().contiguous() for x in torch.autograd.grad(outputs, leaves, gradients)]
+
+
+def _new_gradients(
+    field: Tensor,
+    weights: Tensor,
+    kernels: Tensor,
+    gradient: Tensor,
+    wanted: Sequence[bool],
+) -> list[Tensor]:
+    inputs = zip((field, weights, kernels), wanted, strict=True)
+    return [x.new_empty(x.shape) for x, want in inputs if want]
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:3])
+
+
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    inputs, wanted = ctx.saved_tensors, list(ctx.needs_input_grad[:3])
+    if not torch.is_grad_enabled():
+        found = iter(torch.ops.kornia_tidy.mutual_energies_gradients(*inputs, gradient, wanted))
+    else:  # it is differentiated in turn
+        own = [x.view_as(x) for x in inputs]
+        energies = _energies(*_matrices(*own))
+        asked = [x for x, want in zip(own, wanted, strict=True) if want]
+        found = iter(torch.autograd.grad(energies, asked, gradient, create_graph=True))
+    return *(next(found) if want else None for want in wanted), None
+
+
+torch.library.impl("kornia_tidy::mutual_energies", "default", _choose_energies)
+torch.library.register_fake("kornia_tidy::mutual_energies", _new_energies)
+torch.library.register_autograd("kornia_tidy::mutual_energies", _backward, setup_context=_keep)
+torch.library.impl("kornia_tidy::mutual_energies_gradients", "default", _make_gradients)
+torch.library.register_fake("kornia_tidy::mutual_energies_gradients", _new_gradients)

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 from torch import Tensor
 
 from kornia_tidy.render.cost_model import Work
 from kornia_tidy.render.scene import LayeredScene
+
+GradientPairs = list[tuple[Tensor, Tensor]]  # a tensor and its gradient
+
+
+def gradient_pairs(tensors: Sequence[Tensor | None], gradients: Sequence[Tensor | None]) -> GradientPairs:
+    """Return the tensors that have a gradient, with their gradients.
+
+    Args:
+        tensors: tensors, or None.
+        gradients: of the tensors, or None.
+    """
+    pairs = zip(tensors, gradients, strict=True)
+    return [(tensor, gradient) for tensor, gradient in pairs if tensor is not None and gradient is not None]
+
+
+def wants_gradient(tensor: Tensor | None) -> bool:
+    """Return whether a tensor is there and requires a gradient."""
+    return tensor is not None and tensor.requires_grad
 
 
 class Backend(Protocol):
@@ -35,9 +53,14 @@ class Backend(Protocol):
         ...
 
     def render(self, scene: LayeredScene) -> Tensor:
-        """Return (B, C, h, w) light, without the stray light of gather and scatter.
+        """Return (B, C, h, w) light, without the stray light of gather and scatter. Autograd does not record it."""
+        ...
 
-        It has gradients with respect to image, layer weight, PSFs and, for occlusion, stray light; these can be
-        differentiated in turn.
+    def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+        """Return the gradients of tensors that were made of the scene's, where they require gradients.
+
+        Args:
+            scene: tensors that autograd records: image, layer weight, PSFs and, for occlusion, stray light.
+            gradient: (B, C, h, w) gradient of what :meth:`render` returns.
         """
         ...

@@ -12,8 +12,7 @@ from typing import Protocol
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.dispatch import render_scene
-from kornia_tidy.render.scene import layered_scene
+from kornia_tidy.render.render_ops import render_layers
 
 
 class Bank(Protocol):
@@ -59,7 +58,7 @@ def render(
         correlate: flip the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
         method: the backend. ``"auto"`` takes the cheapest that supports the scene, see
             :func:`kornia_tidy.render.dispatch.explain`; ``"direct"``, ``"tiled"`` and ``"dense"`` ask for one.
-            ``torch.compile``, ``torch.func`` and forward-mode derivatives are for dense alone.
+            ``torch.func`` and forward-mode derivatives are for dense alone.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or
@@ -82,8 +81,8 @@ def render(
     """
     check_choice("compositing", compositing, COMPOSITING)
     options = {"compositing": compositing, "layers": layers, "border": border}
-    scene = layered_scene(image, defocus, bank.defocus, bank.psfs, bank.veil, correlate=correlate, **options)
-    return render_scene(scene, method)
+    scene = image, defocus, bank.defocus, bank.psfs, bank.veil
+    return render_layers(*scene, correlate=correlate, method=method, **options)
 
 
 def gather(
@@ -132,7 +131,7 @@ def gather(
         [0, 0, 25, 75, 0]
     """
     options = {"compositing": "gather", "layers": layers, "border": border}
-    return render_scene(layered_scene(image, defocus, nodes, psfs, veil, correlate=correlate, **options), method)
+    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 def scatter(
@@ -172,7 +171,7 @@ def scatter(
     Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
     """
     options = {"compositing": "scatter", "layers": layers, "border": border}
-    return render_scene(layered_scene(image, defocus, nodes, psfs, veil, correlate=correlate, **options), method)
+    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 def occlusion(
@@ -229,7 +228,7 @@ def occlusion(
         [0, 33, 67, 100]
     """
     options = {"compositing": "occlusion", "layers": layers, "border": border}
-    return render_scene(layered_scene(image, defocus, nodes, psfs, veil, correlate=correlate, **options), method)
+    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
 COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": scatter, "occlusion": occlusion}

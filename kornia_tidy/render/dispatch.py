@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,17 +12,17 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.backend import Backend
-from kornia_tidy.render.backends.dense import DenseBackend
+from kornia_tidy.render.backend import Backend, GradientPairs
+from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.first_use import profile_for
 from kornia_tidy.render.layers import SAMPLE
-from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.scene import LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
-from kornia_tidy.runtime.tracing import is_followed
+from kornia_tidy.runtime.tracing import is_transformed
 
 BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
 METHODS = ("auto", *BACKENDS)
@@ -40,17 +40,90 @@ def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
         method: ``"auto"``, ``"direct"``, ``"tiled"`` or ``"dense"``, or a backend.
 
     Returns:
-        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says.
+        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
+        with respect to image, layer weight, PSFs and stray light. The backend makes them; those that are differentiated
+        in turn are made by the dense one.
 
     Raises:
         ValueError: if the method is not known, or does not support the scene.
     """
+    backend = choose(scene, method) if isinstance(method, str) else method
+    if is_transformed():
+        return render_unrecorded(backend, scene)
+    return _Rendered.apply(backend, scene, scene.image, scene.layer_weight, scene.psfs, scene.stray_light)
+
+
+def render_unrecorded(backend: Backend, scene: LayeredScene) -> Tensor:
+    """Render a layered scene without the gradients that backends make."""
     with torch.autocast(scene.image.device.type, enabled=False):
-        backend = choose(scene, method) if isinstance(method, str) else method
         coded = backend.render(scene)
         if scene.stray_light is not None and scene.compositing != "occlusion":
             coded = coded + stray_light_of(scene)
     return coded.to(scene.dtype)
+
+
+@torch.enable_grad()
+def scene_gradients(backend: Backend, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+    """Return the gradients of tensors that were made of the scene's, where they require gradients.
+
+    Args:
+        backend: makes them.
+        scene: tensors that autograd records.
+        gradient: (B, C, h, w) gradient of the rendered light.
+    """
+    pairs = backend.gradients(scene, gradient.to(scene.image.dtype))
+    if scene.stray_light is not None and scene.compositing != "occlusion":
+        stray_light = stray_light_of(scene)
+        if stray_light.requires_grad:
+            pairs.append((stray_light, gradient.to(stray_light.dtype).sum_to_size(stray_light.shape)))
+    return pairs
+
+
+def chain_gradients(pairs: GradientPairs, leaves: list[Tensor]) -> list[Tensor | None]:
+    """Return the gradients of leaves from those of tensors that were made of them.
+
+    Args:
+        pairs: from :func:`scene_gradients`.
+        leaves: tensors that the scene was made of; each has its gradient, or None.
+    """
+    if not pairs or not leaves:
+        return [None] * len(leaves)
+    tensors, gradients = zip(*pairs, strict=True)
+    return list(torch.autograd.grad(tensors, leaves, gradients, allow_unused=True))
+
+
+class _Rendered(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, backend: Backend, scene: LayeredScene, *tensors: Tensor | None) -> Tensor:
+        ctx.backend, ctx.scene = backend, scene
+        ctx.save_for_backward(*tensors)
+        return render_unrecorded(backend, scene)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), wanted, given = grad_outputs, ctx.needs_input_grad[2:], ctx.scene
+
+        def scene_of(*tensors: Any) -> LayeredScene:
+            image, weight, psfs, stray_light = tensors
+            rest = given.border, given.compositing, given.dtype
+            return scene_of_layers(image, given.layer_index, weight, psfs, stray_light, *rest)
+
+        if torch.is_grad_enabled():  # it is differentiated in turn
+
+            def render(*tensors: Tensor | None) -> Tensor:
+                return render_unrecorded(BACKENDS["dense"], scene_of(*tensors))
+
+            return None, None, *differentiable_gradients(render, ctx.saved_tensors, gradient, wanted)
+        own = leaves_of(ctx.saved_tensors, wanted)
+        leaves = [x for x in own if x is not None and x.requires_grad]
+        with torch.enable_grad():
+            found = iter(chain_gradients(scene_gradients(ctx.backend, scene_of(*own), gradient), leaves))
+        return None, None, *(next(found) if x is not None and x.requires_grad else None for x in own)
+
+
+def leaves_of(tensors: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
+    """Return tensors in which gradients end, that require them where they are wanted."""
+    return [None if x is None else x.detach().requires_grad_(want) for x, want in zip(tensors, wanted, strict=True)]
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
@@ -107,10 +180,10 @@ def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
 def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
     """Return what a choice depends on, with a digest of the sample of layers that costs are estimated from.
 
-    None on an accelerator, which one would have to wait for, and where torch compiles or transforms the renderer.
+    None on an accelerator, which one would have to wait for, and where torch transforms the renderer.
     """
     labels = scene.labels
-    if labels.layer_index.device.type != "cpu" or is_followed():
+    if labels.layer_index.device.type != "cpu" or is_transformed():
         return None
     digest = hashlib.blake2b(digest_size=16)
     for layer in labels.every(SAMPLE).terms():
@@ -123,12 +196,9 @@ def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:
-    """Return why a backend does not support a scene, or None if it does.
-
-    This alone decides what runs while torch compiles or transforms the renderer.
-    """
-    if backend.name != "dense" and is_followed():
-        return "torch.compile, torch.func and forward-mode derivatives need plain operations of torch"
+    """Return why a backend does not support a scene, or None if it does."""
+    if backend.name != "dense" and is_transformed():
+        return "torch.func and forward-mode derivatives need plain operations of torch"
     return backend.refusal(scene)
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_float_tensor
-from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
+from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
 
 LAYER_MODES = ("nearest", "linear")
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
@@ -115,7 +115,7 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
-    spacing = None if is_followed() else _even_spacing(nodes)
+    spacing = None if is_transformed() else _even_spacing(nodes)
     if mode == "nearest" and spacing is not None:
         steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
         return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
@@ -226,7 +226,7 @@ def present_layers(layer_index: Tensor, layer_weight: Tensor | None, count: int)
         >>> present_layers(torch.tensor([0, 3]), torch.tensor([1.0, 0.5]), count=6)
         [1, 3, 4]
     """
-    if is_followed():
+    if is_transformed():
         return list(range(count))
     present = torch.zeros(count, dtype=torch.bool, device=layer_index.device)
     if layer_weight is None:

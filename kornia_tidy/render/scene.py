@@ -62,6 +62,12 @@ class LayeredScene:
         return self.found["plane"]
 
     @property
+    def batch_weight(self) -> Tensor | None:
+        """Layer weight of :attr:`sorted_layers` for each image of the batch, with gradients."""
+        weight = self.sorted_layers[1]
+        return None if weight is None else weight.expand(len(self.image), -1, -1)
+
+    @property
     def sampled_layers(self) -> int:
         """Number of layers in a sample of the scene: every eighth row and column of :attr:`labels`."""
         if "sampled_layers" not in self.found:
@@ -109,8 +115,7 @@ def layered_scene(
         >>> scene.output_size, scene.layer_index.unique(), scene.layer_weight.unique()
         ((4, 4), tensor([0]), tensor([0.5000]))
     """
-    _check_shapes(image, defocus, nodes, psfs, stray_light)
-    check_border(border, image.shape[-2], image.shape[-1], psfs.shape[-1])
+    check_scene(image, defocus, nodes, psfs, stray_light, border)
     dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
     index, weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
     return scene_of_layers(
@@ -164,7 +169,9 @@ def scene_of_layers(
     )
 
 
-def _check_shapes(image: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, stray_light: Tensor | None) -> None:
+def check_scene(
+    image: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, stray_light: Tensor | None, border: str
+) -> None:
     """Raise ``TypeError`` or ``ValueError`` unless image, defocus map and PSFs fit each other. Looks at no value."""
     check_float_tensor("image", image, 4, "(B, C, H, W)")
     check_float_tensor("defocus", defocus, 4, "(B, 1, H, W)")
@@ -186,3 +193,4 @@ def _check_shapes(image: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, s
         raise ValueError(
             f"veil must have shape {(depth, channels)}, one value a layer and channel, got {tuple(stray_light.shape)}"
         )
+    check_border(border, height, width, psf_width)

@@ -6,11 +6,20 @@ tracing.
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import NoReturn
 
 import torch
 from torch.autograd import forward_ad
 
+_KEYS_OF_RECORDING = tuple(
+    getattr(torch._C.DispatchKey, name)
+    for name in (
+        *("AutogradFunctionality", "AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"),
+        *("Conjugate", "Negative", "ZeroTensor"),
+    )
+)
 TORCHSCRIPT = (
     "a programmable camera cannot become TorchScript, which knows no PSFs computed from masks: export it with "
     "torch.export.export(optics, (image, depth)), or compile it with torch.compile"
@@ -24,9 +33,19 @@ def is_followed() -> bool:
         >>> torch.func.grad(lambda x: x * is_followed())(torch.tensor(0.0)), is_followed()
         (tensor(1.), False)
     """
-    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
-        return True
-    return torch._C._functorch.peek_interpreter_stack() is not None
+    return torch.compiler.is_compiling() or is_transformed()
+
+
+def is_transformed() -> bool:
+    """Whether torch.func or forward-mode derivatives need plain operations of torch, compiled or not.
+
+    Example:
+        >>> torch.func.grad(lambda x: x * is_transformed())(torch.tensor(0.0)), is_transformed()
+        (tensor(1.), False)
+    """
+    functorch = torch._C._functorch
+    # While compiling, the empty stack is an object that stands for None: it is not None, and not an interpreter.
+    return forward_ad._current_level >= 0 or isinstance(functorch.peek_interpreter_stack(), functorch.CInterpreter)
 
 
 def is_value_unknown() -> bool:
@@ -42,6 +61,26 @@ def is_value_unknown() -> bool:
     if functorch.peek_interpreter_stack() is None:
         return False
     return any(level.key() == functorch.TransformType.Vmap for level in functorch.get_interpreter_stack() or ())
+
+
+@contextmanager
+def recording_in_operator() -> Generator[None]:
+    """Let autograd record inside the implementation of an operator.
+
+    Where a dispatch mode is active, such as a counter of operations, torch calls implementations with autograd and lazy
+    conjugation switched off. Here both are on.
+
+    Example:
+        >>> x = torch.ones(1, requires_grad=True)
+        >>> with torch.no_grad(), recording_in_operator():
+        ...     (2 * x).requires_grad
+        True
+    """
+    included, excluded = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
+    for key in _KEYS_OF_RECORDING:
+        excluded = excluded.remove(key)
+    with torch._C._ForceDispatchKeyGuard(included, excluded), torch.enable_grad():
+        yield
 
 
 def refuse_torchscript() -> NoReturn:

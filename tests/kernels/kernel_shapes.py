@@ -9,16 +9,17 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
-from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW, mutual_energies
-from kornia_tidy.render.backends import direct, direct_occlusion
+from kornia_tidy.kernels import gather_ops, occlusion_ops
+from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
-from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies import round_off, written_out
@@ -28,27 +29,39 @@ DTYPES = (torch.float32, torch.float64)
 
 
 LARGEST = 3 * 10**6  # products, of calls
-CHEAP = 3 * 10**5  # products, in calls with a check of values, which is slower than the call
+CHEAP = 3 * 10**5  # products, of calls whose values are checked too, which takes longer than the calls
 
 
 @dataclass(frozen=True)
 class Call:
-    """A kernel's result, and what it should be.
+    """An operator's arguments, and what it should return.
 
     Args:
         about: the shapes, in words.
-        got: by the kernel.
-        products: that are to be made.
-        truth: returns the same in float64, and how far apart they may be.
+        name: of the operator.
+        arguments: of the operator.
+        products: number of products.
+        truth: returns the result in float64, and how far apart they may be.
     """
 
     about: str
-    got: Tensor
+    name: str
+    arguments: tuple[Any, ...]
     products: int
     truth: Callable[[], tuple[Tensor, Tensor | float]]
 
+    @property
+    def operator(self) -> torch._ops.OpOverload:
+        """The operator."""
+        return getattr(torch.ops.kornia_tidy, self.name).default
+
+    @cached_property
+    def got(self) -> Tensor:
+        """What the operator returns."""
+        return self.operator(*self.arguments)
+
     def error(self) -> float:
-        """Return the largest ratio of a difference to its bound."""
+        """Return the largest difference as a multiple of the allowed one."""
         expected, allowed = self.truth()
         off = (self.got.double() - expected).abs()
         return float(torch.where(off > 0, off / allowed, 0).max())
@@ -67,35 +80,39 @@ class _Scene:
 def gather(draw: random.Random) -> Call:
     """``mix`` and ``count_pairs`` of direct.c."""
     scene = _gathered(draw)
-    labels, slope = Labels(scene.lower, scene.fraction), scene.fraction is not None and draw.random() < 0.5
-    pairs = direct.count_pairs(labels, scene.light.dtype)
+    weight_gradient = scene.fraction is not None and draw.random() < 0.5
+    pairs = gather_ops.count_pairs(scene.lower, scene.fraction, scene.light.dtype, 1)
     assert pairs >= 0, scene.about
-    got = direct.mix_directly(scene.light, scene.psfs, labels, weight_gradient=slope)
 
     def truth() -> tuple[Tensor, Tensor]:
-        weights = _weights(labels, len(scene.psfs), slope=slope)
+        weights = _weights(scene, gradient=weight_gradient)
         expected, total = (_mixed(x(scene.light), x(scene.psfs), x(weights)) for x in (Tensor.double, _magnitudes))
-        return expected, 2 * gamma(scene.psfs.shape[-1] ** 2 + 4, got.dtype) * total
+        return expected, 2 * gamma(scene.psfs.shape[-1] ** 2 + 4, scene.light.dtype) * total
 
-    return Call(f"{scene.about} slope {slope}", got, scene.products, truth)
+    arguments = scene.light, scene.psfs, scene.lower, scene.fraction, weight_gradient
+    about = f"{scene.about} weight_gradient {weight_gradient}"
+    return Call(about, "gather_direct", arguments, scene.products, truth)
 
 
 def correlate(draw: random.Random) -> Call:
     """``correlate`` of direct.c: the gradient of a sum over pixels to the PSFs."""
     scene = _gathered(draw)
-    labels = Labels(scene.lower, scene.fraction)
+    weight_gradient = scene.fraction is not None and draw.random() < 0.3
     own = torch.randn(len(scene.light), scene.light.shape[1], *scene.lower.shape[-2:], dtype=scene.light.dtype)
-    got = direct.correlate_directly(scene.light, own, labels, scene.psfs.shape)
+    if draw.random() < 0.3:
+        own = own.transpose(-2, -1).contiguous().transpose(-2, -1)
 
     def truth() -> tuple[Tensor, Tensor]:
         sums = []
         for x in (Tensor.double, _magnitudes):
             psfs = x(scene.psfs).requires_grad_()
-            coded = _mixed(x(scene.light), psfs, x(_weights(labels, len(psfs))))
+            coded = _mixed(x(scene.light), psfs, x(_weights(scene, gradient=weight_gradient)))
             sums.append(torch.autograd.grad((coded * x(own)).sum(), psfs)[0])
-        return sums[0], 2 * gamma(own.numel() + 4, got.dtype) * sums[1]
+        return sums[0], 2 * gamma(own.numel() + 4, own.dtype) * sums[1]
 
-    return Call(scene.about, got, scene.products, truth)
+    arguments = scene.light, own, scene.lower, scene.fraction, len(scene.psfs), weight_gradient
+    about = f"{scene.about} weight_gradient {weight_gradient}"
+    return Call(about, "gather_direct_psf_gradient", arguments, scene.products, truth)
 
 
 def occlude(draw: random.Random) -> Call:
@@ -126,11 +143,9 @@ def occlude(draw: random.Random) -> Call:
     share = None if fraction is None else pad_border(fraction[:, None], radius, border)[:, 0]
     inside = pad_border(torch.ones(1, 1, height, width, dtype=dtype), radius, border)[0] if border == "zero" else None
     mean = None if veil is None else image.mean((-2, -1))
-    assert direct_occlusion.can_go_directly(plane, psfs), about
-    counts = direct_occlusion.count(plane, psfs, below, share)
+    counts = occlusion_ops.count_work(plane, psfs, below, share, bands=12)
     assert min(counts) >= 0, about
     seen = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
-    got = direct_occlusion.occlude_directly(plane, psfs, below, share, mean, seen, inside)
 
     def truth() -> tuple[Tensor, float]:
         shared = None if fraction is None else fraction[:, None]
@@ -139,7 +154,8 @@ def occlude(draw: random.Random) -> Call:
         apart = 1 if dtype == torch.float32 else 1 + 3 * side**2
         return expected, 6 * layers * (layers + 1) * apart * gamma(side**2 + 16, dtype)
 
-    return Call(about, got, products, truth)
+    arguments = plane, psfs, below, share, mean, seen, inside
+    return Call(about, "occlusion_direct", arguments, products, truth)
 
 
 def energies(draw: random.Random) -> Call:
@@ -154,13 +170,13 @@ def energies(draw: random.Random) -> Call:
         kernels = kernels.transpose(1, 2).contiguous().transpose(1, 2)
     weights = torch.rand(states, dtype=dtype)
     about = f"{dtype} states {states} cells {cells} order {order} depths {depths} window {window}"
-    got = mutual_energies(field, weights, kernels)
 
     def truth() -> tuple[Tensor, Tensor]:
         expected = written_out(field.to(torch.complex128), weights.double(), kernels.to(torch.complex128))
         return expected, 2 * round_off(field, weights, kernels)
 
-    return Call(about, got, depths * window**2 * cells * (cells + states * order**2), truth)
+    products = depths * window**2 * cells * (cells + states * order**2)
+    return Call(about, "mutual_intensity_energies", (field, weights, kernels), products, truth)
 
 
 KERNELS: dict[str, Callable[[random.Random], Call]] = {
@@ -180,23 +196,26 @@ def _gathered(draw: random.Random) -> _Scene:
     dtype, products = draw.choice(DTYPES), LARGEST + 1
     while products > LARGEST:
         side = draw.choice((1, 3, 5, 7, 9, 15, 21, 33))
-        height, width = _size(draw, direct.STRIP_ROWS, 40), _size(draw, 128 // dtype.itemsize, 70)
+        height, width = _size(draw, gather_ops.STRIP_ROWS, 40), _size(draw, 128 // dtype.itemsize, 70)
         if draw.random() < 0.02:  # more bands or blocks than a piece of a correlation holds
             height, width, side = draw.choice(((290, 33, 3), (7, 1300, 3)))
         images, channels, layers = draw.randint(1, 3), draw.randint(1, 3), draw.randint(1, 8)
         products = images * channels * layers * height * width * side**2
     light = torch.randn(images, channels, height + side - 1, width + side - 1, dtype=dtype)
-    memory = draw.choice(("whole", "shared by channels", "cut out"))
+    memory = draw.choice(("whole", "shared by channels", "cut out", "columns first"))
     if memory == "shared by channels":
         light = light[:, :1].expand(-1, channels, -1, -1)
     elif memory == "cut out":
         light = torch.nn.functional.pad(light, (0, 3, 0, 2))[..., : light.shape[-2], : light.shape[-1]]
+    elif memory == "columns first":
+        light = light.mT.contiguous().mT
     psfs = torch.randn(layers, channels, side, side, dtype=dtype)
     maps = draw.choice((1, images))
     lower, fraction = (
         x if x is None else x.expand(images, -1, -1) for x in _layers(draw, (maps, height, width), layers, dtype)
     )
-    assert direct.can_go_directly(Labels(lower, fraction), dtype)
+    if memory == "columns first":
+        lower, fraction = (x if x is None else x.mT.contiguous().mT for x in (lower, fraction))
     about = f"{dtype} light {tuple(light.shape)} {memory} psfs {tuple(psfs.shape)} shared {fraction is not None}"
     return _Scene(light, psfs, lower, fraction, about, products)
 
@@ -223,13 +242,14 @@ def _layers(
     return lower.contiguous(), fraction
 
 
-def _weights(labels: Labels, layers: int, *, slope: bool = False) -> Tensor:
-    """Return the weights of the layers, (B, D, H, W), or for gradients their differences between adjacent layers."""
-    lower = one_hot(labels.layer_index, layers + 1).movedim(-1, 1).double()
-    upper = one_hot(labels.layer_index + 1, layers + 1).movedim(-1, 1).double()
-    if slope:
+def _weights(scene: _Scene, *, gradient: bool) -> Tensor:
+    """(B, D, H, W) weights of each layer, or their derivatives with respect to the layer weight."""
+    layers = len(scene.psfs)
+    lower = one_hot(scene.lower, layers + 1).movedim(-1, 1).double()
+    upper = one_hot(scene.lower + 1, layers + 1).movedim(-1, 1).double()
+    if gradient:
         return (upper - lower)[:, :layers]
-    fraction = torch.zeros(()) if labels.layer_weight is None else labels.layer_weight[:, None].double()
+    fraction = torch.zeros(()) if scene.fraction is None else scene.fraction[:, None].double()
     return ((1 - fraction) * lower + fraction * upper)[:, :layers]
 
 

@@ -16,7 +16,7 @@ import torch
 
 from kornia_tidy.kernels import build as module
 from kornia_tidy.kernels.build import CompiledCodeWarning, build, compiled, find_compiler
-from kornia_tidy.render.backends.direct import SOURCE
+from kornia_tidy.kernels.gather_ops import SOURCE
 from tests.base import BaseTester
 
 pytestmark = pytest.mark.skipif(build(SOURCE, torch.float32).library is None, reason="no C compiler on this machine")

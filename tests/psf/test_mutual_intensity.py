@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.psf import mutual_intensity
@@ -59,7 +60,7 @@ class TestInC(BaseTester):
 
     def test_feature_only_without_gradients_and_for_small_windows(self, monkeypatch):
         taken = []
-        monkeypatch.setattr(mutual_intensity, "_energies_in_c", lambda *x: taken.append(x[2].shape[1]))
+        monkeypatch.setattr(mutual_intensity, "mutual_intensity_energies", lambda *x: taken.append(x[2].shape[1]))
         for window in (9, LARGEST_WINDOW + 2):
             field, kernels = (torch.randn(*shape, dtype=torch.complex64) for shape in ((2, 8, 8), (2, window, 2, 8)))
             mutual_energies(field, torch.ones(2), kernels)
@@ -67,6 +68,41 @@ class TestInC(BaseTester):
             with torch.no_grad():
                 mutual_energies(field, torch.ones(2), kernels)
         assert taken == [9, 9]
+
+
+class TestOperator(BaseTester):
+    @pytest.mark.parametrize("learning", [False, True])
+    def test_dynamo_passes_the_checks_of_operators(self, learning):
+        """Schema, fake tensors of any shape, gradients as registered, and the compiler's dispatch."""
+        case = [x.requires_grad_(learning) for x in random_case()]
+        torch.library.opcheck(torch.ops.kornia_tidy.mutual_energies.default, (*case, learning))
+
+    @pytest.mark.parametrize("wanted", [[True, True, True], [False, True, False]])
+    def test_dynamo_the_gradients_pass_the_checks_of_operators(self, wanted):
+        case = random_case()
+        light = torch.randn(4, 5, 5, dtype=torch.float64)
+        torch.library.opcheck(torch.ops.kornia_tidy.mutual_energies_gradients.default, (*case, light, wanted))
+
+    def test_dynamo_equals_eager_to_the_last_bit(self):
+        case = [x.requires_grad_() for x in random_case()]
+        compiled = torch.compile(mutual_energies, fullgraph=True, backend="aot_eager")
+        results = []
+        for energies in (mutual_energies, compiled):
+            got = energies(*case)
+            results.append((got, *torch.autograd.grad(got.square().sum(), case)))
+        for expected, got in zip(*results, strict=True):
+            assert torch.equal(expected, got)
+        with torch.no_grad():
+            assert torch.equal(compiled(*case), mutual_energies(*case))
+
+    def test_feature_gradients_are_the_same_while_operations_are_counted(self):
+        """A dispatch mode has torch call operators with autograd and conjugation switched off."""
+        case = [x.requires_grad_() for x in random_case()]
+        expected = torch.autograd.grad(mutual_energies(*case).square().sum(), case)
+        with FlopCounterMode(display=False):
+            got = torch.autograd.grad(mutual_energies(*case).square().sum(), case)
+        for one, other in zip(expected, got, strict=True):
+            assert torch.equal(one, other)
 
 
 class TestNumerics(BaseTester):

@@ -1,7 +1,7 @@
 """The dense backend: the whole plane is convolved for every layer of the scene, in plain operations of torch.
 
 It is the definition that other backends are compared with. They are differentiated by hand, once; a gradient that is
-differentiated in turn is made from these functions instead.
+differentiated in turn is made by this backend instead.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.render.backend import GradientPairs, gradient_pairs
 from kornia_tidy.render.backends.dense_occlusion import occlude_dense, occlusion_planes
 from kornia_tidy.render.borders import from_spectrum, padded_size, to_spectrum
 from kornia_tidy.render.cost_model import DenseOcclusionWork, DenseWork, Work
@@ -42,6 +43,15 @@ class DenseBackend:
         composite = gather_dense if scene.compositing == "gather" else scatter_dense
         index, weight = scene.sorted_layers
         return composite(scene.plane, scene.psfs, weight, index)
+
+    @torch.enable_grad()
+    def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+        """Return the gradients of the scene's own tensors: the light is rendered again."""
+        given = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+        tensors = [x for x in given if x is not None and x.requires_grad]
+        coded = self.render(scene)
+        found = torch.autograd.grad(coded, tensors, gradient.to(coded), retain_graph=True, allow_unused=True)
+        return gradient_pairs(tensors, found)
 
 
 def gather_dense(plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, layer_index: Tensor) -> Tensor:

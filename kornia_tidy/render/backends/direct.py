@@ -9,41 +9,28 @@ pixels of many layers.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.build import KERNELS, REALS, compiled
+from kornia_tidy.kernels import gather_ops
+from kornia_tidy.kernels.build import REALS, compiled
+from kornia_tidy.kernels.gather_ops import SOURCE, gather_direct, gather_direct_psf_gradient
+from kornia_tidy.kernels.occlusion_ops import occlusion_direct
+from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends import direct_occlusion
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.block_plan import plan_blocks
-from kornia_tidy.render.backends.dense import gather_dense
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.tile_plan import BLOCKS, choose_grid
-from kornia_tidy.render.backends.tiled import gather_gradients, twice_differentiable
+from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
+from kornia_tidy.render.backends.tiled import gather_gradients
+from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.cost_model import DirectWork, Work
 from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import LayeredScene
 
-SOURCE = KERNELS / "direct.c"
-STRIP_ROWS, STRIP_BYTES = 4, 64  # a strip of pixels, see direct.c
 EVERY = 4  # columns of strips are counted in every fourth row of them
-SLABS = 4  # sums of a correlation that each thread makes in turn: enough for all to end together
-SLAB_BYTES = 64 << 20  # most memory of all these sums
-
-
-class _Scene(ctypes.Structure):
-    """The struct of the same name in direct.c."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
-        *((name, ctypes.c_int64) for name in ("slabs", "plane_image", "plane_channel", "plane_row", "lower_image")),
-        *((name, ctypes.c_int64) for name in ("lower_row", "share_image", "share_row", "slope")),
-        *((name, ctypes.c_void_p) for name in ("plane", "psfs", "lower", "share", "own", "out")),
-    )
 
 
 class DirectBackend:
@@ -75,10 +62,28 @@ class DirectBackend:
         """Return the rendered light."""
         keep_memory()
         if scene.compositing == "occlusion":
-            return direct_occlusion.occlude_scene(occlusion_planes(scene), scene.labels)
-        weight = scene.sorted_layers[1]
-        weight = None if weight is None else weight.expand(len(scene.image), -1, -1)
-        return _GatherDirectly.apply(scene.plane, scene.psfs, weight, scene.labels)
+            light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
+            return occlusion_direct(light, psfs, index, weight, mean, stray_light, inside)
+        return gather_direct(scene.plane, scene.psfs, scene.labels.layer_index, scene.labels.layer_weight)
+
+    def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+        """Return the gradients of PSFs and layer weight directly, those of the image and of occlusion by tiles."""
+        keep_memory()
+        labels, layers, side = scene.labels, len(scene.psfs), scene.psfs.shape[-1]
+        if scene.compositing == "occlusion":
+            grid = choose_grid(labels, layers, side, WINDOWS)
+            return occlusion_gradients(occlusion_planes(scene), labels, grid, WINDOWS, gradient)
+        tensors = scene.plane, scene.psfs, scene.batch_weight
+        plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
+        of_plane = of_psfs = of_weight = None
+        if wants_gradient(tensors[0]):
+            plan = plan_blocks(labels, layers, choose_grid(labels, layers, side), BLOCKS)
+            of_plane, _, _ = gather_gradients(plane, psfs, gradient, plan, (True, False, False))
+        if wants_gradient(tensors[1]):
+            of_psfs = gather_direct_psf_gradient(plane, gradient, index, weight, layers)
+        if wants_gradient(tensors[2]):
+            of_weight = gather_direct(plane, psfs, index, weight, weight_gradient=True).mul_(gradient).sum(1)
+        return gradient_pairs(tensors, (of_plane, of_psfs, of_weight))
 
 
 def refusal(labels: Labels, dtype: torch.dtype) -> str | None:
@@ -93,7 +98,7 @@ def refusal(labels: Labels, dtype: torch.dtype) -> str | None:
         return f"direct convolution runs on processors, and the image is on {index.device.type!r}"
     if dtype not in REALS:
         return f"direct convolution is in float32 or float64, and the image in {dtype}"
-    (height, width), smallest = index.shape[-2:], (STRIP_ROWS, 2 * STRIP_BYTES // dtype.itemsize)
+    (height, width), smallest = index.shape[-2:], gather_ops.smallest_output(dtype)
     if height < smallest[0] or width < smallest[1]:
         least = "x".join(map(str, smallest))
         return f"direct convolution needs an output of at least {least} pixels, got {height}x{width}"
@@ -107,123 +112,6 @@ def can_go_directly(labels: Labels, dtype: torch.dtype) -> bool:
     return refusal(labels, dtype) is None
 
 
-class _GatherDirectly(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, labels: Labels) -> Tensor:
-        ctx.save_for_backward(plane, psfs, layer_weight)
-        ctx.labels = labels
-        return mix_directly(plane, psfs, labels)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (grad,), wanted, labels = grad_outputs, ctx.needs_input_grad, ctx.labels
-        if torch.is_grad_enabled():
-            return *twice_differentiable(gather_dense, ctx.saved_tensors, labels, grad, wanted), None
-        plane, psfs, _ = ctx.saved_tensors
-        of_plane = of_psfs = of_weight = None
-        if wanted[0]:
-            grid = choose_grid(labels, len(psfs), psfs.shape[-1])
-            plan = plan_blocks(labels, len(psfs), grid, BLOCKS)
-            of_plane, _, _ = gather_gradients(plane, psfs, grad, plan, (True, False, False))
-        if wanted[1]:
-            of_psfs = correlate_directly(plane, grad, labels, psfs.shape)
-        if wanted[2]:
-            of_weight = mix_directly(plane, psfs, labels, weight_gradient=True).mul_(grad).sum(1)
-        return of_plane, of_psfs, of_weight, None
-
-
-def mix_directly(plane: Tensor, psfs: Tensor, labels: Labels, *, weight_gradient: bool = False) -> Tensor:
-    """Convolve a plane with the PSFs of each pixel's own layers and blend them: gather.
-
-    Args:
-        plane: (B, C, H + P - 1, W + P - 1) light.
-        psfs: (D, C, P, P) of the plane's dtype.
-        labels: the layers of each pixel, (B, H, W).
-        weight_gradient: instead, what a pixel would gain by moving from its layer to the next.
-
-    Returns:
-        (B, C, H, W).
-
-    Raises:
-        IndexError: if a pixel lies in no layer.
-    """
-    batch, channels = plane.shape[:2]
-    plane = _rows(plane)
-    columns = psfs.flip((-2, -1)).transpose(-2, -1).contiguous()
-    blended = plane.new_empty(batch, channels, *labels.layer_index.shape[-2:])
-    scene, kept = _scene(plane, psfs.shape, labels)
-    scene.psfs, scene.out, scene.slope = columns.data_ptr(), blended.data_ptr(), weight_gradient
-    if _library(plane.dtype).mix(ctypes.byref(scene)):
-        raise IndexError(f"a pixel lies in none of the {len(psfs)} layers: its depth or defocus is not a number")
-    del kept
-    return blended
-
-
-def correlate_directly(plane: Tensor, own: Tensor, labels: Labels, shape: torch.Size) -> Tensor:
-    """Return the gradient of the PSFs: the correlation of each layer's own pixels with the light that they see.
-
-    Args:
-        plane: (B, C, H + P - 1, W + P - 1) light.
-        own: (B, C, H, W): for :func:`mix_directly` the gradient of what it returns.
-        labels: the layers of each pixel of ``own``, (B, H, W).
-        shape: (D, C, P, P) of the PSFs.
-
-    Returns:
-        (D, C, P, P). Sums are made in the same order every time.
-    """
-    plane, own = _rows(plane), own.contiguous()
-    slabs = max(1, min(SLABS * torch.get_num_threads(), SLAB_BYTES // (shape.numel() * plane.element_size())))
-    sums = plane.new_zeros(slabs, *shape)
-    scene, kept = _scene(plane, shape, labels)
-    scene.own, scene.out, scene.slabs = own.data_ptr(), sums.data_ptr(), slabs
-    if _library(plane.dtype).correlate(ctypes.byref(scene)):
-        raise MemoryError(f"no memory to correlate with PSFs of {shape[-1]}x{shape[-1]} pixels")
-    del kept
-    return sums.sum(0).flip((-2, -1))
-
-
 def count_pairs(labels: Labels, dtype: torch.dtype) -> int:
-    """Return how many pairs of a strip and a layer present in it there are, from every fourth row of strips."""
-    plane = torch.empty((), dtype=dtype).expand(len(labels.layer_index), 1, 1, 1)
-    scene, kept = _scene(plane, torch.Size((2**31 - 1, 1, 1, 1)), labels)  # however many layers there are
-    pairs = _library(dtype).count_pairs(ctypes.byref(scene), EVERY)
-    del kept
-    return EVERY * pairs
-
-
-def _library(dtype: torch.dtype) -> ctypes.CDLL:
-    library = compiled(SOURCE, dtype)
-    assert library is not None
-    library.count_pairs.restype = ctypes.c_int64
-    library.count_pairs.argtypes = ctypes.c_void_p, ctypes.c_int64
-    return library
-
-
-def _rows(plane: Tensor) -> Tensor:
-    """Return a plane with the pixels of a row side by side in memory."""
-    return plane if plane.stride(-1) == 1 else plane.contiguous()
-
-
-def _scene(plane: Tensor, shape: torch.Size, labels: Labels) -> tuple[_Scene, list[Tensor]]:
-    """Return the struct that direct.c reads, and the tensors that own its memory."""
-    index = _rows(labels.layer_index)
-    weight = None if labels.layer_weight is None else _rows(labels.layer_weight.to(plane.dtype))
-    scene = _Scene(
-        images=plane.shape[0],
-        channels=plane.shape[1],
-        height=index.shape[-2],
-        width=index.shape[-1],
-        layers=shape[0],
-        side=shape[-1],
-        threads=torch.get_num_threads(),
-        plane_image=plane.stride(0),
-        plane_channel=plane.stride(1),
-        plane_row=plane.stride(2),
-        lower_image=index.stride(0),
-        lower_row=index.stride(1),
-        plane=plane.data_ptr(),
-        lower=index.data_ptr(),
-    )
-    if weight is not None:
-        scene.share_image, scene.share_row, scene.share = weight.stride(0), weight.stride(1), weight.data_ptr()
-    return scene, [plane, index] if weight is None else [plane, index, weight]
+    """Return the number of pairs of a strip and a layer present in it, from every fourth row of strips."""
+    return EVERY * gather_ops.count_pairs(labels.layer_index, labels.layer_weight, dtype, EVERY)

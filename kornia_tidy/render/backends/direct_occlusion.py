@@ -9,38 +9,17 @@ tiles.
 
 from __future__ import annotations
 
-import ctypes
 import math
-from typing import Any
 
-import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from kornia_tidy.kernels.build import KERNELS, REALS, compiled
-from kornia_tidy.render.backends.dense_occlusion import OcclusionPlanes
-from kornia_tidy.render.backends.tile_plan import WINDOWS, choose_grid
-from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
-from kornia_tidy.render.backends.window_plan import WindowPlan, plan_windows
+from kornia_tidy.kernels.build import REALS, compiled
+from kornia_tidy.kernels.occlusion_ops import SMALLEST_SIDE, SOURCE, count_work, smallest_output
 from kornia_tidy.render.cost_model import DirectOcclusionWork
-from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import LayeredScene
 
-SOURCE = KERNELS / "occlusion.c"
-BAND, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
-SMALLEST_SIDE = BAND - 1  # px, of PSFs; smaller ones are made as large
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 COUNTED, FEWEST_COUNTED = 12, 3  # bands of blocks that are counted to know the work
-
-
-class _Scene(ctypes.Structure):
-    """The struct ``panes`` in occlusion.c."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
-        *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "map_image", "map_row")),
-        *((name, ctypes.c_void_p) for name in ("plane", "psfs", "lower", "share", "mean", "veil", "out")),
-    )
 
 
 def refusal(output_size: tuple[int, ...], psfs: Tensor) -> str | None:
@@ -56,7 +35,7 @@ def refusal(output_size: tuple[int, ...], psfs: Tensor) -> str | None:
         return f"direct convolution runs on processors, and the PSFs are on {psfs.device.type!r}"
     if psfs.dtype not in REALS:
         return f"direct convolution is in float32 or float64, and the PSFs in {psfs.dtype}"
-    smallest = (BAND, 2 * STRIP_BYTES // psfs.element_size())
+    smallest = smallest_output(psfs.dtype)
     if output_size[0] < smallest[0] or output_size[1] < smallest[1]:
         size = "x".join(map(str, output_size))
         return f"direct occlusion needs an output of at least {smallest[0]}x{smallest[1]} pixels, got {size}"
@@ -83,128 +62,8 @@ def scene_work(scene: LayeredScene) -> DirectOcclusionWork:
     return DirectOcclusionWork(batch * pixels, *counts, side, len(scene.psfs), channels, itemsize)
 
 
-def occlude_scene(planes: OcclusionPlanes, labels: Labels) -> Tensor:
-    """Render with occlusion, with gradients by tiles.
-
-    Args:
-        planes: of the scene.
-        labels: the layers of the pixels of ``planes``.
-
-    Returns:
-        (B, C, H, W).
-    """
-    return _OccludeDirectly.apply(*planes, labels)
-
-
-class _OccludeDirectly(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, *planes_and_labels: Any) -> Tensor:
-        *tensors, ctx.labels = planes_and_labels
-        planes = OcclusionPlanes(*tensors)
-        ctx.save_for_backward(*planes)
-        light, psfs, weight, mean, stray_light, index, inside = planes
-        return occlude_directly(light, psfs, index, weight, mean, stray_light, inside)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        planes, labels = OcclusionPlanes(*ctx.saved_tensors), ctx.labels
-
-        def plan() -> WindowPlan:
-            layers, channels, psf_size = planes.psfs.shape[:3]
-            grid = choose_grid(labels, layers, psf_size, WINDOWS)
-            return plan_windows(labels, layers, channels, grid, WINDOWS, dark=planes.inside is not None)
-
-        return *occlusion_gradients(planes, plan, grad_outputs[0], ctx.needs_input_grad), None
-
-
-def count(plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None) -> list[int]:
+def count(plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None) -> tuple[int, int, int, int]:
     """Return the counts of a :class:`~kornia_tidy.render.cost_model.DirectOcclusionWork`, from every few bands."""
-    scene, kept = _scene(plane, psfs, layer_index, layer_weight, None)
     # Small PSFs are rendered in little more time than it takes to count, and are the fastest by far.
-    counted = min(COUNTED, max(FEWEST_COUNTED, scene.side // 4))
-    every = max(1, scene.images * scene.height // (BAND * counted))
-    counts = (ctypes.c_int64 * 4)()
-    if _library(plane.dtype).count(ctypes.byref(scene), ctypes.c_int64(every), counts):
-        raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
-    del kept
-    return [every * number for number in counts]
-
-
-def occlude_directly(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-) -> Tensor:
-    """Render with occlusion. See :func:`kornia_tidy.render.backends.dense_occlusion.occlude_dense`, which it equals.
-
-    Args:
-        plane: (B, C, H + P - 1, W + P - 1) image, with all that lies beyond its border.
-        psfs: (D, C, P, P) of the plane's dtype, not negative anywhere.
-        layer_index: (B or 1, H + P - 1, W + P - 1) layer of each pixel, in any dtype, and
-        layer_weight: weight of the next one, or None.
-        mean: (B, C) mean light of each image, and
-        stray_light: (D, C) fraction of it that each layer takes on; or None.
-        inside: (1, H + P - 1, W + P - 1) 1 on the image and 0 in the dark beyond it, or None for no dark.
-
-    Returns:
-        (B, C, H, W).
-    """
-    scene, kept = _scene(plane, psfs, layer_index, layer_weight, inside)
-    coded = plane.new_empty(*plane.shape[:2], scene.height, scene.width)
-    scene.out = coded.data_ptr()
-    if mean is not None and stray_light is not None:  # both or none
-        kept += [mean.to(plane.dtype).contiguous(), stray_light.to(plane.dtype).contiguous()]
-        scene.mean, scene.veil = (x.data_ptr() for x in kept[-2:])
-    if _library(plane.dtype).occlude(ctypes.byref(scene)):
-        raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
-    del kept
-    return coded
-
-
-def _library(dtype: torch.dtype) -> ctypes.CDLL:
-    library = compiled(SOURCE, dtype)
-    assert library is not None
-    return library
-
-
-def _scene(
-    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, inside: Tensor | None
-) -> tuple[_Scene, list[Tensor]]:
-    """Return the struct that occlusion.c reads, and the tensors that own its memory."""
-    index, weight = layer_index.to(plane.dtype), layer_weight
-    if weight is not None:  # a pixel of one layer alone gets the index of this layer
-        full = weight == 1
-        index, weight = index + full, weight.detach().to(plane.dtype).masked_fill(full, 0)
-    if inside is not None:
-        index = index.masked_fill(inside == 0, len(psfs))
-    extra = (max(0, SMALLEST_SIDE - psfs.shape[-1]) // 2,) * 4
-    if extra[0]:  # no light comes from there
-        psfs, plane, index = pad(psfs, extra), pad(plane, extra), pad(index, extra, mode="replicate")
-        weight = None if weight is None else pad(weight, extra, mode="replicate")
-    plane, index, columns = (x.contiguous() for x in (plane, index, psfs.flip((-2, -1)).transpose(-2, -1)))
-    scene = _Scene(
-        images=plane.shape[0],
-        channels=plane.shape[1],
-        height=plane.shape[2] - psfs.shape[-1] + 1,
-        width=plane.shape[3] - psfs.shape[-1] + 1,
-        layers=psfs.shape[0],
-        side=psfs.shape[-1],
-        threads=torch.get_num_threads(),
-        plane_image=plane.stride(0),
-        plane_channel=plane.stride(1),
-        plane_row=plane.stride(2),
-        map_image=index.stride(0) if len(index) > 1 else 0,
-        map_row=index.stride(1),
-        plane=plane.data_ptr(),
-        psfs=columns.data_ptr(),
-        lower=index.data_ptr(),
-    )
-    if weight is None:
-        return scene, [plane, index, columns]
-    weight = weight.contiguous()
-    scene.share = weight.data_ptr()
-    return scene, [plane, index, columns, weight]
+    bands = min(COUNTED, max(FEWEST_COUNTED, max(psfs.shape[-1], SMALLEST_SIDE) // 4))
+    return count_work(plane, psfs, layer_index, layer_weight, bands)

@@ -1,25 +1,24 @@
 """The tiled backend: each tile is convolved by transforms with the PSFs of the layers it contains and with no other.
 
-For the backward pass only the inputs are kept; spectra are computed again. Gradients that are differentiated in turn
-are made by the functions of :mod:`kornia_tidy.render.backends.dense`.
+For the backward pass nothing is kept; spectra are computed again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.block_plan import BlockPlan, plan_blocks
-from kornia_tidy.render.backends.dense import differentiable_gradients, gather_dense, scatter_dense
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.tile_plan import (
     BLOCKS,
     WINDOWS,
+    Grid,
     TileKind,
     cheapest_grid,
     choose_grid,
@@ -27,11 +26,10 @@ from kornia_tidy.render.backends.tile_plan import (
     least_work,
 )
 from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
-from kornia_tidy.render.backends.tiled_occlusion import occlude_tiled
+from kornia_tidy.render.backends.tiled_occlusion import occlude_tiled, occlusion_gradients
 from kornia_tidy.render.borders import pad_border
 from kornia_tidy.render.cost_model import TiledOcclusionWork, TiledWork, Work
 from kornia_tidy.render.cost_store import settled_profile
-from kornia_tidy.render.layers import Labels
 from kornia_tidy.render.scene import LayeredScene
 
 
@@ -74,15 +72,30 @@ class TiledBackend:
         grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
-        weight = scene.sorted_layers[1]
-        weight = None if weight is None else weight.expand(len(scene.image), -1, -1)
         plan = plan_blocks(labels, layers, grid, kind)
         if scene.compositing == "scatter":
-            return _Scatter.apply(scene.plane, scene.psfs, weight, plan)
-        # Room below and on the right for tiles that hang over, where the border can fill it.
-        spare = (grid.rows * grid.tile - grid.height, grid.columns * grid.across * grid.tile - grid.width)
-        plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, spare)
-        return _Gather.apply(plane, scene.psfs, weight, plan)
+            return _scatter(scene.plane, scene.psfs, plan)
+        return _gather(_plane_with_spare(scene, grid), scene.psfs, plan)
+
+    def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+        """Return the gradients of the padded planes and of the PSFs."""
+        keep_memory()
+        labels, layers = scene.labels, len(scene.psfs)
+        kind = self.windows if scene.compositing == "occlusion" else self.blocks
+        grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
+        if scene.compositing == "occlusion":
+            return occlusion_gradients(occlusion_planes(scene), labels, grid, kind, gradient)
+        plan, scatters = plan_blocks(labels, layers, grid, kind), scene.compositing == "scatter"
+        tensors = scene.plane if scatters else _plane_with_spare(scene, grid), scene.psfs, scene.batch_weight
+        wanted = [wants_gradient(x) for x in tensors]
+        gradients = _scatter_gradients if scatters else gather_gradients
+        return gradient_pairs(tensors, gradients(tensors[0].detach(), scene.psfs.detach(), gradient, plan, wanted))
+
+
+def _plane_with_spare(scene: LayeredScene, grid: Grid) -> Tensor:
+    """Return the plane with room below and on the right for tiles that hang over, where the border can fill it."""
+    spare = (grid.rows * grid.tile - grid.height, grid.columns * grid.across * grid.tile - grid.width)
+    return pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, spare)
 
 
 def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work:
@@ -92,30 +105,19 @@ def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work
     return replace(work, channels=scene.image.shape[1], itemsize=scene.image.element_size())
 
 
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, plan: BlockPlan) -> Tensor:
-        ctx.save_for_backward(plane, psfs, layer_weight)
-        ctx.plan = plan
-        work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
-        blended = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
-        for chunk in plan.chunks:
-            offsets = work.offsets(chunk)
-            for c in range(psfs.shape[1]):
-                light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-                blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-                work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
-        return blended
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (grad,), wanted = grad_outputs, ctx.needs_input_grad
-        if torch.is_grad_enabled():
-            return *twice_differentiable(gather_dense, ctx.saved_tensors, ctx.plan.labels, grad, wanted), None
-        plane, psfs, _ = ctx.saved_tensors
-        return *gather_gradients(plane, psfs, grad, ctx.plan, wanted), None
+def _gather(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
+    work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
+    blended = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+            blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
+            work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
+    return blended
 
 
+@torch.no_grad()
 def gather_gradients(
     plane: Tensor, psfs: Tensor, grad: Tensor, plan: BlockPlan, wanted: Sequence[bool]
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -150,64 +152,37 @@ def gather_gradients(
     return full, gradients.of_psfs(psfs, conjugate=False), gradients.layer_weight
 
 
-class _Scatter(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, plan: BlockPlan) -> Tensor:
-        ctx.save_for_backward(plane, psfs, layer_weight)
-        ctx.plan = plan
-        work = TileWorkspace(plan, psfs, 0)
-        full = work.tiled_plane(plane)
-        for chunk in plan.chunks:
-            offsets = work.offsets(chunk)
-            for c in range(psfs.shape[1]):
-                own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
-                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
-        return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (grad,), wanted = grad_outputs, ctx.needs_input_grad
-        (plane, psfs, _), plan = ctx.saved_tensors, ctx.plan
-        if torch.is_grad_enabled():
-            return *twice_differentiable(scatter_dense, ctx.saved_tensors, plan.labels, grad, wanted), None
-        work = TileWorkspace(plan, psfs, 0)
-        gradients = TileGradients(wanted, plane, work)
-        gathered = torch.empty_like(plane) if gradients.plane else None
-        full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
-        for chunk in plan.chunks:
-            offsets = work.offsets(chunk)
-            for c in range(psfs.shape[1]):
-                light = torch.fft.fft2(work.windows(full[:, c], chunk))
-                pixels = plane[:, c][chunk.pixels]
-                if gradients.psfs is not None:
-                    own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
-                    gradients.add_psfs(light, own, chunk, c)
-                if gathered is not None or gradients.layer_weight is not None:
-                    blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
-                    if gradients.layer_weight is not None:
-                        gradients.add_layer_weight(blurred, pixels, offsets, chunk)
-                    if gathered is not None:
-                        work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
-        return gathered, gradients.of_psfs(psfs, conjugate=True), gradients.layer_weight, None
+def _scatter(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
+    work = TileWorkspace(plan, psfs, 0)
+    full = work.tiled_plane(plane)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
+            work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
+    return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
 
 
-def twice_differentiable(
-    render: Callable[..., Tensor], planes: Sequence[Tensor | None], labels: Labels, grad: Tensor, wanted: Sequence[bool]
-) -> list[Tensor | None]:
-    """Return the gradients with respect to plane, PSFs and layer weight so that they can be differentiated in turn.
-
-    Args:
-        render: :func:`~kornia_tidy.render.backends.dense.gather_dense` or ``scatter_dense``.
-        planes: plane, PSFs and layer weight. The plane may have spare rows and columns, which no pixel sees.
-        labels: the layers of each pixel.
-        grad: gradient of the rendered light.
-        wanted: of which of the planes.
-    """
-    psfs = planes[1]
-    assert psfs is not None
-    height, width = grad.shape[-2] + psfs.shape[-1] - 1, grad.shape[-1] + psfs.shape[-1] - 1
-
-    def rendered(plane: Tensor, psfs: Tensor, layer_weight: Tensor | None) -> Tensor:
-        return render(plane[..., :height, :width], psfs, layer_weight, labels.layer_index)
-
-    return differentiable_gradients(rendered, planes, grad, wanted[:3])
+@torch.no_grad()
+def _scatter_gradients(
+    plane: Tensor, psfs: Tensor, grad: Tensor, plan: BlockPlan, wanted: Sequence[bool]
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    work = TileWorkspace(plan, psfs, 0)
+    gradients = TileGradients(wanted, plane, work)
+    gathered = torch.empty_like(plane) if gradients.plane else None
+    full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
+    for chunk in plan.chunks:
+        offsets = work.offsets(chunk)
+        for c in range(psfs.shape[1]):
+            light = torch.fft.fft2(work.windows(full[:, c], chunk))
+            pixels = plane[:, c][chunk.pixels]
+            if gradients.psfs is not None:
+                own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
+                gradients.add_psfs(light, own, chunk, c)
+            if gathered is not None or gradients.layer_weight is not None:
+                blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
+                if gradients.layer_weight is not None:
+                    gradients.add_layer_weight(blurred, pixels, offsets, chunk)
+                if gathered is not None:
+                    work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
+    return gathered, gradients.of_psfs(psfs, conjugate=True), gradients.layer_weight

@@ -15,20 +15,19 @@ the inputs are kept; each chunk is computed again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_tidy.render.backends.dense import differentiable_gradients
+from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends.dense_occlusion import (
     EPSILON,
     OcclusionPlanes,
     cumulative_weight,
     lay_over,
-    occlude_dense,
 )
 from kornia_tidy.render.backends.tile_plan import Grid, TileKind
 from kornia_tidy.render.backends.window_plan import Corner, WindowChunk, WindowPlan, plan_windows
@@ -77,54 +76,37 @@ def occlude_tiled(planes: OcclusionPlanes, labels: Labels, grid: Grid, kind: Til
         kind: of the tiles.
 
     Returns:
-        (B, C, H, W). It has gradients with respect to light, PSFs, layer weight, mean and stray light; where they are
-        differentiated in turn, they are made by the definition.
+        (B, C, H, W).
     """
     channels = planes.light.shape[1]
     plan = plan_windows(labels, len(planes.psfs), channels, grid, kind, dark=planes.inside is not None)
-    return _Occlude.apply(*planes, plan)
-
-
-class _Occlude(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, *planes_and_plan: Any) -> Tensor:
-        *tensors, plan = planes_and_plan
-        planes = OcclusionPlanes(*tensors)
-        ctx.save_for_backward(*planes)
-        ctx.plan = plan
-        padded, grid = _padded(planes, plan), plan.grid
-        coded = planes.light.new_empty(*planes.light.shape[:2], grid.height, grid.width)
-        for chunk in plan.chunks:
-            tiles = _tiles(_inputs(padded, chunk, grid), padded, chunk, plan)
-            for place, (image, y, x) in _kept(chunk):
-                part = coded[image, :, y : y + grid.tile, x : x + grid.tile]
-                part.copy_(tiles[place, :, : part.shape[-2], : part.shape[-1]])
-        return coded
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        planes = OcclusionPlanes(*ctx.saved_tensors)
-        return *occlusion_gradients(planes, lambda: ctx.plan, grad_outputs[0], ctx.needs_input_grad), None
+    padded = _padded(planes, plan)
+    coded = planes.light.new_empty(*planes.light.shape[:2], grid.height, grid.width)
+    for chunk in plan.chunks:
+        tiles = _tiles(_inputs(padded, chunk, grid), padded, chunk, plan)
+        for place, (image, y, x) in _kept(chunk):
+            part = coded[image, :, y : y + grid.tile, x : x + grid.tile]
+            part.copy_(tiles[place, :, : part.shape[-2], : part.shape[-1]])
+    return coded
 
 
 def occlusion_gradients(
-    planes: OcclusionPlanes, plan: Callable[[], WindowPlan], grad: Tensor, wanted: Sequence[bool]
-) -> tuple[Tensor | None, ...]:
-    """Return the gradients of light rendered with occlusion with respect to its planes, where they are wanted.
+    planes: OcclusionPlanes, labels: Labels, grid: Grid, kind: TileKind, gradient: Tensor
+) -> GradientPairs:
+    """Return the gradients of light rendered with occlusion, with respect to those planes that require them.
 
     Args:
         planes: of the scene.
-        plan: returns the tiles of the pixels.
-        grad: (B, C, H, W) gradient of the rendered light.
-        wanted: of which planes.
+        labels: the layers of the pixels of ``planes``.
+        grid: of the tiles.
+        kind: of the tiles.
+        gradient: (B, C, H, W) of the rendered light.
     """
-    if torch.is_grad_enabled():  # it is differentiated in turn
-
-        def render(*leaves: Tensor) -> Tensor:
-            return occlude_dense(*leaves, planes.layer_index, planes.inside)
-
-        return *differentiable_gradients(render, planes[:5], grad, wanted[:5]), None, None
-    return *_gradients(planes, plan(), grad, wanted[:5]), None, None
+    channels = planes.light.shape[1]
+    plan = plan_windows(labels, len(planes.psfs), channels, grid, kind, dark=planes.inside is not None)
+    with torch.no_grad():
+        found = _gradients(planes, plan, gradient, [wants_gradient(x) for x in planes[:5]])
+    return gradient_pairs(planes[:5], found)
 
 
 def _gradients(

@@ -11,13 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.kernels import gather_ops
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends.direct import (
-    SOURCE,
-    STRIP_ROWS,
-    count_pairs,
-    mix_directly,
-)
+from kornia_tidy.render.backends.direct import SOURCE, count_pairs
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
@@ -164,21 +160,11 @@ class TestDirectRender(RenderTester):
         self.assert_close(1e39 * dim.double(), render(image, defocus, bank, **options), rtol=0, atol=1e-4)
         assert torch.tensor(1e-39) * 0.5 > 0
 
-    @pytest.mark.parametrize("layer", [-(2**63), -1, 3, 2**40])
-    @pytest.mark.parametrize("shared", [False, True])
-    def test_exception_pixels_in_no_layer(self, layer, shared):
-        """What a depth that is not a number may come to."""
-        lower = torch.zeros(1, 9, 70, dtype=torch.int64)
-        lower[0, 8, 69] = layer
-        labels = Labels(lower, torch.full((1, 9, 70), 0.5) if shared else None)
-        with pytest.raises(IndexError, match="a pixel lies in none of the 3 layers"):
-            mix_directly(torch.rand(1, 1, 13, 74), torch.rand(3, 1, 5, 5), labels)
-
 
 class TestChoice(BaseTester):
     def test_feature_pairs_are_the_layers_that_strips_contain(self):
         """Counted pixel by pixel; 4 rows of strips, so that every fourth of them is the first."""
-        lower = torch.randint(5, (1, 4, 1, 64)).expand(1, 4, STRIP_ROWS, 64).reshape(1, 16, 64)
+        lower = torch.randint(5, (1, 4, 1, 64)).expand(1, 4, gather_ops.STRIP_ROWS, 64).reshape(1, 16, 64)
         lower[:, 4:] = lower[:, :4].repeat(1, 3, 1)
         expected = 4 * sum(len(strip.unique()) for strip in lower[0, :4].split(16, dim=1))
         assert count_pairs(Labels(lower, None), torch.float32) == expected

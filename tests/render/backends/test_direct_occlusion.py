@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends.direct_occlusion import SOURCE, can_go_directly, occlude_directly
+from kornia_tidy.kernels.occlusion_ops import occlusion_direct
+from kornia_tidy.render.backends.direct_occlusion import SOURCE, can_go_directly
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import choose
@@ -180,7 +181,7 @@ class TestDirectOcclusion(RenderTester):
         lower, _ = assign_layers(defocus, bank.defocus, "nearest")
         planes = [torch.nn.functional.pad(x.float(), (5,) * 4, mode="reflect") for x in (image, lower)]
         assert can_go_directly(planes[0], psfs.float())
-        coded = occlude_directly(planes[0], psfs.float(), planes[1][:, 0], None, None, None, None)
+        coded = occlusion_direct(planes[0], psfs.float(), planes[1][:, 0], None, None, None, None)
         self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)
 
     @pytest.mark.parametrize("layer", [-(2.0**63), -1.0, 3.0, float("nan")])
@@ -193,6 +194,6 @@ class TestDirectOcclusion(RenderTester):
         light, psfs = torch.rand(1, 1, 40, 60, device=device), torch.rand(3, 1, 7, 7, device=device)
         inside = torch.ones(1, 40, 60, device=device)
         inside[0, 20, 30] = 0
-        coded = occlude_directly(light, psfs, lower, fraction, None, None, None)
-        expected = occlude_directly(light, psfs, torch.ones_like(lower), fraction, None, None, inside)
+        coded = occlusion_direct(light, psfs, lower, fraction, None, None, None)
+        expected = occlusion_direct(light, psfs, torch.ones_like(lower), fraction, None, None, inside)
         self.assert_close(coded, expected, rtol=0, atol=1e-6)

@@ -1,0 +1,104 @@
+r"""Operator of the energy of many waves by their mutual intensity in C.
+
+.. math:: E_d = \sum_k w_k \, |K_d U_k K_d^T|^2
+
+The formula and its derivation are in :mod:`kornia_tidy.psf.mutual_intensity`. The gradient is made of the waves, which
+the operator itself does not form: products of complex matrices, one depth at a time.
+
+The operator is defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.kernels.build import KERNELS, load
+
+SOURCE = KERNELS / "mutual_intensity.c"
+
+torch.library.define(
+    "kornia_tidy::mutual_intensity_energies", "(Tensor field, Tensor weights, Tensor kernels) -> Tensor"
+)
+
+
+def mutual_intensity_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    r"""Return :math:`\sum_{k,q,q'} w_k |K_d U_k K_d^T|^2`: operator ``kornia_tidy::mutual_intensity_energies``.
+
+    Args:
+        field: U, (K, N, N) complex64 or complex128 on a processor.
+        weights: w, (K,), of the field's real dtype.
+        kernels: (D, P, q, N), of the field's dtype.
+
+    Returns:
+        (D, P, P), real, summed over the q points of a pixel on each axis, never negative. It has gradients with respect
+        to all three, which can be differentiated in turn.
+
+    Raises:
+        TypeError: if a data type is not as above.
+        ValueError: if shapes do not fit.
+        MemoryError: if there is no memory for a row of pixels.
+        NotBuiltError: if the source cannot be compiled.
+    """
+    return torch.ops.kornia_tidy.mutual_intensity_energies(field, weights, kernels)
+
+
+def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    """Check the arguments and return the memory of the result, which is also the fake implementation."""
+    if field.dtype not in (torch.complex64, torch.complex128):
+        raise TypeError(f"field must be complex64 or complex128, got {field.dtype}")
+    if kernels.dtype != field.dtype:
+        raise TypeError(f"kernels must be of the field's dtype {field.dtype}, got {kernels.dtype}")
+    if weights.dtype != field.dtype.to_real():
+        raise TypeError(f"weights must be of the field's real dtype {field.dtype.to_real()}, got {weights.dtype}")
+    if field.ndim != 3 or field.shape[1] != field.shape[2]:
+        raise ValueError(f"field must have shape (K, N, N), got {tuple(field.shape)}")
+    if tuple(weights.shape) != (field.shape[0],):
+        raise ValueError(f"weights must have shape {(field.shape[0],)}, got {tuple(weights.shape)}")
+    if kernels.ndim != 4 or kernels.shape[-1] != field.shape[-1]:
+        raise ValueError(f"kernels must have shape (D, P, q, {field.shape[-1]}), got {tuple(kernels.shape)}")
+    return weights.new_empty(kernels.shape[0], kernels.shape[1], kernels.shape[1])
+
+
+def _energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    energies = _new_energies(field, weights, kernels)
+    field, weights, kernels = field.contiguous(), weights.contiguous(), kernels.contiguous()
+    depths, window, order, cells = kernels.shape
+    failed = load(SOURCE, energies.dtype).mutual_energies(
+        *(ctypes.c_void_p(x.data_ptr()) for x in (field, weights, kernels, energies)),
+        *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
+    )
+    if failed:
+        raise MemoryError(f"no memory for PSFs of {window}x{window} pixels")
+    return energies
+
+
+def _keep(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    r"""Return the gradients from those of the waves :math:`W = K U K^T`, which are :math:`2 w g W`."""
+    field, weights, kernels = ctx.saved_tensors
+    order = kernels.shape[2]
+    of_field, of_weights = torch.zeros_like(field), torch.zeros_like(weights)
+    of_kernels: list[Tensor] = []
+    for kernel, light in zip(kernels.flatten(1, 2), gradient, strict=True):
+        every = light.repeat_interleave(order, 0).repeat_interleave(order, 1)
+        half = kernel @ field
+        wave = half @ kernel.mT
+        energy = wave.real.square() + wave.imag.square()
+        of_weights = of_weights + (energy * every).sum((1, 2))
+        of_wave = 2 * weights[:, None, None] * every * wave
+        to_half = of_wave @ kernel.conj()
+        of_field = of_field + kernel.mH @ to_half
+        of_kernels.append((to_half @ field.mH + of_wave.mT @ half.conj()).sum(0))
+    return of_field, of_weights, torch.stack(of_kernels).view(kernels.shape)
+
+
+torch.library.impl("kornia_tidy::mutual_intensity_energies", "CPU", _energies)
+torch.library.register_fake("kornia_tidy::mutual_intensity_energies", _new_energies)
+torch.library.register_autograd("kornia_tidy::mutual_intensity_energies", _backward, setup_context=_keep)

@@ -1,0 +1,224 @@
+"""Operator of occlusion by direct convolution in C.
+
+Sums are of positive terms only, so float32 keeps their relative accuracy however small the divisor that they become.
+The operator has no gradient of its own: the renderer makes gradients by tiles.
+
+The operator is defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from kornia_tidy.kernels.build import KERNELS, load
+
+SOURCE = KERNELS / "occlusion.c"
+BLOCK_ROWS, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
+SMALLEST_SIDE = BLOCK_ROWS - 1  # px, of PSFs; smaller ones are padded to it
+
+torch.library.define(
+    "kornia_tidy::occlusion_direct",
+    "(Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, Tensor? mean, Tensor? stray_light,"
+    " Tensor? inside) -> Tensor",
+)
+
+
+def occlusion_direct(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None = None,
+    mean: Tensor | None = None,
+    stray_light: Tensor | None = None,
+    inside: Tensor | None = None,
+) -> Tensor:
+    """Render layers that hide one another by direct convolution: operator ``kornia_tidy::occlusion_direct``.
+
+    Args:
+        plane: (B, C, H + P - 1, W + P - 1) image on a processor, with all that lies beyond its border; float32 or
+            float64.
+        psfs: (D, C, P, P) with P odd, of the plane's dtype, not negative anywhere. Layer D - 1 is the nearest.
+        layer_index: (B or 1, H + P - 1, W + P - 1) layer of each pixel, whole numbers of any dtype.
+        layer_weight: share of the next layer in [0, 1], of the same shape and the plane's dtype, or None for zero.
+        mean: (B, C) mean light of each image, and
+        stray_light: (D, C) share of it that each layer takes on; both or none.
+        inside: (1, H + P - 1, W + P - 1) 1 on the image and 0 in the dark beyond it, or None for no dark.
+
+    Returns:
+        (B, C, H, W). It has no gradient.
+
+    Raises:
+        TypeError: if a data type is not as above.
+        ValueError: if shapes do not fit, or the output is smaller than a block of 8 x 32 (float64: 8 x 16) pixels.
+        MemoryError: if there is no memory for the tables.
+        NotBuiltError: if the source cannot be compiled.
+    """
+    return torch.ops.kornia_tidy.occlusion_direct(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
+
+
+def count_work(
+    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, bands: int
+) -> tuple[int, int, int, int]:
+    """Count the work of :func:`occlusion_direct` in some bands of blocks, and scale it up to the image.
+
+    Args:
+        plane: as there.
+        psfs: as there.
+        layer_index: as there.
+        layer_weight: as there.
+        bands: number of bands that are counted.
+
+    Returns:
+        Numbers of blocks whose window is all of one layer; of pairs of another block and a layer present in its window;
+        of columns of PSFs that meet a row of light or of shared weights; of ends of runs of whole weights.
+    """
+    scene, kept = _scene(plane, psfs, layer_index, layer_weight, None)
+    every = max(1, scene.images * scene.height // (BLOCK_ROWS * bands))
+    counts = (ctypes.c_int64 * 4)()
+    if load(SOURCE, plane.dtype).count(ctypes.byref(scene), ctypes.c_int64(every), counts):
+        raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
+    del kept
+    alone, pairs, columns, ends = (every * number for number in counts)
+    return alone, pairs, columns, ends
+
+
+def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
+    """Return the rows and columns of a block, below which an image is too small.
+
+    Example:
+        >>> smallest_output(torch.float32), smallest_output(torch.float64)
+        ((8, 32), (8, 16))
+    """
+    return BLOCK_ROWS, 2 * STRIP_BYTES // dtype.itemsize
+
+
+class _Scene(ctypes.Structure):
+    """The struct ``scene_parameters`` in occlusion.c."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
+        *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "map_image", "map_row")),
+        *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "mean", "stray_light", "out")),
+    )
+
+
+def _scene(
+    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, inside: Tensor | None
+) -> tuple[_Scene, list[Tensor]]:
+    """Return the scene for C, and the tensors whose memory it names."""
+    index, weight = layer_index.to(plane.dtype), layer_weight
+    if weight is not None:  # a pixel with a weight of one lies in the next layer alone
+        full = weight == 1
+        index, weight = index + full, weight.detach().to(plane.dtype).masked_fill(full, 0)
+    if inside is not None:
+        index = index.masked_fill(inside == 0, len(psfs))
+    extra = (max(0, SMALLEST_SIDE - psfs.shape[-1]) // 2,) * 4
+    if extra[0]:  # no light comes from there
+        psfs, plane, index = pad(psfs, extra), pad(plane, extra), pad(index, extra, mode="replicate")
+        weight = None if weight is None else pad(weight, extra, mode="replicate")
+    plane, index, columns = (x.contiguous() for x in (plane, index, psfs.flip((-2, -1)).transpose(-2, -1)))
+    scene = _Scene(
+        images=plane.shape[0],
+        channels=plane.shape[1],
+        height=plane.shape[2] - psfs.shape[-1] + 1,
+        width=plane.shape[3] - psfs.shape[-1] + 1,
+        layers=psfs.shape[0],
+        side=psfs.shape[-1],
+        threads=torch.get_num_threads(),
+        plane_image=plane.stride(0),
+        plane_channel=plane.stride(1),
+        plane_row=plane.stride(2),
+        map_image=index.stride(0) if len(index) > 1 else 0,
+        map_row=index.stride(1),
+        plane=plane.data_ptr(),
+        psfs=columns.data_ptr(),
+        index=index.data_ptr(),
+    )
+    if weight is None:
+        return scene, [plane, index, columns]
+    weight = weight.contiguous()
+    scene.weight = weight.data_ptr()
+    return scene, [plane, index, columns, weight]
+
+
+def _new_light(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None,
+    stray_light: Tensor | None,
+    inside: Tensor | None,
+) -> Tensor:
+    """Check the arguments and return the memory of the result, which is also the fake implementation."""
+    if plane.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"plane must be float32 or float64, got {plane.dtype}")
+    for name, tensor in (("psfs", psfs), ("layer_weight", layer_weight), ("mean", mean), ("stray_light", stray_light)):
+        if tensor is not None and tensor.dtype != plane.dtype:
+            raise TypeError(f"{name} must be of the plane's dtype {plane.dtype}, got {tensor.dtype}")
+    if plane.ndim != 4 or 0 in plane.shape[1:]:
+        raise ValueError(f"plane must have shape (B, C, H + P - 1, W + P - 1), got {tuple(plane.shape)}")
+    batch, channels, rows, columns = plane.shape
+    if psfs.ndim != 4 or psfs.shape[1] != channels or psfs.shape[2] != psfs.shape[3] or psfs.shape[3] % 2 == 0:
+        raise ValueError(f"psfs must have shape (D, {channels}, P, P) with P odd, got {tuple(psfs.shape)}")
+    height, width = rows - psfs.shape[-1] + 1, columns - psfs.shape[-1] + 1
+    smallest = smallest_output(plane.dtype)
+    if height < smallest[0] or width < smallest[1]:
+        raise ValueError(f"the output must have at least {smallest[0]}x{smallest[1]} pixels, got {height}x{width}")
+    if tuple(layer_index.shape) not in ((batch, rows, columns), (1, rows, columns)):
+        raise ValueError(
+            f"layer_index must have shape {(batch, rows, columns)} or {(1, rows, columns)}, "
+            f"got {tuple(layer_index.shape)}"
+        )
+    if (mean is None) != (stray_light is None):
+        raise ValueError(f"stray_light needs a mean and a mean needs stray_light, got only {_one_of(mean)}")
+    for name, tensor, shape in (
+        ("layer_weight", layer_weight, tuple(layer_index.shape)),
+        ("mean", mean, (batch, channels)),
+        ("stray_light", stray_light, (psfs.shape[0], channels)),
+        ("inside", inside, (1, rows, columns)),
+    ):
+        if tensor is not None and tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+    return plane.new_empty(batch, channels, height, width)
+
+
+def _one_of(mean: Tensor | None) -> str:
+    return "stray_light" if mean is None else "mean"
+
+
+def _occlude(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None,
+    stray_light: Tensor | None,
+    inside: Tensor | None,
+) -> Tensor:
+    light = _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
+    scene, kept = _scene(plane, psfs, layer_index, layer_weight, inside)
+    scene.out = light.data_ptr()
+    if mean is not None and stray_light is not None:  # both or none
+        kept += [mean.contiguous(), stray_light.contiguous()]
+        scene.mean, scene.stray_light = (x.data_ptr() for x in kept[-2:])
+    if load(SOURCE, plane.dtype).occlude(ctypes.byref(scene)):
+        raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
+    del kept
+    return light
+
+
+def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
+    raise NotImplementedError(
+        "kornia_tidy::occlusion_direct has no gradient: call kornia_tidy.render.occlusion, which makes it by tiles"
+    )
+
+
+torch.library.impl("kornia_tidy::occlusion_direct", "CPU", _occlude)
+torch.library.register_fake("kornia_tidy::occlusion_direct", _new_light)
+torch.library.register_autograd("kornia_tidy::occlusion_direct", _refuse)

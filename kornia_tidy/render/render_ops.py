@@ -1,0 +1,149 @@
+"""The renderer as one operator of torch: compiled and exported graphs render by the same backends as eager code.
+
+The operator assigns the layers, chooses the backend and renders when it runs: which layers a tile holds depends on
+values, which a compiler does not know. Its gradient is a second operator, which makes the scene again: only the
+arguments are kept between the two.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
+from kornia_tidy.render.dispatch import (
+    chain_gradients,
+    choose,
+    leaves_of,
+    render_scene,
+    render_unrecorded,
+    scene_gradients,
+)
+from kornia_tidy.render.scene import LayeredScene, check_scene, layered_scene
+from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
+
+_SCENE = (
+    "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
+    " str border, bool correlate, str method"
+)
+_TENSORS = 5  # of a scene, which may have gradients
+
+torch.library.define("kornia_tidy::render_layers", f"({_SCENE}) -> Tensor")
+torch.library.define("kornia_tidy::render_layers_gradients", f"({_SCENE}, Tensor gradient, bool[] wanted) -> Tensor[]")
+
+
+def render_layers(
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    stray_light: Tensor | None,
+    *,
+    compositing: str,
+    layers: str,
+    border: str,
+    correlate: bool,
+    method: str,
+) -> Tensor:
+    """Render a scene by the cheapest backend, or by one that is named: operator ``kornia_tidy::render_layers``.
+
+    Args:
+        image: (B, C, H, W) linear light.
+        defocus: as the other tensors and ``layers`` to ``correlate`` in
+            :func:`kornia_tidy.render.scene.layered_scene`.
+        nodes: as there.
+        psfs: as there.
+        stray_light: as there.
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
+        layers: as there.
+        border: as there.
+        correlate: as there.
+        method: ``"auto"`` or the name of a backend, see :func:`kornia_tidy.render.dispatch.choose`.
+
+    Returns:
+        (B, C, h, w) in the image's dtype, computed in float32 or better, autocast or not. It has gradients with respect
+        to all tensors, which can be differentiated in turn.
+
+    Raises:
+        TypeError: if a tensor is not floating point.
+        ValueError: if shapes do not fit, or as :func:`kornia_tidy.render.dispatch.choose`.
+    """
+    if is_transformed():
+        options = {"compositing": compositing, "layers": layers, "border": border}
+        scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
+        return render_scene(scene, method)
+    check_scene(image, defocus, nodes, psfs, stray_light, border)
+    return torch.ops.kornia_tidy.render_layers(
+        image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method
+    )
+
+
+def _render(*arguments: Any) -> Tensor:
+    image, method = arguments[0], arguments[-1]
+    with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
+        scene = _scene(*arguments[:-1])
+        return render_unrecorded(choose(scene, method), scene).contiguous()
+
+
+def _render_fake(*arguments: Any) -> Tensor:
+    image, psfs, border = arguments[0], arguments[3], arguments[7]
+    lost = psfs.shape[-1] - 1 if border == "valid" else 0
+    return image.new_empty(image.shape[0], image.shape[1], image.shape[2] - lost, image.shape[3] - lost)
+
+
+def _scene(*arguments: Any) -> LayeredScene:
+    *tensors, compositing, layers, border, correlate = arguments
+    return layered_scene(*tensors, compositing=compositing, layers=layers, border=border, correlate=correlate)
+
+
+def _gradients(*arguments: Any) -> list[Tensor]:
+    tensors, options, (method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:-3], arguments[-3:]
+    own = leaves_of(tensors, wanted)
+    leaves = [x for x in own if x is not None and x.requires_grad]
+    with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
+        scene = _scene(*own, *options)
+        found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
+    return [
+        torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
+        for x, leaf in zip(found, leaves, strict=True)
+    ]
+
+
+def _gradients_fake(*arguments: Any) -> list[Tensor]:
+    pairs = zip(arguments[:_TENSORS], arguments[-1], strict=True)
+    return [x.new_empty(x.shape) for x, want in pairs if want and x is not None]
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:_TENSORS])
+    ctx.options = inputs[_TENSORS:]
+
+
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    tensors, options = ctx.saved_tensors, ctx.options[:-1]
+    layered = options[1] == "linear" and len(tensors[2]) > 1  # otherwise nothing depends smoothly on defocus
+    wanted = [
+        bool(want and x is not None and (layered or n not in (1, 2)))
+        for n, (x, want) in enumerate(zip(tensors, ctx.needs_input_grad, strict=False))
+    ]
+    rest = [None] * len(ctx.options)
+    if torch.is_grad_enabled():  # it is differentiated in turn
+
+        def render(*tensors: Tensor | None) -> Tensor:
+            return render_unrecorded(DenseBackend(), _scene(*tensors, *options))
+
+        with torch.autocast(gradient.device.type, enabled=False):
+            return *differentiable_gradients(render, tensors, gradient, wanted), *rest
+    found = iter(
+        torch.ops.kornia_tidy.render_layers_gradients(*tensors, *ctx.options, gradient, wanted) if any(wanted) else ()
+    )
+    return *(next(found) if want else None for want in wanted), *rest
+
+
+torch.library.impl("kornia_tidy::render_layers", "default", _render)
+torch.library.register_fake("kornia_tidy::render_layers", _render_fake)
+torch.library.register_autograd("kornia_tidy::render_layers", _backward, setup_context=_keep)
+torch.library.impl("kornia_tidy::render_layers_gradients", "default", _gradients)
+torch.library.register_fake("kornia_tidy::render_layers_gradients", _gradients_fake)

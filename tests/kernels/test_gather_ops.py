@@ -1,0 +1,157 @@
+"""Gather by direct convolution as operators: values, gradients of any order, refused arguments."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+import torch
+
+from kornia_tidy.kernels.gather_ops import SOURCE, count_pairs, gather_direct, gather_direct_psf_gradient
+from tests.kernels import kernel_shapes
+from tests.kernels.operator_tester import OperatorTester, needs_compiler
+
+
+def scene(dtype=torch.float64, **changes: Any) -> dict[str, Any]:
+    """Arguments of ``gather_direct``: 2 images, 2 channels, 3 layers, 3x3 PSFs."""
+    height, width = 5, 16 if dtype == torch.float64 else 32
+    arguments = {
+        "plane": torch.randn(2, 2, height + 2, width + 2, dtype=dtype),
+        "psfs": torch.randn(3, 2, 3, 3, dtype=dtype),
+        "layer_index": torch.randint(2, (2, height, width)),
+        "layer_weight": torch.rand(2, height, width, dtype=dtype),
+    }
+    return {**arguments, **changes}
+
+
+class TestGatherDirect(OperatorTester):
+    draw = staticmethod(kernel_shapes.gather)
+    differentiable = (0, 1, 3)
+    source = SOURCE
+
+    def smallest(self):
+        return gather_direct(**scene())
+
+    @needs_compiler
+    @pytest.mark.parametrize("kind", ["nearest", "linear", "weight gradient"])
+    def test_gradcheck_of_any_order(self, kind):
+        given = scene()
+        inputs = [given["plane"].requires_grad_(), given["psfs"].requires_grad_()]
+        if kind == "linear":
+            inputs.append(given["layer_weight"].requires_grad_())
+
+        def function(plane, psfs, weight=None):
+            weight = given["layer_weight"] if kind == "weight gradient" else weight
+            return gather_direct(plane, psfs, given["layer_index"], weight, weight_gradient=kind == "weight gradient")
+
+        self.gradcheck(function, tuple(inputs))
+        assert torch.autograd.gradgradcheck(function, inputs, fast_mode=True)
+
+    @needs_compiler
+    def test_feature_negated_and_shared_memory(self):
+        """Views whose sign torch keeps as a bit, and planes that channels and images share."""
+        given = scene()
+        plane = (
+            torch.view_as_complex(torch.randn(2, 1, 7, 18, 2, dtype=torch.float64)).conj().imag.expand(-1, 2, -1, -1)
+        )
+        assert plane.is_neg()
+        index = given["layer_index"][:1].expand(2, -1, -1)
+        expected = gather_direct(plane.clone().contiguous(), given["psfs"], index.contiguous())
+        assert torch.equal(gather_direct(plane, given["psfs"], index), expected)
+
+    @needs_compiler
+    @pytest.mark.parametrize("layer", [-(2**63), -1, 3, 2**40])
+    def test_exception_pixels_in_no_layer(self, layer):
+        """A depth that is not a number may give any of these."""
+        given = scene()
+        given["layer_index"][1, 4, 15] = layer
+        with pytest.raises(IndexError, match="a pixel lies in none of the 3 layers"):
+            gather_direct(**given)
+
+    @pytest.mark.parametrize(
+        ("changes", "error", "words"),
+        [
+            (
+                {"plane": torch.zeros(2, 2, 7, 18).half()},
+                TypeError,
+                "plane must be float32 or float64, got torch.float16",
+            ),
+            ({"psfs": torch.zeros(3, 2, 3, 3)}, TypeError, "psfs must be of the plane's dtype torch.float64, got .*32"),
+            ({"layer_index": torch.zeros(2, 5, 16)}, TypeError, "layer_index must be int64, got torch.float32"),
+            ({"layer_weight": torch.zeros(2, 5, 16)}, TypeError, "layer_weight must be of the plane's dtype .*float32"),
+            ({"plane": torch.zeros(7, 18).double()}, ValueError, r"plane must have shape \(B, C, .*, got \(7, 18\)"),
+            ({"psfs": torch.zeros(3, 2, 4, 4).double()}, ValueError, "odd side of at least 1 pixel, got 4"),
+            ({"psfs": torch.zeros(3, 1, 3, 3).double()}, ValueError, r"psfs must have shape \(D, 2, P, P\), got"),
+            ({"psfs": torch.zeros(3, 2, 5, 5).double()}, ValueError, "at least 4x16 pixels, got 3x14"),
+            (
+                {"layer_index": torch.zeros(2, 5, 15).long()},
+                ValueError,
+                r"layer_index must have .*\(2, 5, 16\), got .*15",
+            ),
+            (
+                {"layer_weight": torch.zeros(1, 5, 16).double()},
+                ValueError,
+                r"layer_weight must have .*, got \(1, 5, 16\)",
+            ),
+            ({"layer_weight": None, "weight_gradient": True}, ValueError, "weight_gradient needs a layer_weight"),
+        ],
+    )
+    def test_exception(self, changes, error, words):
+        with pytest.raises(error, match=words):
+            gather_direct(**scene(**changes))
+
+    @needs_compiler
+    def test_feature_pairs_are_the_layers_that_strips_contain(self, dtype):
+        """Counted pixel by pixel."""
+        lanes = 64 // dtype.itemsize
+        index = torch.randint(5, (1, 4, 4 * lanes))
+        expected = sum(len(strip.unique()) for strip in index[0].split(lanes, dim=1))
+        assert count_pairs(index, None, dtype, 1) == expected
+
+
+class TestGatherDirectPsfGradient(OperatorTester):
+    draw = staticmethod(kernel_shapes.correlate)
+    differentiable = (0, 1, 3)
+    source = SOURCE
+
+    def smallest(self):
+        given = scene()
+        labels = given["layer_index"], given["layer_weight"]
+        return gather_direct_psf_gradient(given["plane"], torch.randn(2, 2, 5, 16, dtype=torch.float64), *labels, 3)
+
+    @needs_compiler
+    def test_gradcheck_of_any_order(self):
+        given = scene()
+        gradient = torch.randn(2, 2, 5, 16, dtype=torch.float64)
+
+        def function(plane, gradient, weight):
+            return gather_direct_psf_gradient(plane, gradient, given["layer_index"], weight, 3)
+
+        inputs = [x.requires_grad_() for x in (given["plane"], gradient, given["layer_weight"])]
+        self.gradcheck(function, tuple(inputs))
+        assert torch.autograd.gradgradcheck(function, inputs, fast_mode=True)
+
+    @needs_compiler
+    def test_feature_layers_without_a_pixel_have_no_gradient(self):
+        given = scene(layer_index=torch.ones(2, 5, 16, dtype=torch.int64), layer_weight=None)
+        gradient = torch.randn(2, 2, 5, 16, dtype=torch.float64)
+        got = gather_direct_psf_gradient(given["plane"], gradient, given["layer_index"], None, 3)
+        assert [bool(layer.any()) for layer in got] == [False, True, False]
+
+    def test_exception_the_gradient_is_of_another_size(self):
+        given = scene()
+        labels = given["layer_index"], given["layer_weight"]
+        with pytest.raises(
+            ValueError, match=r"gradient must have the output's shape \(2, 2, 5, 16\), got \(2, 1, 5, 16\)"
+        ):
+            gather_direct_psf_gradient(given["plane"], torch.randn(2, 1, 5, 16, dtype=torch.float64), *labels, 3)
+        with pytest.raises(TypeError, match=r"gradient must be of the plane's dtype torch.float64, got torch.float32"):
+            gather_direct_psf_gradient(given["plane"], torch.randn(2, 2, 5, 16), *labels, 3)
+
+
+@needs_compiler
+class TestRandomScenes:
+    def test_smoke_all_kinds_of_memory_are_drawn(self):
+        about = {kernel_shapes.gather(random.Random(seed)).about.split(") ")[1].split(" psfs")[0] for seed in range(60)}
+        assert about == {"whole", "shared by channels", "cut out", "columns first"}

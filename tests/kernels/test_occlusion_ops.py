@@ -1,0 +1,87 @@
+"""Occlusion by direct convolution as an operator: values, refused arguments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct
+from tests.kernels import kernel_shapes
+from tests.kernels.operator_tester import OperatorTester, needs_compiler
+
+
+def scene(**changes: Any) -> dict[str, Any]:
+    """Arguments of ``occlusion_direct``: 2 images, 2 channels, 3 layers, 3x3 PSFs."""
+    arguments = {
+        "plane": torch.rand(2, 2, 11, 34),
+        "psfs": torch.full((3, 2, 3, 3), 1 / 9),
+        "layer_index": torch.randint(2, (1, 11, 34)).float(),
+        "layer_weight": torch.rand(1, 11, 34),
+    }
+    return {**arguments, **changes}
+
+
+class TestOcclusionDirect(OperatorTester):
+    draw = staticmethod(kernel_shapes.occlude)
+    source = SOURCE
+
+    def smallest(self):
+        return occlusion_direct(**scene())
+
+    @needs_compiler
+    def test_feature_layers_of_any_number_type(self):
+        given = scene(layer_weight=None)
+        expected = occlusion_direct(**given)
+        for dtype in (torch.int64, torch.float64):
+            assert torch.equal(occlusion_direct(**{**given, "layer_index": given["layer_index"].to(dtype)}), expected)
+
+    @needs_compiler
+    def test_feature_a_weight_of_one_is_the_next_layer(self):
+        given = scene(layer_weight=torch.ones(1, 11, 34))
+        expected = occlusion_direct(**{**given, "layer_index": given["layer_index"] + 1, "layer_weight": None})
+        assert torch.equal(occlusion_direct(**given), expected)
+
+    @needs_compiler
+    def test_exception_it_has_no_gradient(self):
+        coded = occlusion_direct(**scene(psfs=torch.rand(3, 2, 3, 3, requires_grad=True)))
+        with pytest.raises(NotImplementedError, match=r"occlusion_direct has no gradient: call kornia_tidy\.render"):
+            coded.sum().backward()
+
+    @pytest.mark.parametrize(
+        ("changes", "error", "words"),
+        [
+            (
+                {"plane": torch.zeros(2, 2, 11, 34).half()},
+                TypeError,
+                "plane must be float32 or float64, got torch.float16",
+            ),
+            (
+                {"psfs": torch.zeros(3, 2, 3, 3).double()},
+                TypeError,
+                "psfs must be of the plane's dtype .*, got .*float64",
+            ),
+            ({"layer_weight": torch.zeros(1, 11, 34).double()}, TypeError, "layer_weight must be of the plane's dtype"),
+            ({"plane": torch.zeros(11, 34)}, ValueError, r"plane must have shape \(B, C, .*, got \(11, 34\)"),
+            ({"psfs": torch.zeros(3, 2, 2, 2)}, ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
+            ({"psfs": torch.zeros(3, 2, 5, 5)}, ValueError, "at least 8x32 pixels, got 7x30"),
+            (
+                {"layer_index": torch.zeros(3, 11, 34)},
+                ValueError,
+                r"layer_index must have shape \(2, 11, 34\) or \(1, ",
+            ),
+            ({"layer_weight": torch.zeros(2, 11, 34)}, ValueError, r"layer_weight must have shape \(1, 11, 34\), got"),
+            ({"mean": torch.zeros(2, 2)}, ValueError, "a mean needs stray_light, got only mean"),
+            ({"stray_light": torch.zeros(3, 2)}, ValueError, "a mean needs stray_light, got only stray_light"),
+            ({"mean": torch.zeros(2, 2), "stray_light": torch.zeros(2, 2)}, ValueError, r"stray_light must .*\(3, 2\)"),
+            (
+                {"inside": torch.zeros(2, 11, 34)},
+                ValueError,
+                r"inside must have shape \(1, 11, 34\), got \(2, 11, 34\)",
+            ),
+        ],
+    )
+    def test_exception(self, changes, error, words):
+        with pytest.raises(error, match=words):
+            occlusion_direct(**scene(**changes))
