@@ -207,9 +207,8 @@ class TiDyOptics(CameraState):
             reach = survey_defocus([defocus], now).reach
             banks = now.psf_model.scene_banks(light.shape[1], sample.dtype, reach, now.compositing == "occlusion")
             irradiance = now.render(light, defocus, banks, now.border)
-            if now.sensor is not None:
-                irradiance = now.sensor(irradiance, params=params, generator=generator)
-            coded = now.encode(irradiance)
+            seen = irradiance if now.sensor is None else now.sensor(irradiance, params=params, generator=generator)
+            coded = now.encode(seen)
         return sample.coded(coded.to(sample.image.dtype))
 
     def capture(

@@ -145,9 +145,11 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return BACKENDS[method]
-    key = scene.layout.get("fingerprint") or _fingerprint(scene)
-    if scene.compositing != "occlusion":  # where the values of PSFs matter too
-        scene.layout["fingerprint"] = key
+    # With occlusion the values of PSFs matter too.
+    layout = {} if scene.layout is None or scene.compositing == "occlusion" else scene.layout
+    if "fingerprint" not in layout:
+        layout["fingerprint"] = _fingerprint(scene)
+    key = layout["fingerprint"]
     known = None if key is None else _choices.get(key)  # another thread may empty the memory meanwhile
     if known is not None and (known[0].name != "direct" or known[0].refusal(scene) is None):  # others refuse nothing
         best, grids = known

@@ -75,8 +75,8 @@ class LayeredScene:
         labels: the same for each image of the batch, without gradients.
         found: planes that were made of the scene, by their names, so that they are made once.
         grids: the best tiles of each kind for the scene, as far as they were looked for.
-        layout: what else follows from the layers alone, by its name. It lasts as long as :func:`remembered_scene`
-            remembers the layers.
+        layout: what else follows from the layers, kept as long as :func:`remembered_scene` remembers them; None for
+            other scenes.
     """
 
     image: Tensor
@@ -91,7 +91,7 @@ class LayeredScene:
     labels: Labels
     found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     grids: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
-    layout: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+    layout: dict[Any, Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
@@ -253,6 +253,7 @@ def remembered_scene(
         or not (torch.equal(last.defocus, defocus) and torch.equal(last.nodes, nodes))
     ):
         scene = assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+        scene = replace(scene, layout={})
         nothing = image.new_empty(0)
         kept = replace(scene, image=nothing, psfs=nothing, stray_light=None, found={})
         _last["scene"] = _Remembered(options, defocus.clone(), nodes.clone(), kept)

@@ -57,8 +57,8 @@ def calls(request) -> list[Call]:
     optics, image = TiDyOptics(), torch.rand(1, 3, 256, 256)
     depth = torch.full((1, 1, 256, 256), 0.9)
     if request.param == "leaves":
-        scene = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
-        image, depth = scene.image[None], scene.depth[None]
+        leaves = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
+        image, depth = (part[None] for part in leaves)
     with torch.no_grad():
         optics(image, depth)
         return calls_of(lambda: optics(image, depth))

@@ -72,8 +72,11 @@ class TiledBackend:
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
         offset = scene.psfs.shape[-1] - 1 if scene.compositing == "gather" else 0
-        plan = scene.layout.get((grid, kind)) or plan_blocks(labels, layers, grid, kind, offset)
-        scene.layout[grid, kind] = plan
+        plan = None if scene.layout is None else scene.layout.get((grid, kind))
+        if plan is None:
+            plan = plan_blocks(labels, layers, grid, kind, offset)
+            if scene.layout is not None:
+                scene.layout[grid, kind] = plan
         if scene.compositing == "scatter":
             return _scatter(scene.plane, scene.psfs, plan)
         plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, grid.spare)
