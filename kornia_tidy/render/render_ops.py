@@ -70,14 +70,14 @@ def render_layers(
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if shapes do not fit, or as :func:`kornia_tidy.render.dispatch.choose`.
+        ValueError: if shapes do not fit, the compositing is not known, or as :func:`kornia_tidy.render.dispatch.choose`.
     """
+    if compositing not in COMPOSITINGS:
+        check_choice("compositing", compositing, COMPOSITINGS)
     if is_transformed():
         options = {"compositing": compositing, "layers": layers, "border": border}
         scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
         return render_scene(scene, method)
-    if compositing not in COMPOSITINGS:
-        check_choice("compositing", compositing, COMPOSITINGS)
     check_scene(image, defocus, nodes, psfs, stray_light, border)
     return torch.ops.kornia_tidy.render_layers(
         image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method
@@ -102,7 +102,8 @@ def _gradients(*arguments: Any) -> list[Tensor]:
     own = leaves_of(tensors, wanted)
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
-        scene = assigned_scene(*own, *options)
+        given: list[Any] = [*own, *options]
+        scene = assigned_scene(*given)
         found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
     return [
         torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
@@ -131,7 +132,8 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     if torch.is_grad_enabled():  # it is differentiated in turn
 
         def render(*tensors: Tensor | None) -> Tensor:
-            return render_unrecorded(DenseBackend(), assigned_scene(*tensors, *options))
+            given: list[Any] = [*tensors, *options]
+            return render_unrecorded(DenseBackend(), assigned_scene(*given))
 
         with torch.autocast(gradient.device.type, enabled=False):
             return *differentiable_gradients(render, tensors, gradient, wanted), *rest
