@@ -67,7 +67,7 @@ class Fidelity:
             which is nearly exact for a spacing below 2.8 rad (at 470 nm).
         layer_spacing: distance between the computed PSFs in radians of defocus.
         wavelengths: at most so many, where the camera's spectrum has more: neighbours then stand together for one, see
-            :func:`kornia_tidy.psf.spectral_binning.fewer_wavelengths`. Default: all that the spectrum has.
+            :func:`kornia_tidy.psf.spectral_binning.bin_spectrum`. Default: all that the spectrum has.
         window: side of the PSFs in pixels, odd. Default: measured, by the next two.
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
         max_window: largest side of the PSF window in pixels.

@@ -72,9 +72,14 @@ V2 = frozenset({"sse4_2", "ssse3", "popcnt", "cx16"})
 PROBE = """
 import hashlib, json, warnings
 import torch
-from kornia_tidy.kernels.build import compiled
+from kornia_tidy.kernels.build import NotBuiltError, compiled, find_compiler
 from kornia_tidy.render.backends.direct import SOURCE
 warnings.simplefilter("ignore")
+try:
+    compiler = find_compiler()
+    compiler = " ".join([*compiler.version.split()[1:], *compiler.options])  # the first word is the program's name
+except NotBuiltError:
+    compiler = "none"
 generator = torch.Generator().manual_seed(0)
 one, two = torch.rand(2, 96, 96, generator=generator, dtype=torch.float64)
 products = torch.cat([one @ two, torch.linalg.inv(one), torch.fft.fft2(two).real])
@@ -83,6 +88,7 @@ print(json.dumps({
     "mkl": hashlib.sha256(products.numpy().tobytes()).hexdigest() if torch.backends.mkl.is_available() else "",
     "compiled": compiled(SOURCE, torch.float32) is not None,
     "threads": torch.get_num_threads(),
+    "compiler": compiler,
 }))
 """
 
@@ -239,12 +245,14 @@ def probe(factor: dict[str, str]) -> dict[str, object]:
 
 
 def why_not(factor: Factor, machine: Machine) -> str | None:
-    """Return why a factor cannot be had on this machine, or None."""
+    """Return why a factor is not run on this machine: it cannot be had, or it is no change; or None."""
     if missing := sorted(factor.needs - machine.can):
         return f"this processor ({machine.processor}) has no {', '.join(missing)}"
     if factor.compiler and shutil.which(factor.compiler) is None:
         return f"{factor.compiler} is not on this machine"
     used = probe(factor.environment)
+    if used and used == machine.usual:
+        return "it is what `make test` runs on this machine"
     return factor.refuse(machine, used) if used else None
 
 

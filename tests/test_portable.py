@@ -60,6 +60,12 @@ class TestPortable(BaseTester):
         machine = replace(PLAIN, can=AVX512)
         assert portable.why_not(factor("aten avx512"), machine) == "PyTorch uses DEFAULT nevertheless"
 
+    def test_feature_what_is_no_change_is_left_to_the_usual_tests(self, probed):
+        machine = replace(PLAIN, usual=dict(probed))
+        assert portable.why_not(factor("threads 1"), machine) == "it is what `make test` runs on this machine"
+        probed["compiler"] = "another"
+        assert portable.why_not(factor("threads 1"), machine) is None
+
     def test_feature_reports_are_added_up(self):
         report = portable.ET.fromstring(
             '<testsuites><testsuite tests="7" failures="1" errors="1" skipped="2"/></testsuites>'

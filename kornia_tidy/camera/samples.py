@@ -137,7 +137,7 @@ def compute_dtype(dtype: torch.dtype, fidelity: Fidelity) -> torch.dtype:
 
 
 def check_light(image: Tensor, camera: Watchful) -> None:
-    """Refuse values of an image without sense; warn once of those that seem to be in another unit.
+    """Raise an error for an image that is not light, and warn once of one that seems to be in another unit.
 
     Args:
         image: of any shape, in the camera's colour space.

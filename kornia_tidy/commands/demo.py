@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> None:
             figure.savefig(reconstructed, dpi=DOTS_PER_INCH)
         bank = optics.psf_bank()
 
-    assert best.nearness is not None  # it is a joint system
+    assert best.inverse_depth is not None  # it is a joint system
     pictures = {
         "scene.png": scene.image,
         "depth.png": near,
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> None:
         "coded_k1.png": estimates["K = 1"].capture,
         "coded_k5.png": best.capture,
         "estimated_scene.png": best.image,
-        "estimated_depth.png": best.nearness,
+        "estimated_depth.png": best.inverse_depth,
         "estimated_scene_alone.png": estimates["K=5 EDoF"].image,
     }
     files = {"demo.png": explained.getvalue(), "reconstruction.png": reconstructed.getvalue()}
@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> None:
 def _tell_scores(estimates: Mapping[str, Estimate], scene: Scene, near: Tensor) -> None:
     for name, estimate in estimates.items():
         scores = estimate.scores(scene.image, near, scene.valid)
-        depth = f"; depth RMSE {scores['depth_rmse']:.3f} of the range" if estimate.nearness is not None else ""
+        depth = f"; depth RMSE {scores['depth_rmse']:.3f} of the range" if estimate.inverse_depth is not None else ""
         tell(
             name,
             f"capture {scores['capture_psnr']:.2f} dB; all in focus {scores['image_psnr']:.2f} dB, "

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
     progress = tqdm(systems, desc="systems", file=sys.stderr, leave=False, unit="system", disable=None)
     with torch.no_grad(), progress:
         with stages("scene"):
-            image, nearness, scene = _scene(args)
+            image, inverse_depth, scene = _scene(args)
         for system in progress:
             progress.set_postfix_str(system.name)
             with stages("cameras"):
@@ -102,12 +102,12 @@ def run(args: argparse.Namespace) -> None:
                 seen = system_statistics(optics.psf_model)
             with stages("captures"):
                 generator = torch.Generator().manual_seed(args.seed)
-                capture = optics(image, metres(camera, nearness), generator=generator)
+                capture = optics(image, metres(camera, inverse_depth), generator=generator)
             portraits.append(Portrait(system, optics, seen, capture))
         with stages("picture"):
             picture = BytesIO()
             suffix = Path(args.output).suffix[1:]
-            draw_systems(portraits, image, nearness, scene).savefig(picture, dpi=DOTS_PER_INCH, format=suffix)
+            draw_systems(portraits, image, inverse_depth, scene).savefig(picture, dpi=DOTS_PER_INCH, format=suffix)
     print("\n".join(table([portrait.system for portrait in portraits])))
     print()
     write_bytes(args.output, picture.getvalue())
@@ -162,9 +162,9 @@ def _scene(args: argparse.Namespace) -> tuple[Tensor, Tensor, str]:
         image, depth, valid = read_scene(args)
         name = Path(args.image).name
     near, far = (1 / end for end in middle_depths(depth, valid))
-    nearness = ((1 / depth - far) / (near - far)).clamp(0, 1)
+    inverse_depth = ((1 / depth - far) / (near - far)).clamp(0, 1)
     image = image.expand(3, -1, -1)
     if max(image.shape[-2:]) > args.size:
         image = resize(image[None], args.size, side="long", antialias=True)[0].clamp(0, 1)
-        nearness = resize(nearness[None], args.size, side="long", interpolation="nearest")[0]
-    return image, nearness, name
+        inverse_depth = resize(inverse_depth[None], args.size, side="long", interpolation="nearest")[0]
+    return image, inverse_depth, name

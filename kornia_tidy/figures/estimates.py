@@ -26,9 +26,9 @@ class Estimate(NamedTuple):
     name: str
     capture: Tensor
     image: Tensor
-    nearness: Tensor | None
+    inverse_depth: Tensor | None
 
-    def scores(self, image: Tensor, nearness: Tensor, known: Tensor | None = None) -> dict[str, float]:
+    def scores(self, image: Tensor, inverse_depth: Tensor, known: Tensor | None = None) -> dict[str, float]:
         """Return PSNR (dB) of capture and image, SSIM of the image, and RMSE of the known normalised inverse depth."""
         truth = image[None]
         scores = {
@@ -36,14 +36,14 @@ class Estimate(NamedTuple):
             "image_psnr": float(psnr(self.image[None].clamp(0, 1), truth)),
             "image_ssim": float(ssim(self.image[None].clamp(0, 1), truth)),
         }
-        if self.nearness is None:
+        if self.inverse_depth is None:
             return scores
         where = None if known is None else known[None]
-        return {**scores, "depth_rmse": float(rmse(self.nearness[None].clamp(0, 1), nearness[None], where))}
+        return {**scores, "depth_rmse": float(rmse(self.inverse_depth[None].clamp(0, 1), inverse_depth[None], where))}
 
 
 def draw_estimates(
-    image: Tensor, nearness: Tensor, estimates: Sequence[Estimate], known: Tensor | None = None
+    image: Tensor, inverse_depth: Tensor, estimates: Sequence[Estimate], known: Tensor | None = None
 ) -> Figure:
     """Draw one row for each camera: the capture, the estimated image and depth, and error maps.
 
@@ -51,7 +51,8 @@ def draw_estimates(
 
     Args:
         image: the scene in focus, (3, H, W) in [0, 1].
-        nearness: normalised inverse depth of the scene, (1, H, W), 0 at the far and 1 at the near end of the range.
+        inverse_depth: normalised inverse depth of the scene, (1, H, W): 0 at the far and 1 at the near end of
+            the range.
         estimates: of two cameras or more, from top to bottom. The scene is drawn beside the first row, its depth beside
             the second.
         known: bool (1, H, W), True where the depth is known. None: everywhere.
@@ -79,16 +80,16 @@ def draw_estimates(
     )
     figure.text(0.98, 1 - 0.28 / height, legend, fontsize=LABEL, color=FAINT, ha="right")
     for y, estimate in enumerate(estimates):
-        scores = estimate.scores(image, nearness, known)
+        scores = estimate.scores(image, inverse_depth, known)
         pictures = [
             (estimate.capture, f"{scores['capture_psnr']:.1f} dB"),
             (estimate.image, f"{scores['image_psnr']:.1f} dB, SSIM {scores['image_ssim']:.2f}"),
             ((estimate.image - image).abs() * ERROR_SCALE, ""),
         ]
-        if estimate.nearness is not None:
+        if estimate.inverse_depth is not None:
             pictures += [
-                (_in_colors(estimate.nearness), f"RMSE {scores['depth_rmse']:.3f} of the range"),
-                ((estimate.nearness - nearness).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
+                (_in_colors(estimate.inverse_depth), f"RMSE {scores['depth_rmse']:.3f} of the range"),
+                ((estimate.inverse_depth - inverse_depth).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
             ]
         for empty in axes[y][1 + len(pictures) :]:
             empty.set_axis_off()
@@ -105,7 +106,7 @@ def draw_estimates(
             transform=axes[y][1].transAxes,
             bbox={"facecolor": ACCENT, "linewidth": 0, "pad": 2},
         )
-        scene = (image, "") if y == 0 else (_in_colors(nearness), "its depth; bright is near")
+        scene = (image, "") if y == 0 else (_in_colors(inverse_depth), "its depth; bright is near")
         if y < 2:
             _show(axes[y][0], *scene, HEADINGS[0] if y == 0 else "")
         else:
@@ -113,10 +114,12 @@ def draw_estimates(
     return figure
 
 
-def _in_colors(nearness: Tensor) -> Tensor:
+def _in_colors(inverse_depth: Tensor) -> Tensor:
     from matplotlib import colormaps  # noqa: PLC0415
 
-    return torch.from_numpy(colormaps[DEPTH_COLORS](nearness[0].cpu().clamp(0, 1).numpy())[..., :3]).permute(2, 0, 1)
+    return torch.from_numpy(colormaps[DEPTH_COLORS](inverse_depth[0].cpu().clamp(0, 1).numpy())[..., :3]).permute(
+        2, 0, 1
+    )
 
 
 def _show(axes: Axes, picture: Tensor, words: str, heading: str) -> None:

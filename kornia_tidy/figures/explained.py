@@ -134,8 +134,8 @@ def _scene(figure: Figure, image: Tensor, depth: Tensor, camera: ThinLensCamera)
 
     _picture(figure, (SCENE_X, UPPER), image, "all in focus, as the eye sees it")
     lo, hi = camera.defocus_range
-    nearness = ((camera.defocus(depth) - lo) / (hi - lo)).clamp(0, 1)
-    colors = torch.from_numpy(colormaps[DEPTH_COLORS](nearness[0].cpu().numpy())).permute(2, 0, 1)
+    inverse_depth = ((camera.defocus(depth) - lo) / (hi - lo)).clamp(0, 1)
+    colors = torch.from_numpy(colormaps[DEPTH_COLORS](inverse_depth[0].cpu().numpy())).permute(2, 0, 1)
     axes = _picture(figure, (SCENE_X, LOWER), colors, "its depth; bright is near")
     bounds = axes.get_position(original=False)  # of the picture, not of its box
     depth_bar(figure.add_axes((bounds.x0, 0.44 / HEIGHT, bounds.width, 0.09 / HEIGHT)), camera)

@@ -67,13 +67,13 @@ class Portrait:
     capture: Tensor
 
 
-def draw_systems(portraits: Sequence[Portrait], image: Tensor, nearness: Tensor, scene: str) -> Figure:
+def draw_systems(portraits: Sequence[Portrait], image: Tensor, inverse_depth: Tensor, scene: str) -> Figure:
     """Draw one row for each system: mask, PSFs over depth, contrast, depth bound, and the capture of one scene.
 
     Args:
         portraits: of the systems, from top to bottom.
         image: the scene, (3, H, W) in [0, 1].
-        nearness: normalised inverse depth of the scene, (1, H, W): 0 is the farthest and 1 the nearest end of each
+        inverse_depth: normalised inverse depth of the scene, (1, H, W): 0 is the farthest and 1 the nearest end of each
             system's range.
         scene: name of the scene.
 
@@ -95,7 +95,7 @@ def draw_systems(portraits: Sequence[Portrait], image: Tensor, nearness: Tensor,
         raise ValueError("there is nothing to draw: no systems were given")
     height = HEAD + ROW * len(portraits) + FOOT
     figure = Figure(figsize=(WIDTH, height), facecolor="white")
-    _head(figure, height, image, nearness, scene)
+    _head(figure, height, image, inverse_depth, scene)
     bounds = [(_place(p.statistics.defocus), p.statistics.bound.numpy()) for p in portraits]
     values = np.concatenate([bound for _, bound in bounds])
     limits = (
@@ -124,7 +124,7 @@ def draw_systems(portraits: Sequence[Portrait], image: Tensor, nearness: Tensor,
 # ---------------------------------------------------------------------- the parts, from left to right
 
 
-def _head(figure: Figure, height: float, image: Tensor, nearness: Tensor, scene: str) -> None:
+def _head(figure: Figure, height: float, image: Tensor, inverse_depth: Tensor, scene: str) -> None:
     from matplotlib import colormaps  # noqa: PLC0415
 
     _text(figure, LEFT, height - 0.45, "Published optical systems, side by side", HEADLINE, weight="bold")
@@ -151,7 +151,7 @@ def _head(figure: Figure, height: float, image: Tensor, nearness: Tensor, scene:
     bar.imshow(np.linspace(0, 1, 256)[None], cmap=PHASE_COLORS, aspect="auto")
     bar.set_axis_off()
     side = 1.0
-    colors = torch.from_numpy(colormaps[DEPTH_COLORS](nearness[0].cpu().numpy())).permute(2, 0, 1)
+    colors = torch.from_numpy(colormaps[DEPTH_COLORS](inverse_depth[0].cpu().numpy())).permute(2, 0, 1)
     for x, picture, title in (
         (CAPTURE_X - CAPTURE - 0.2, image, f"the scene: {scene}"),
         (CAPTURE_X, colors, "its depth, bright is near"),

@@ -29,11 +29,11 @@ def layer_kinds() -> Iterator[Fidelity]:
             yield replace(REFERENCE, layers=layers, layer_spacing=spacing)
 
 
-def window_ladder(largest: int) -> tuple[int, ...]:
+def window_steps(largest: int) -> tuple[int, ...]:
     """Return the candidate window sides, ascending, each about a fifth narrower than the next.
 
     Example:
-        >>> window_ladder(41)
+        >>> window_steps(41)
         (3, 5, 7, 9, 11, 13, 15, 17, 21, 25, 29, 35, 41)
     """
     windows = [largest]
@@ -42,11 +42,11 @@ def window_ladder(largest: int) -> tuple[int, ...]:
     return tuple(windows)
 
 
-def wavelength_ladder(fewest: int, all_of_them: int) -> tuple[int, ...]:
+def wavelength_steps(fewest: int, all_of_them: int) -> tuple[int, ...]:
     """Return the candidate numbers of wavelengths, ascending, below the number of the spectrum.
 
     Example:
-        >>> wavelength_ladder(1, 31)
+        >>> wavelength_steps(1, 31)
         (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25)
     """
     counts = [all_of_them]

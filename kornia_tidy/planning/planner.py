@@ -33,10 +33,10 @@ from torch.nn.functional import max_pool2d
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.planning.bank_cost import bank_work, memory_bytes, window_side
-from kornia_tidy.planning.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_ladder
+from kornia_tidy.planning.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_steps
 from kornia_tidy.planning.depth_energy import Depths
 from kornia_tidy.planning.error_model import LayerErrors, change_error, layer_coefficients
-from kornia_tidy.planning.psf_samples import CameraSurvey, PlannableCamera
+from kornia_tidy.planning.psf_samples import PlannableCamera, PSFSamples
 from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.planning.rendering_cost import (
     SceneWork,
@@ -76,14 +76,14 @@ class Planner:
 
     Example:
         >>> from kornia_tidy import PixelwiseMask, TiDyOptics
-        >>> survey = Planner(TiDyOptics(PixelwiseMask(1, initial="flat")), channels=3)
-        >>> scene = survey.scene(torch.full((1, 1, 64, 64), -5.0))
+        >>> planner = Planner(TiDyOptics(PixelwiseMask(1, initial="flat")), channels=3)
+        >>> scene = planner.scene(torch.full((1, 1, 64, 64), -5.0))
         >>> [scene.plan(tolerance).predicted_error <= tolerance for tolerance in (1e-1, 1e-2)]
         [True, True]
     """
 
     def __init__(self, optics: PlannableCamera, channels: int) -> None:
-        self.survey = CameraSurvey(optics, channels)
+        self.samples = PSFSamples(optics, channels)
 
     def scene(self, defocus: Tensor, light: Tensor | None = None) -> PlannedScene:
         """Return a scene to ask for errors and plans.
@@ -92,30 +92,30 @@ class Planner:
             defocus: (B, 1, H, W) or (1, 1, H, W) radians.
             light: (B, C, H, W) linear light. Default: a typical photograph.
         """
-        return PlannedScene(self.survey, defocus, light)
+        return PlannedScene(self.samples, defocus, light)
 
 
 class PlannedScene:
     """Error prediction and plans for one scene, made by :meth:`Planner.scene`."""
 
     @torch.no_grad()
-    def __init__(self, survey: CameraSurvey, defocus: Tensor, light: Tensor | None) -> None:
+    def __init__(self, samples: PSFSamples, defocus: Tensor, light: Tensor | None) -> None:
         height, width = defocus.shape[-2:]
         self._batch = len(defocus if light is None else light)
-        self._survey, self._defocus = survey, defocus.detach()
+        self._samples, self._defocus = samples, defocus.detach()
         self._known: dict[Any, float] = {}
         self._works: dict[tuple[str, Sequence[float], int], SceneWork] = {}
         self._labelled: tuple[tuple[str, Sequence[float], int], Labels] | None = None
-        self.reference = survey.reference(height, width)
+        self.reference = samples.reference(height, width)
         size = spectrum_size(window_side(self.reference))
-        colours = range(1, len(survey.spectrum.basis or (1,)))
-        margin = window_side(self.reference) // 2 if survey.border == "valid" else 0
-        bins = 256 if survey.compositing == "gather" else 128
-        self._depths = Depths(defocus, *survey.defocus_range, survey.border, margin, bins)
+        colours = range(1, len(samples.spectrum.basis or (1,)))
+        margin = window_side(self.reference) // 2 if samples.border == "valid" else 0
+        bins = 256 if samples.compositing == "gather" else 128
+        self._depths = Depths(defocus, *samples.defocus_range, samples.border, margin, bins)
         if light is None:  # differences between channels are assumed as large as between pixels
-            self._light, self._level = SceneLight.unseen(self._depths, survey.channels, size), 0.5
+            self._light, self._level = SceneLight.unseen(self._depths, samples.channels, size), 0.5
             self._contrast = CONTRAST
-            self._apart = torch.full((survey.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
+            self._apart = torch.full((samples.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
             self._colours = [self._light for _ in colours]
         else:
             self._light, self._level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
@@ -123,11 +123,11 @@ class PlannedScene:
             means = self._depths.means(light)  # mean light of each depth less that of the image
             self._apart = means / self._depths.share - means.sum(1, keepdim=True)
             self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
-        self._layers = LayerErrors(*survey.layer_survey(window_side(self.reference)), self._light)
+        self._layers = LayerErrors(*samples.layer_samples(window_side(self.reference)), self._light)
         self._rows = self._layer_rows(self.reference)
 
     def _seen_light(self, light: Tensor, size: int) -> SceneLight:
-        return SceneLight.seen(light, self._depths, self._survey.border, size, self._survey.compositing)
+        return SceneLight.seen(light, self._depths, self._samples.border, size, self._samples.compositing)
 
     def error(self, fidelity: Fidelity) -> float:
         """Return the predicted error of a fidelity, full scale 1; its window is at most that of the reference.
@@ -145,7 +145,7 @@ class PlannedScene:
                 f"errors are predicted for a fixed window up to the reference's {self.reference.window}, got "
                 f"{fidelity.window}"
             )
-        if self._survey.captures > 1 and fidelity.occlusion_states != "each":
+        if self._samples.captures > 1 and fidelity.occlusion_states != "each":
             raise ValueError(f"errors are predicted for occlusion_states 'each', got {fidelity.occlusion_states!r}")
         return sum(error for _, error in self._parts(fidelity))
 
@@ -154,11 +154,11 @@ class PlannedScene:
 
         See :mod:`kornia_tidy.render.cost_model`.
         """
-        survey, scene = self._survey, self._work(fidelity)
-        bank = bank_work(survey.geometry(fidelity), fidelity, self._computed(fidelity))
+        samples, scene = self._samples, self._work(fidelity)
+        bank = bank_work(samples.geometry(fidelity), fidelity, self._computed(fidelity))
         seconds = seconds_of(bank, scene.profile, torch.get_num_threads())
-        seconds += rendering_seconds(scene, survey.planes, double=fidelity.double)
-        return (survey.captures if self._occlusion else 1) * seconds
+        seconds += rendering_seconds(scene, samples.planes, double=fidelity.double)
+        return (samples.captures if self._occlusion else 1) * seconds
 
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
@@ -173,7 +173,7 @@ class PlannedScene:
 
     def _within(self, tolerance: float) -> Iterator[Fidelity]:
         """Yield the narrowest window within a tolerance for each combination of the other settings."""
-        windows, counts = window_ladder(window_side(self.reference)), tuple(self._wavelength_counts(tolerance))
+        windows, counts = window_steps(window_side(self.reference)), tuple(self._wavelength_counts(tolerance))
         for layers, double, points, count in product(layer_kinds(), (False, True), PIXEL_TOLERANCES, counts):
             full = replace(layers, window=windows[-1], double=double, pixel_tolerance=points, wavelengths=count)
             if self.error(full) > tolerance:
@@ -185,7 +185,7 @@ class PlannedScene:
 
     def _wavelength_counts(self, tolerance: float) -> Iterator[int | None]:
         """Yield candidate numbers of wavelengths, up to the first with an error small against the tolerance."""
-        for count in self._survey.wavelength_counts():
+        for count in self._samples.wavelength_counts():
             error = SAFETY * self._wavelength_error(count)
             if error <= tolerance:
                 yield count
@@ -194,8 +194,8 @@ class PlannedScene:
         yield None
 
     def _described(self, fidelity: Fidelity, tolerance: float) -> RenderPlan:
-        survey, window = self._survey, window_side(fidelity)
-        held = _cropped(survey.window_survey(window_side(self.reference))[1], window).sum((-2, -1))
+        samples, window = self._samples, window_side(fidelity)
+        held = _cropped(samples.window_samples(window_side(self.reference))[1], window).sum((-2, -1))
         return RenderPlan(
             fidelity=fidelity,
             reference=self.reference,
@@ -206,10 +206,10 @@ class PlannedScene:
             reference_seconds=self.seconds(self.reference),
             memory_bytes=self._memory(fidelity),
             layers_present=self._computed(fidelity),
-            layers_total=len(self._samples(fidelity)),
-            states=survey.captures,
-            wavelengths=len(survey.geometry(fidelity).wavelengths),
-            wavelengths_total=len(survey.spectrum.wavelengths),
+            layers_total=len(self._sampled_defocus(fidelity)),
+            states=samples.captures,
+            wavelengths=len(samples.geometry(fidelity).wavelengths),
+            wavelengths_total=len(samples.spectrum.wavelengths),
             light_held=(float(held.min()), float(held.max())),
             reference_error=self._layers(self._rows, self._layers.own_rows()),
         )
@@ -242,14 +242,14 @@ class PlannedScene:
         Occlusion divides by the cumulative alpha. With the border ``"zero"`` it covers the image alone: in a tiny image
         PSFs are renormalised by the small share inside it, and their errors grow likewise.
         """
-        if not self._occlusion or self._survey.border != "zero":
+        if not self._occlusion or self._samples.border != "zero":
             return 1.0
-        psfs = self._survey.window_survey(window_side(self.reference))[1]
+        psfs = self._samples.window_samples(window_side(self.reference))[1]
         shares = share_in_frame(psfs, self._defocus.shape[-2:]) / psfs.sum((-2, -1))
         return min(1.0, float(shares.amin()))
 
     def _layer_rows(self, fidelity: Fidelity) -> Tensor:
-        return self._layers.rows(self._survey.nodes(fidelity), fidelity.layers, self._survey.band)
+        return self._layers.rows(self._samples.nodes(fidelity), fidelity.layers, self._samples.band)
 
     def _layer_error(self, fidelity: Fidelity) -> float:
         key = (fidelity.layers, fidelity.layer_spacing)
@@ -276,7 +276,7 @@ class PlannedScene:
             return 0.0
         key = ("dark", fidelity.window)
         if key not in self._known:
-            nodes, psfs = self._survey.window_survey(window_side(self.reference))
+            nodes, psfs = self._samples.window_samples(window_side(self.reference))
             held = _cropped(psfs, window_side(fidelity)).sum((-2, -1)).amin(1).double()
             lost = EPSILON / (interpolation(self._depths.psi, nodes) @ held) - EPSILON
             self._known[key] = 2 * self._level * float((self._depths.share @ lost.square()).sqrt())
@@ -291,7 +291,7 @@ class PlannedScene:
             return 0.0
         key = ("spread", fidelity.window)
         if key not in self._known:
-            nodes, psfs = self._survey.window_survey(window_side(self.reference))
+            nodes, psfs = self._samples.window_samples(window_side(self.reference))
             lost = psfs.sum((-2, -1)) - _cropped(psfs, window_side(fidelity)).sum((-2, -1))
             lost = interpolation(self._depths.psi, nodes) @ lost.double() * self._apart.T
             self._known[key] = float((self._depths.share @ lost.square()).mean().clamp(min=0).sqrt())
@@ -304,7 +304,7 @@ class PlannedScene:
         key = (window, stray_light)
         full = window_side(self.reference)
         if key not in self._known:
-            nodes, psfs = self._survey.window_survey(full)
+            nodes, psfs = self._samples.window_samples(full)
             around = slice(
                 max(0, bisect_right(nodes, float(self._depths.psi[0])) - 1),
                 bisect_left(nodes, float(self._depths.psi[-1])) + 1,
@@ -324,22 +324,22 @@ class PlannedScene:
         if tolerance <= REFERENCE.pixel_tolerance:
             return 0.0
         if tolerance not in self._known:
-            nodes, changes = self._survey.pixel_changes(tolerance, window_side(self.reference))
+            nodes, changes = self._samples.pixel_changes(tolerance, window_side(self.reference))
             self._known[tolerance] = change_error(nodes, changes, self._light)
         return self._known[tolerance]
 
     def _wavelength_error(self, count: int | None) -> float:
-        if count is None or count >= len(self._survey.spectrum.wavelengths):
+        if count is None or count >= len(self._samples.spectrum.wavelengths):
             return 0.0
         key = ("wavelengths", count)
         if key not in self._known:
-            nodes, changes = self._survey.wavelength_changes(count, window_side(self.reference))
+            nodes, changes = self._samples.wavelength_changes(count, window_side(self.reference))
             lights = (self._light, *self._colours)
             self._known[key] = sum(map(change_error, repeat(nodes), changes, lights))
         return self._known[key]
 
-    def _samples(self, fidelity: Fidelity) -> Sequence[float]:
-        nodes = self._survey.nodes(fidelity)
+    def _sampled_defocus(self, fidelity: Fidelity) -> Sequence[float]:
+        nodes = self._samples.nodes(fidelity)
         return guarded(nodes, TAPS[fidelity.layers] // 2) if fidelity.layers in TAPS else nodes
 
     def _computed(self, fidelity: Fidelity) -> int:
@@ -347,20 +347,20 @@ class PlannedScene:
         key = ("computed", fidelity.layers, fidelity.layer_spacing)
         if key not in self._known:
             ends = torch.stack([self._depths.psi[0], self._depths.psi[-1]])
-            weights, _ = layer_coefficients(ends, self._survey.nodes(fidelity), fidelity.layers, self._survey.band)
+            weights, _ = layer_coefficients(ends, self._samples.nodes(fidelity), fidelity.layers, self._samples.band)
             used = torch.nonzero((weights != 0).any(0)).flatten()
             self._known[key] = int(used[-1] - used[0] + 1)
         return int(self._known[key])
 
     def _memory(self, fidelity: Fidelity) -> int:
-        survey, scene, layers = self._survey, self._work(fidelity), self._computed(fidelity)
-        rendering = rendering_bytes(scene, survey.planes, double=fidelity.double)
-        held = survey.captures * max(layers, scene.layers)
-        return memory_bytes(survey.geometry(fidelity), survey.planes, fidelity, held, rendering)
+        samples, scene, layers = self._samples, self._work(fidelity), self._computed(fidelity)
+        rendering = rendering_bytes(scene, samples.planes, double=fidelity.double)
+        held = samples.captures * max(layers, scene.layers)
+        return memory_bytes(samples.geometry(fidelity), samples.planes, fidelity, held, rendering)
 
     def _rendered(self, fidelity: Fidelity) -> Sequence[float]:
         """Return the defocus of the rendered layers."""
-        nodes = self._survey.nodes(fidelity)
+        nodes = self._samples.nodes(fidelity)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
     def _work(self, fidelity: Fidelity) -> SceneWork:
@@ -368,7 +368,7 @@ class PlannedScene:
         nodes, window = self._rendered(fidelity), window_side(fidelity)
         mode = "nearest" if fidelity.layers == "nearest" else "linear"
         if (mode, nodes, window) not in self._works:
-            margin = 0 if self._survey.compositing == "gather" and self._survey.border != "valid" else window // 2
+            margin = 0 if self._samples.compositing == "gather" and self._samples.border != "valid" else window // 2
             if self._labelled is None or self._labelled[0] != (
                 mode,
                 nodes,
@@ -376,13 +376,13 @@ class PlannedScene:
             ):  # only one is cached: it is large
                 seen = self._seen(margin)
                 self._labelled = (mode, nodes, margin), label_pixels(seen, self._batch, nodes, mode)
-            work = count_work(self._labelled[1], len(nodes), window, self._survey.compositing)
+            work = count_work(self._labelled[1], len(nodes), window, self._samples.compositing)
             self._works[mode, nodes, window] = work
         return self._works[mode, nodes, window]
 
     def _seen(self, margin: int) -> Tensor:
         """Return the defocus of the rendered pixels: cropped for the border ``valid``, else padded by the margin."""
-        border = self._survey.border
+        border = self._samples.border
         if border == "valid" and not self._occlusion:
             height, width = self._defocus.shape[-2:]
             return self._defocus[..., margin : height - margin, margin : width - margin]
@@ -390,7 +390,7 @@ class PlannedScene:
 
     @property
     def _occlusion(self) -> bool:
-        return self._survey.compositing == "occlusion"
+        return self._samples.compositing == "occlusion"
 
 
 def _cropped(psfs: Tensor, window: int) -> Tensor:

@@ -13,12 +13,12 @@ from torch import Tensor
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.planning.bank_cost import BankGeometry
-from kornia_tidy.planning.candidates import REFERENCE, layer_kinds, wavelength_ladder
+from kornia_tidy.planning.candidates import REFERENCE, layer_kinds, wavelength_steps
 from kornia_tidy.planning.error_model import chebyshev_nodes, nodes_needed
 from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, guarded
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.psf.spectral_binning import fewer_wavelengths
+from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.render.borders import largest_window
 
 _TOLERANCE = 0.3  # pixel tolerance of the samples: some per cent suffice for differences of PSFs
@@ -64,7 +64,7 @@ class PlannableCamera(Protocol):
         ...
 
 
-class CameraSurvey:
+class PSFSamples:
     """PSF samples of a camera's masks at the time of construction, each computed once on first use.
 
     Args:
@@ -99,7 +99,7 @@ class CameraSurvey:
 
     def merged(self, count: int | None) -> Spectrum:
         """Return the spectrum binned to a number of wavelengths."""
-        return self.spectrum if count is None else fewer_wavelengths(self.spectrum, count)
+        return self.spectrum if count is None else bin_spectrum(self.spectrum, count)
 
     def wavelength_counts(self) -> tuple[int, ...]:
         """Return the candidate numbers of binned wavelengths, ascending; none with one wavelength per channel.
@@ -107,7 +107,7 @@ class CameraSurvey:
         One wavelength per channel is a model of its own, not a sample of a broader spectrum.
         """
         single = all(sum(weight > 0 for weight in row) == 1 for row in self.spectrum.weights)
-        return () if single else wavelength_ladder(self._fewest, len(self.spectrum.wavelengths))
+        return () if single else wavelength_steps(self._fewest, len(self.spectrum.wavelengths))
 
     def nodes(self, fidelity: Fidelity) -> tuple[float, ...]:
         """Return the defocus of a fidelity's layers."""
@@ -126,7 +126,7 @@ class CameraSurvey:
             self._references[limit] = replace(REFERENCE, window=window)
         return self._references[limit]
 
-    def layer_survey(self, window: int) -> tuple[Tensor, Tensor]:
+    def layer_samples(self, window: int) -> tuple[Tensor, Tensor]:
         """Return Chebyshev nodes for interpolation over defocus and the PSFs there, in a window of bounded size."""
         window = min(window, _LAYERS_WINDOW)
         if window not in self._layers:
@@ -140,7 +140,7 @@ class CameraSurvey:
             self._layers[window] = nodes, psfs
         return self._layers[window]
 
-    def window_survey(self, window: int) -> tuple[tuple[float, ...], Tensor]:
+    def window_samples(self, window: int) -> tuple[tuple[float, ...], Tensor]:
         """Return sample values of defocus over the range, and the PSFs there in a window."""
         nodes = self._spread(max(1, round((self.defocus_range[1] - self.defocus_range[0]) / _WINDOW_SPACING)))
         if window not in self._wide:

@@ -143,7 +143,8 @@ def interpolated_bank(
     Args:
         bank: PSFs before anything is done about stray light.
         nodes: their defocus in radians, evenly spaced.
-        targets: layers that follow one another in radians, with their taps among the bank's nodes.
+        targets: defocus of the fine layers in radians, ascending; each needs as many nodes on both sides as the
+            interpolation takes.
         band: highest frequency from :func:`defocus_band`, or None for cubic interpolation.
 
     Returns:

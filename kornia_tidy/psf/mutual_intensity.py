@@ -73,7 +73,7 @@ def goes_in_c(window: int, dtype: torch.dtype) -> bool:
 
 
 def _choose_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
-    """Return energies in C where no gradient is wanted, and otherwise from the matrices that gradients are made of."""
+    """Compute the energies by the C kernel if no gradient is wanted, and otherwise by matrix products in torch."""
     if not learning and field.device.type == "cpu" and goes_in_c(kernels.shape[1], field.real.dtype):
         return mutual_intensity_energies(field, weights, kernels)
     return _energies(*_matrices(field, weights, kernels))

@@ -27,7 +27,7 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
-from kornia_tidy.psf.spectral_binning import fewer_wavelengths
+from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.runtime.threads import SharedLock
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
@@ -117,7 +117,7 @@ class ScenePSFs:
         if "spectrum" in parts or "fidelity" in parts:
             fidelity, spectrum = parts.get("fidelity") or self.fidelity, parts.get("spectrum") or self.spectrum
             most = fidelity.wavelengths
-            parts["_sampled"] = spectrum if most is None else fewer_wavelengths(spectrum, most)
+            parts["_sampled"] = spectrum if most is None else bin_spectrum(spectrum, most)
         if "masks" in parts or "modulator" in parts:
             parts["shown"] = None
         return self._replace(_derived=Derived(), **parts)

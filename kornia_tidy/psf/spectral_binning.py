@@ -11,7 +11,7 @@ from kornia_tidy.optics.spectrum import Spectrum
 
 
 @cache
-def fewer_wavelengths(spectrum: Spectrum, count: int) -> Spectrum:
+def bin_spectrum(spectrum: Spectrum, count: int) -> Spectrum:
     r"""Return a spectrum of at most some wavelengths, in which neighbours stand together for one.
 
     The wavelengths are cut into slices :math:`S_i`, each to be seen at the mean of its light, where that moves the
@@ -40,7 +40,7 @@ def fewer_wavelengths(spectrum: Spectrum, count: int) -> Spectrum:
 
     Example:
         >>> many = Spectrum((450e-9, 500e-9, 600e-9, 610e-9), ((1, 1, 0, 0), (0, 0, 1, 3)))
-        >>> few = fewer_wavelengths(many, 3)
+        >>> few = bin_spectrum(many, 3)
         >>> [round(wavelength * 1e9, 1) for wavelength in few.wavelengths], few.weights
         ([450.0, 500.0, 607.5], ((1.0, 1.0, 0.0), (0.0, 0.0, 4.0)))
     """

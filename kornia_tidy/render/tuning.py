@@ -194,7 +194,7 @@ def _shared(measurements: Sequence[Measurement], default: float) -> float:
 
 
 def _solve(shares: NDArray[Any], prior: NDArray[Any]) -> NDArray[Any]:
-    r"""Return x >= 0 with the least :math:`\sum_i w_i ((A x)_i - 1)^2 + p^2 n |x - x_0|^2`, w for outliers."""
+    r"""Return the x >= 0 of least :math:`\sum_i w_i ((A x)_i - 1)^2 + p^2 n |x - x_0|^2`; small w_i for outliers."""
     weights, x, pull = np.ones(len(shares)), prior.copy(), PRIOR**2 * len(shares)
     for _ in range(ROBUST):
         rows = shares * weights[:, None]

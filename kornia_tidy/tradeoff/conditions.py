@@ -19,7 +19,7 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 MEASURED_CODE = (
     "**/*.c",
     "**/*.h",
-    "camera/tidy_optics.py",
+    "camera/*.py",
     "checks.py",
     "fidelity.py",
     "kernels/**/*.py",

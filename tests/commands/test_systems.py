@@ -39,11 +39,11 @@ class TestSystems(BaseTester):
         assert read_image(output).shape[0] == 3
 
     def test_feature_depth_is_stretched_evenly_in_dioptres(self):
-        nearness = torch.tensor([0.0, 0.25, 1.0])
+        inverse_depth = torch.tensor([0.0, 0.25, 1.0])
         for system in SYSTEMS.values():
             camera = system.camera()
             lo, hi = camera.defocus_range
-            psi = camera.defocus(metres(camera, nearness))
+            psi = camera.defocus(metres(camera, inverse_depth))
             self.assert_close(psi, torch.tensor([lo, 0.75 * lo + 0.25 * hi, hi]), rtol=0, atol=2e-3)
 
     def test_feature_the_table_has_a_line_for_each_system_and_its_guesses(self):

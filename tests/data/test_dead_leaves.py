@@ -68,9 +68,9 @@ class TestDeadLeaves(BaseTester):
     def test_feature_seen_depth_is_a_power_of_what_is_uniform(self, num_leaves):
         """Background exp(-3) = 5 % of the pixels; then u ** g for uniform u, however small the leaves."""
         seen = [dead_leaves(96, 96, depth_range=(0.5, 4.0), num_leaves=num_leaves, seed=s)[1] for s in range(40)]
-        nearness = (1 / torch.stack(seen) - 1 / 4.0) / (1 / 0.5 - 1 / 4.0)
-        shown = nearness[nearness >= 1e-5].double()
-        assert 0.03 < (nearness < 1e-5).float().mean() < 0.07
+        inverse_depth = (1 / torch.stack(seen) - 1 / 4.0) / (1 / 0.5 - 1 / 4.0)
+        shown = inverse_depth[inverse_depth >= 1e-5].double()
+        assert 0.03 < (inverse_depth < 1e-5).float().mean() < 0.07
         # With g log-uniform on [1, 3] the mean of u ** g is log(1.5) / log(3); likewise for its powers.
         for power, expected in ((1, math.log(1.5)), (2, math.log(9 / 7)), (0.5, math.log(9 / 5))):
             assert shown.pow(power).mean() == pytest.approx(expected / math.log(3), abs=0.04)

@@ -20,7 +20,7 @@ from tests.base import BaseTester
 
 
 class Passing(nn.Module):
-    """Returns the image, and its red channel as nearness."""
+    """Returns the image, and its red channel as inverse_depth."""
 
     def __init__(self, task):
         super().__init__()
@@ -76,7 +76,7 @@ class TestReconstructLight(BaseTester):
         self.assert_close(result.image, linear_rgb_to_rgb(light))
 
     def test_feature_depth_is_in_metres(self):
-        """Linear colours, so that red light is nearness: half is the focus distance of the default lens."""
+        """Linear colours, so that red light is inverse_depth: half is the focus distance of the default lens."""
         light = torch.tensor([0.0, 0.5, 1.0]).view(1, 1, 3)
         depth = reconstruct_light(light_head("depth", "linear"), light).depth
         self.assert_close(depth.flatten()[1:], torch.tensor([0.595, 0.2975]))

@@ -447,8 +447,8 @@ class TestNoFalseAlarm(BaseTester):
             warnings.filterwarnings("ignore", message=".*beyond the camera's range|the largest PSF window")
             for lens in (ThinLensCamera(), ThinLensCamera.for_scene((near, max(far, 1.1 * near)))):
                 camera(camera=lens)(image, depth)
-            nearness = (1 / depth - 1 / far) / (1 / near - 1 / far)
-            camera(camera=DefocusRange())(image, nearness.clamp(0, 1))
+            inverse_depth = (1 / depth - 1 / far) / (1 / near - 1 / far)
+            camera(camera=DefocusRange())(image, inverse_depth.clamp(0, 1))
 
     def test_feature_dead_leaves(self):
         for item in range(4):

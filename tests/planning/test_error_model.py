@@ -18,7 +18,7 @@ from kornia_tidy.planning.error_model import (
     layer_coefficients,
     nodes_needed,
 )
-from kornia_tidy.planning.psf_samples import CameraSurvey
+from kornia_tidy.planning.psf_samples import PSFSamples
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, coarser, natural_power, power_spectrum
 from kornia_tidy.render.compositing import render
 from tests.base import BaseTester
@@ -48,19 +48,19 @@ class TestInterpolation(BaseTester):
         left_out = scipy.special.jv(range(nodes_needed(half_range, bandwidth), 1000), half_range * bandwidth)
         assert 2 * abs(left_out).sum() < 1e-5
 
-    def test_feature_surveyed_psfs_carry_those_of_every_defocus(self):
+    def test_feature_sampled_psfs_carry_those_of_every_defocus(self):
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
-        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, CameraSurvey(optics, 3).geometry(Fidelity()).bandwidth))
+        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, PSFSamples(optics, 3).geometry(Fidelity()).bandwidth))
         psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
         with torch.no_grad():
             direct, known = (optics.psf_bank(3, None, at).psfs for at in (psi, tuple(nodes.tolist())))
-        surveyed = torch.einsum("an,ncpq->acpq", chebyshev_weights(torch.tensor(psi).double(), nodes), known.double())
-        assert float((surveyed - direct).abs().sum((-2, -1)).max()) < 1e-4
+        sampled = torch.einsum("an,ncpq->acpq", chebyshev_weights(torch.tensor(psi).double(), nodes), known.double())
+        assert float((sampled - direct).abs().sum((-2, -1)).max()) < 1e-4
 
     def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
         """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
         optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
-        assert 1.05**2 * 530 / 470 <= CameraSurvey(optics, 1).geometry(Fidelity()).bandwidth <= 1.2 * 530 / 470
+        assert 1.05**2 * 530 / 470 <= PSFSamples(optics, 1).geometry(Fidelity()).bandwidth <= 1.2 * 530 / 470
 
 
 class TestPower(BaseTester):
@@ -132,8 +132,8 @@ class TestLayers(BaseTester):
         """Against the capture of a point, which is the layered PSF of the camera."""
         fidelity = Fidelity(window=15, layers=layers, layer_spacing=1.0, stray_light="discard", double=True)
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, color_space="linear", border="zero")
-        survey, psi = CameraSurvey(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
-        weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, survey.band)
+        samples, psi = PSFSamples(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
+        weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, samples.band)
         point = torch.zeros(1, 3, 15, 15, dtype=torch.float64)
         point[..., 7, 7] = 1
         with torch.no_grad():

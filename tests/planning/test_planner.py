@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
 from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.optics import camera_spectrum
-from kornia_tidy.planning.candidates import LAYER_SPACINGS, PIXEL_TOLERANCES, REFERENCE, window_ladder
+from kornia_tidy.planning.candidates import LAYER_SPACINGS, PIXEL_TOLERANCES, REFERENCE, window_steps
 from kornia_tidy.planning.planner import PlannedScene, Planner
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.render.borders import largest_window
@@ -397,7 +397,7 @@ class TestWithFidelity(BaseTester):
 class TestWindows(BaseTester):
     def test_feature_ladders_are_odd_ascending_and_end_at_the_largest(self):
         for largest in (1, 3, 5, 31, 129):
-            ladder = window_ladder(largest)
+            ladder = window_steps(largest)
             assert ladder[-1] == largest
             assert all(window % 2 == 1 and window > 0 for window in ladder)
             assert all(a < b <= 1.5 * a + 2 for a, b in pairwise(ladder))

@@ -41,7 +41,7 @@ class TestBank(BaseTester):
         with FlopCounterMode(display=False) as counter, forward_ad.dual_level():
             optics.psf_bank(3, None, (-5.0, 0.0, 5.0))
         counted = counter.get_total_flops()
-        expected = bank_operations(Planner(optics, 3).survey.geometry(fidelity), fidelity, 3) / (
+        expected = bank_operations(Planner(optics, 3).samples.geometry(fidelity), fidelity, 3) / (
             2 if fidelity.double else 1
         )
         assert expected == pytest.approx(counted, rel=0.05)
@@ -49,7 +49,7 @@ class TestBank(BaseTester):
     @pytest.mark.parametrize("double", [False, True])
     def test_feature_all_operations_are_priced_once(self, double):
         fidelity = Fidelity(window=31, double=double)
-        geometry = Planner(TiDyOptics(PixelwiseMask(2), fidelity=fidelity), 3).survey.geometry(fidelity)
+        geometry = Planner(TiDyOptics(PixelwiseMask(2), fidelity=fidelity), 3).samples.geometry(fidelity)
         terms = bank_work(geometry, fidelity, 5).terms
         assert sum(terms[1:]) == bank_operations(geometry, fidelity, 5)
         assert (sum(terms[1::2]) > 0) != double  # products and intensities in float32

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.optics import camera_spectrum
-from kornia_tidy.psf.spectral_binning import fewer_wavelengths
+from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.psf.spectral_error import spectral_error
 from tests.base import BaseTester
 
@@ -34,13 +34,13 @@ def spread(place: np.ndarray, light: np.ndarray) -> float:
 
 class TestFewerWavelengths(BaseTester):
     def test_smoke(self):
-        few = fewer_wavelengths(MANY, 5)
+        few = bin_spectrum(MANY, 5)
         assert len(few.wavelengths) == 5
         assert len(few.weights) == 3
 
     @given(spectra(), st.integers(1, 8))
     def test_property_channels_keep_their_light_and_its_mean_wavelength(self, many, count):
-        few = fewer_wavelengths(many, count)
+        few = bin_spectrum(many, count)
         assert len(few.wavelengths) <= count
         np.testing.assert_allclose(np.sum(few.weights, 1), np.sum(many.weights, 1), rtol=1e-12)
         shares = np.sum(many.channel_weights, 0), np.sum(few.channel_weights, 0)
@@ -55,7 +55,7 @@ class TestFewerWavelengths(BaseTester):
         place, light = np.array(many.wavelengths)[order] * 1e9, light[order]
         if len(many.wavelengths) <= count or len(order) < count:
             return
-        few = fewer_wavelengths(many, count)
+        few = bin_spectrum(many, count)
         every = [
             sum(spread(place[i:j], light[i:j]) for i, j in pairwise((0, *cuts, len(order))))
             for cuts in combinations(range(1, len(order)), count - 1)
@@ -65,27 +65,24 @@ class TestFewerWavelengths(BaseTester):
         assert own == pytest.approx(min(every), abs=1e-6 * (1 + spread(place, light)))
 
     def test_feature_a_spectrum_of_no_more_is_returned_as_it_is(self):
-        assert fewer_wavelengths(MANY, 31) is MANY
-        assert fewer_wavelengths(Spectrum.rgb(), 8) == Spectrum.rgb()
+        assert bin_spectrum(MANY, 31) is MANY
+        assert bin_spectrum(Spectrum.rgb(), 8) == Spectrum.rgb()
 
     def test_feature_what_no_channel_sees_is_left_out(self):
         many = Spectrum((400e-9, 500e-9, 510e-9, 600e-9), ((0, 1, 1, 0), (0, 0, 0, 1)))
-        assert fewer_wavelengths(many, 3).wavelengths == pytest.approx((500e-9, 510e-9, 600e-9))
+        assert bin_spectrum(many, 3).wavelengths == pytest.approx((500e-9, 510e-9, 600e-9))
 
     @pytest.mark.parametrize("count", [3, 4, 7, 16])
     def test_feature_colours_with_spectra_stay_what_they_are(self, count):
         """A basis is checked where a spectrum is made; grey stays flat."""
-        few = fewer_wavelengths(camera_spectrum(samples=31, reflectance=True), count)
+        few = bin_spectrum(camera_spectrum(samples=31, reflectance=True), count)
         np.testing.assert_allclose(np.sum(few.basis, 0), 1, atol=1e-9)
         assert len(few.basis[0]) == count
 
     def test_feature_psfs_come_nearer_with_more_and_beat_equal_slices(self):
         lens = TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(3)), fidelity=Fidelity(window=17))
         errors = {
-            n: [
-                spectral_error(lens.psf_model, few, MANY, (-20.0, 0.0, 12.0))
-                for few in (fewer_wavelengths(MANY, n), equal)
-            ]
+            n: [spectral_error(lens.psf_model, few, MANY, (-20.0, 0.0, 12.0)) for few in (bin_spectrum(MANY, n), equal)]
             for n, equal in ((n, camera_spectrum(samples=n)) for n in (3, 6, 12))
         }
         ours = [own for own, _ in errors.values()]
@@ -94,7 +91,7 @@ class TestFewerWavelengths(BaseTester):
         assert all(own < 0.7 * equal for own, equal in errors.values())
 
     def test_feature_a_camera_at_fewer_is_a_camera_made_of_them(self):
-        masks, few = PixelwiseMask(1), fewer_wavelengths(MANY, 4)
+        masks, few = PixelwiseMask(1), bin_spectrum(MANY, 4)
         image, depth = torch.rand(3, 24, 24), torch.full((1, 24, 24), 0.5)
         own = TiDyOptics(masks, sensor=None, spectrum=MANY, fidelity=Fidelity(window=9, wavelengths=4))
         made = TiDyOptics(masks, sensor=None, spectrum=few, fidelity=Fidelity(window=9))
@@ -115,8 +112,8 @@ class TestFewerWavelengths(BaseTester):
     @pytest.mark.parametrize("count", [0, -1, 1.5])
     def test_exception_names_the_count(self, count):
         with pytest.raises(ValueError, match=f"wavelengths must be a whole number of at least 1, got {count}"):
-            fewer_wavelengths(MANY, count)
+            bin_spectrum(MANY, count)
 
     def test_exception_colours_need_a_wavelength_each(self):
         with pytest.raises(ValueError, match="wavelengths must be a whole number of at least 3, got 2"):
-            fewer_wavelengths(camera_spectrum(samples=7, reflectance=True), 2)
+            bin_spectrum(camera_spectrum(samples=7, reflectance=True), 2)

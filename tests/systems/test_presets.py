@@ -161,17 +161,20 @@ class TestPhysics(BaseTester):
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_white_stays_white(self, name):
         optics = preset(name, sensor=None)
-        nearness = torch.where(torch.arange(44) < 20, 0.9, 0.1) + 0.1 * torch.rand(1, 1, 40, 44)
+        inverse_depth = torch.where(torch.arange(44) < 20, 0.9, 0.1) + 0.1 * torch.rand(1, 1, 40, 44)
         with torch.no_grad():
-            white = optics(torch.ones(1, 3, 40, 44), metres(optics.camera, nearness))
+            white = optics(torch.ones(1, 3, 40, 44), metres(optics.camera, inverse_depth))
         assert float((white - 1).abs().max()) < (1e-6 if name in GATHERING else 2e-5)
 
     @pytest.mark.parametrize("name", GATHERING)
     def test_feature_scatter_conserves_flux(self, name):
         optics = preset(name, sensor=None, compositing="scatter", border="circular", color_space="linear")
-        image, nearness = torch.rand(1, 3, 72, 72, dtype=torch.float64), torch.rand(1, 1, 72, 72, dtype=torch.float64)
+        image, inverse_depth = (
+            torch.rand(1, 3, 72, 72, dtype=torch.float64),
+            torch.rand(1, 1, 72, 72, dtype=torch.float64),
+        )
         with torch.no_grad():
-            coded = optics(image, metres(optics.camera, nearness))
+            coded = optics(image, metres(optics.camera, inverse_depth))
         self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-6, atol=0)
 
     @pytest.mark.parametrize("name", ["tidy-1", "phasecam3d", "ikoma2021", "chang2019", "sitzmann2018"])
@@ -273,10 +276,10 @@ class TestPhysics(BaseTester):
 class TestScenes(BaseTester):
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_all_capture_a_real_scene(self, name, scene):
-        image, nearness = scene
+        image, inverse_depth = scene
         optics = preset(name, color_space="linear", sensor=None)
         with torch.no_grad():
-            light = optics(image, metres(optics.camera, nearness))
+            light = optics(image, metres(optics.camera, inverse_depth))
         assert optics.clamped_pixels == 0
         assert light.shape == image.shape
         assert float(light.mean()) == pytest.approx(float(image.mean()), rel=0.05)
@@ -287,15 +290,15 @@ class TestScenes(BaseTester):
         assert detail(light) < 0.9 * detail(image)
         noisy = preset(name, color_space="linear")
         with torch.no_grad():
-            coded = noisy(image, metres(noisy.camera, nearness))
+            coded = noisy(image, metres(noisy.camera, inverse_depth))
         inside = (light > 0.1) & (light < 0.9)
         assert float((coded - light)[inside].std()) == pytest.approx(SYSTEMS[name].sigma, rel=0.05)
 
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_gradients_reach_whatever_is_learnable(self, name):
         optics = preset(name, sensor=None, fidelity=Fidelity(window=9, layer_spacing=20.0))
-        nearness = torch.where(torch.arange(20) < 10, 0.8, 0.3).expand(1, 1, 20, 20)
-        coded = optics(torch.rand(1, 3, 20, 20), metres(optics.camera, nearness))
+        inverse_depth = torch.where(torch.arange(20) < 10, 0.8, 0.3).expand(1, 1, 20, 20)
+        coded = optics(torch.rand(1, 3, 20, 20), metres(optics.camera, inverse_depth))
         assert coded.requires_grad == (name != "fresnel")
         if name != "fresnel":
             coded.square().mean().backward()

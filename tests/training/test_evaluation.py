@@ -29,7 +29,7 @@ def result(camera, depth, estimate, mask=None):
 
 class TestDepthRow(BaseTester):
     def test_feature_scores_are_their_definitions(self):
-        """From 0.3 m to infinity nearness is 0.3 / z: by hand, without the camera."""
+        """From 0.3 m to infinity inverse_depth is 0.3 / z: by hand, without the camera."""
         camera = ThinLensCamera.for_scene((0.3, INF))
         depth, guess = np.array([0.3, 0.5, 1.0, 2.0, 9.0]), np.array([0.9, 0.5, 0.4, 0.1, 0.05])
         row = depth_row(camera, result(camera, depth, guess))
