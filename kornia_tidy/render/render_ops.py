@@ -70,7 +70,7 @@ def render_layers(
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if shapes do not fit, the compositing is not known, or as :func:`kornia_tidy.render.dispatch.choose`.
+        ValueError: if shapes do not fit or a choice is not known, and as :func:`kornia_tidy.render.dispatch.choose`.
     """
     if compositing not in COMPOSITINGS:
         check_choice("compositing", compositing, COMPOSITINGS)
