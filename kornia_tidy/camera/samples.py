@@ -16,7 +16,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.runtime.threads import CaptureNotes
-from kornia_tidy.runtime.tracing import is_followed, is_value_unknown, refuse_torchscript
+from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
@@ -207,7 +207,7 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
         own = defocus.detach()
         if not own.numel():
             continue
-        if defocus.requires_grad or is_followed():
+        if defocus.requires_grad or is_transformed():
             reach = defocus
         lowest, highest = torch.aminmax(own)
         if not bool((lowest >= lo - ROUNDING) & (highest <= hi + ROUNDING)):

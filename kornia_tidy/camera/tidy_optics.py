@@ -23,9 +23,10 @@ from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import COMPOSITING, render
+from kornia_tidy.render.compositing import COMPOSITING
+from kornia_tidy.render.render_ops import render_layers
 from kornia_tidy.runtime.threads import CaptureNotes
-from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
+from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.systems.presets import published_system
 
@@ -206,7 +207,8 @@ class TiDyOptics(CameraState):
             reach = survey_defocus([defocus], now).reach
             banks = now.psf_model.scene_banks(light.shape[1], sample.dtype, reach, now.compositing == "occlusion")
             irradiance = now.render(light, defocus, banks, now.border)
-            coded = now.encode(now.expose(irradiance, params, generator))
+            seen = irradiance if now.sensor is None else now.sensor(irradiance, params=params, generator=generator)
+            coded = now.encode(seen)
         return sample.coded(coded.to(sample.image.dtype))
 
     def capture(
@@ -228,7 +230,7 @@ class TiDyOptics(CameraState):
         Args:
             dtype: float32 or float64, in which the masks are needed.
         """
-        if is_followed():
+        if torch.compiler.is_compiling() or is_transformed():
             return self
         with self.psf_model.lock:
             return self._replace(psf_model=self.psf_model.snapshot(dtype))
@@ -277,12 +279,11 @@ class TiDyOptics(CameraState):
             margin = banks[0][1].window // 2 if border == "valid" else 0
             return cropped(light, margin) + zero_of(defocus, *(bank.psfs for _, bank in banks))
         fidelity = self.psf_model.fidelity
-        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        options: dict[str, Any] = {"compositing": self.compositing, "border": border, "correlate": fidelity.correlate}
+        options["layers"] = "nearest" if fidelity.layers == "nearest" else "linear"
         total = light
         for index, (share, bank) in enumerate(banks):
-            seen = render(
-                light, defocus, bank, self.compositing, layers=layers, border=border, correlate=fidelity.correlate
-            )
+            seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, method="auto", **options)
             seen = seen if len(banks) == 1 else seen * share
             total = total + seen if index else seen
         return total.unflatten(1, (-1, reflectances)).sum(2) if reflectances > 1 else total

@@ -209,7 +209,7 @@ class ThinLensCamera(nn.Module):
         Raises:
             ValueError: if a depth is NaN or not positive.
         """
-        if check_inputs:
+        if check_inputs and depth.numel() and not bool(depth.detach().amin() > 0):  # NaN too
             check_depth(depth)
         return thin_lens_defocus(depth, self.aperture_diameter / 2, self.focus_distance)
 

@@ -50,7 +50,7 @@ from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes, guarded
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
 from kornia_tidy.render.borders import pad_border
 from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.layers import Labels
+from kornia_tidy.render.scene import Labels
 from kornia_tidy.render.stray_light import share_in_frame
 
 SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.2 times the formula

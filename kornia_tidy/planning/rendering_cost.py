@@ -28,7 +28,8 @@ from kornia_tidy.render.cost_model import (
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE
 from kornia_tidy.render.first_use import profile_for
-from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
+from kornia_tidy.render.layers import assign_layers
+from kornia_tidy.render.scene import SAMPLE, Labels
 
 OCCLUSION_PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.99 to 1.46 of the measured peak
 DENSE_PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy

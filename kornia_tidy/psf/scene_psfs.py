@@ -29,7 +29,7 @@ from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.runtime.threads import SharedLock
-from kornia_tidy.runtime.tracing import is_followed, is_value_unknown, refuse_torchscript
+from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 
 class Derived:
@@ -197,7 +197,8 @@ class ScenePSFs:
         side = self.window if derived.window is None else derived.window.side
         build = partial(self._build, states, weights, spectrum, side, self.fidelity.pixel_tolerance)
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        if learning or is_followed() or next(self.camera.parameters(), None) is not None:
+        traced = torch.compiler.is_compiling() or is_transformed()
+        if learning or traced or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
         fill_factor = getattr(self.modulator, "fill_factor", 1.0)
@@ -273,13 +274,15 @@ class ScenePSFs:
         """
         if torch.jit.is_tracing():
             refuse_torchscript()
-        if self.shown is not None or is_followed():
+        if self.shown is not None or torch.compiler.is_compiling() or is_transformed():
             return self
         with self.lock:
             shown = settled_timeline(self.masks, self.modulator, dtype)
             if self._derived.window is None:
                 _ = self.fitted, self.pupil  # found here, once for all threads
-            return self._replace(shown=shown)
+            model = object.__new__(type(self))
+            vars(model).update(vars(self), shown=shown)
+            return model
 
     # ------------------------------------------------------------------ what follows from the parts
 
@@ -378,7 +381,7 @@ def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]
         return nodes
     lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
     # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad or is_followed())
+    extra = int(defocus.requires_grad or is_transformed())
     first = max(0, bisect_right(nodes, lowest) - 1 - extra)
     last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
     return nodes[min(first, last) : last + 1]

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
 from kornia_tidy.render.render_ops import render_layers
 
 
@@ -79,7 +78,6 @@ def render(
         >>> render(torch.rand(4, 3, 32, 48), torch.zeros(1, 1, 32, 48), bank, border="valid").shape
         torch.Size([4, 3, 28, 44])
     """
-    check_choice("compositing", compositing, COMPOSITING)
     options = {"compositing": compositing, "layers": layers, "border": border}
     scene = image, defocus, bank.defocus, bank.psfs, bank.veil
     return render_layers(*scene, correlate=correlate, method=method, **options)

@@ -19,8 +19,7 @@ from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.first_use import profile_for
-from kornia_tidy.render.layers import SAMPLE
-from kornia_tidy.render.scene import LayeredScene, scene_of_layers
+from kornia_tidy.render.scene import SAMPLE, LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
 
@@ -140,15 +139,19 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     Raises:
         ValueError: as :func:`render_scene`.
     """
-    check_choice("method", method, METHODS)
     if method != "auto":
+        check_choice("method", method, METHODS)
         why = refusal(BACKENDS[method], scene)
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return BACKENDS[method]
-    key = _fingerprint(scene)
+    # With occlusion the values of PSFs matter too.
+    layout = {} if scene.layout is None or scene.compositing == "occlusion" else scene.layout
+    if "fingerprint" not in layout:
+        layout["fingerprint"] = _fingerprint(scene)
+    key = layout["fingerprint"]
     known = None if key is None else _choices.get(key)  # another thread may empty the memory meanwhile
-    if known is not None and refusal(known[0], scene) is None:
+    if known is not None and (known[0].name != "direct" or known[0].refusal(scene) is None):  # others refuse nothing
         best, grids = known
         scene.grids.update(grids)
         return best
@@ -186,13 +189,14 @@ def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
     if labels.layer_index.device.type != "cpu" or is_transformed():
         return None
     digest = hashlib.blake2b(digest_size=16)
-    for layer in labels.every(SAMPLE).terms():
+    for layer in labels.terms(slice(None), *(slice(None, None, SAMPLE),) * 2):
         digest.update(layer.contiguous().numpy())
-    # With occlusion the values of PSFs matter too.
     refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
-    objected, threads, shape = memory_objection(scene), torch.get_num_threads(), labels.layer_index.shape
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    recorded = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
+    threads, shape = torch.get_num_threads(), labels.layer_index.shape
     shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
-    return scene.compositing, *shapes, refused, objected, threads, digest.digest()
+    return scene.compositing, *shapes, refused, recorded, threads, digest.digest()
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:

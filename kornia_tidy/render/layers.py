@@ -7,8 +7,6 @@ and a layer weight, the fraction of the way to the next node. All weights follow
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -16,45 +14,6 @@ from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
 
 LAYER_MODES = ("nearest", "linear")
-SAMPLE = 8  # px between the rows and columns of a sample of the labels
-
-
-@dataclass(frozen=True)
-class Labels:
-    """The layers of each pixel: all light to one layer, or a weight to the next one.
-
-    Args:
-        layer_index: (B, H, W) int64 index of a layer, from :func:`assign_layers`.
-        layer_weight: (B, H, W) weight of the next layer, or None for nearest layers.
-        weight_gradient: a layer with a weight of zero counts too, for its gradient.
-    """
-
-    layer_index: Tensor
-    layer_weight: Tensor | None
-    weight_gradient: bool = False
-
-    @classmethod
-    def of(cls, layer_index: Tensor, layer_weight: Tensor | None) -> Labels:
-        """Return labels for layers as assigned; ``weight_gradient`` where a gradient of ``layer_weight`` is wanted."""
-        if layer_weight is None:
-            return cls(layer_index, None)
-        return cls(layer_index, layer_weight.detach(), layer_weight.requires_grad and torch.is_grad_enabled())
-
-    def every(self, step: int) -> Labels:
-        """Return the labels of every ``step``-th row and column."""
-        kept = (slice(None), slice(None, None, step), slice(None, None, step))
-        weight = self.layer_weight
-        return Labels(self.layer_index[kept], None if weight is None else weight[kept], self.weight_gradient)
-
-    def terms(self, *where: slice) -> list[Tensor]:
-        """Return the one or two layers of each pixel there: the same twice if it lies in one."""
-        index = self.layer_index[where]
-        if self.layer_weight is None:
-            return [index]
-        if self.weight_gradient:
-            return [index, index + 1]
-        weight = self.layer_weight[where]
-        return [index + (weight == 1), index + (weight > 0)]
 
 
 def clamp_defocus(defocus: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.checks import check_choice
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.dispatch import (
     chain_gradients,
@@ -21,13 +22,14 @@ from kornia_tidy.render.dispatch import (
     render_unrecorded,
     scene_gradients,
 )
-from kornia_tidy.render.scene import LayeredScene, check_scene, layered_scene
+from kornia_tidy.render.scene import assigned_scene, check_scene, layered_scene, remembered_scene
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
     " str border, bool correlate, str method"
 )
+COMPOSITINGS = ("gather", "scatter", "occlusion")
 _TENSORS = 5  # of a scene, which may have gradients
 
 torch.library.define("kornia_tidy::render_layers", f"({_SCENE}) -> Tensor")
@@ -68,8 +70,10 @@ def render_layers(
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if shapes do not fit, or as :func:`kornia_tidy.render.dispatch.choose`.
+        ValueError: if shapes do not fit or a choice is not known, and as :func:`kornia_tidy.render.dispatch.choose`.
     """
+    if compositing not in COMPOSITINGS:
+        check_choice("compositing", compositing, COMPOSITINGS)
     if is_transformed():
         options = {"compositing": compositing, "layers": layers, "border": border}
         scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
@@ -83,7 +87,7 @@ def render_layers(
 def _render(*arguments: Any) -> Tensor:
     image, method = arguments[0], arguments[-1]
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
-        scene = _scene(*arguments[:-1])
+        scene = remembered_scene(*arguments[:-1])
         return render_unrecorded(choose(scene, method), scene).contiguous()
 
 
@@ -93,17 +97,13 @@ def _render_fake(*arguments: Any) -> Tensor:
     return image.new_empty(image.shape[0], image.shape[1], image.shape[2] - lost, image.shape[3] - lost)
 
 
-def _scene(*arguments: Any) -> LayeredScene:
-    *tensors, compositing, layers, border, correlate = arguments
-    return layered_scene(*tensors, compositing=compositing, layers=layers, border=border, correlate=correlate)
-
-
 def _gradients(*arguments: Any) -> list[Tensor]:
     tensors, options, (method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:-3], arguments[-3:]
     own = leaves_of(tensors, wanted)
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
-        scene = _scene(*own, *options)
+        given: list[Any] = [*own, *options]
+        scene = assigned_scene(*given)
         found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
     return [
         torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
@@ -132,7 +132,8 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     if torch.is_grad_enabled():  # it is differentiated in turn
 
         def render(*tensors: Tensor | None) -> Tensor:
-            return render_unrecorded(DenseBackend(), _scene(*tensors, *options))
+            given: list[Any] = [*tensors, *options]
+            return render_unrecorded(DenseBackend(), assigned_scene(*given))
 
         with torch.autocast(gradient.device.type, enabled=False):
             return *differentiable_gradients(render, tensors, gradient, wanted), *rest

@@ -2,15 +2,57 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.render.borders import check_border, pad_border
-from kornia_tidy.render.layers import SAMPLE, Labels, assign_layers
+from kornia_tidy.render.borders import BORDERS, check_border, pad_border
+from kornia_tidy.render.layers import assign_layers
+
+SAMPLE = 8  # px between the rows and columns of a sample of the labels
+LARGEST_REMEMBERED = 1 << 20  # pixels of a defocus map: some 24 MB with their layers
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The layers of each pixel: all light to one layer, or a weight to the next one.
+
+    Args:
+        layer_index: (B, H, W) int64 index of a layer, from :func:`~kornia_tidy.render.layers.assign_layers`.
+        layer_weight: (B, H, W) weight of the next layer, or None for nearest layers.
+        weight_gradient: a layer with a weight of zero counts too, for its gradient.
+    """
+
+    layer_index: Tensor
+    layer_weight: Tensor | None
+    weight_gradient: bool = False
+
+    @classmethod
+    def of(cls, layer_index: Tensor, layer_weight: Tensor | None) -> Labels:
+        """Return labels for layers as assigned; ``weight_gradient`` where a gradient of ``layer_weight`` is wanted."""
+        if layer_weight is None:
+            return cls(layer_index, None)
+        return cls(layer_index, layer_weight.detach(), layer_weight.requires_grad and torch.is_grad_enabled())
+
+    def every(self, step: int) -> Labels:
+        """Return the labels of every ``step``-th row and column."""
+        kept = (slice(None), slice(None, None, step), slice(None, None, step))
+        weight = self.layer_weight
+        return Labels(self.layer_index[kept], None if weight is None else weight[kept], self.weight_gradient)
+
+    def terms(self, *where: slice) -> list[Tensor]:
+        """Return the one or two layers of each pixel there: the same twice if it lies in one."""
+        index = self.layer_index[where]
+        if self.layer_weight is None:
+            return [index]
+        if self.weight_gradient:
+            return [index, index + 1]
+        weight = self.layer_weight[where]
+        return [index + (weight == 1), index + (weight > 0)]
 
 
 @dataclass(frozen=True)
@@ -33,6 +75,8 @@ class LayeredScene:
         labels: the same for each image of the batch, without gradients.
         found: planes that were made of the scene, by their names, so that they are made once.
         grids: the best tiles of each kind for the scene, as far as they were looked for.
+        layout: what else follows from the layers, kept as long as :func:`remembered_scene` remembers them; None for
+            other scenes.
     """
 
     image: Tensor
@@ -47,6 +91,7 @@ class LayeredScene:
     labels: Labels
     found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     grids: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+    layout: dict[Any, Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
@@ -116,6 +161,33 @@ def layered_scene(
         ((4, 4), tensor([0]), tensor([0.5000]))
     """
     check_scene(image, defocus, nodes, psfs, stray_light, border)
+    return assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+
+
+def assigned_scene(
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    stray_light: Tensor | None,
+    compositing: str,
+    layers: str,
+    border: str,
+    correlate: bool,
+) -> LayeredScene:
+    """Return the scene of :func:`layered_scene`, whose tensors were checked before.
+
+    Args:
+        image: this and the other arguments are those of :func:`layered_scene`.
+        defocus: of each pixel.
+        nodes: defocus of the layers.
+        psfs: of the layers.
+        stray_light: of the layers, or None.
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
+        layers: ``"linear"`` or ``"nearest"``.
+        border: what lies beyond the image.
+        correlate: flip the PSFs by 180 degrees.
+    """
     dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
     index, weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
     return scene_of_layers(
@@ -127,6 +199,73 @@ def layered_scene(
         border,
         compositing,
         image.dtype,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Remembered:
+    """The layers of a scene, for a defocus map and the layers' nodes."""
+
+    options: tuple[Hashable, ...]
+    defocus: Tensor
+    nodes: Tensor
+    scene: LayeredScene
+
+
+_last: dict[str, _Remembered] = {}
+
+
+def remembered_scene(
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    stray_light: Tensor | None,
+    compositing: str,
+    layers: str,
+    border: str,
+    correlate: bool,
+) -> LayeredScene:
+    """Return the scene of :func:`assigned_scene`; layers are assigned once for a defocus map that comes again.
+
+    The map is compared value by value. Only the last one is remembered, up to :data:`LARGEST_REMEMBERED` pixels and on
+    a processor. For use without gradients.
+
+    Args:
+        image: this and the other arguments are those of :func:`assigned_scene`.
+        defocus: of each pixel.
+        nodes: defocus of the layers.
+        psfs: of the layers.
+        stray_light: of the layers, or None.
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
+        layers: ``"linear"`` or ``"nearest"``.
+        border: what lies beyond the image.
+        correlate: flip the PSFs by 180 degrees.
+    """
+    if defocus.device.type != "cpu" or defocus.numel() > LARGEST_REMEMBERED:
+        return assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+    options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads()
+    options += image.dtype, psfs.dtype, defocus.dtype, nodes.dtype
+    last = _last.get("scene")  # another thread may put in another one meanwhile
+    if (
+        last is None
+        or last.options != options
+        or not (torch.equal(last.defocus, defocus) and torch.equal(last.nodes, nodes))
+    ):
+        scene = assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+        scene = replace(scene, layout={})
+        nothing = image.new_empty(0)
+        kept = replace(scene, image=nothing, psfs=nothing, stray_light=None, found={})
+        _last["scene"] = _Remembered(options, defocus.clone(), nodes.clone(), kept)
+        return scene
+    dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
+    return replace(
+        last.scene,
+        image=image.to(dtype),
+        psfs=(psfs.flip((-2, -1)) if correlate else psfs).to(dtype),
+        stray_light=None if stray_light is None else stray_light.to(dtype),
+        found={},
+        grids=dict(last.scene.grids),
     )
 
 
@@ -193,4 +332,5 @@ def check_scene(
         raise ValueError(
             f"veil must have shape {(depth, channels)}, one value a layer and channel, got {tuple(stray_light.shape)}"
         )
-    check_border(border, height, width, psf_width)
+    if border not in BORDERS or min(height, width) < psf_width:  # no border needs more
+        check_border(border, height, width, psf_width)

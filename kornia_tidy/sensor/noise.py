@@ -203,7 +203,8 @@ class SensorNoise(nn.Module):
             >>> sorted(SensorNoise(0.01, full_well=1e4).draw((1, 3, 4, 4)))
             ['read', 'shot']
         """
-        check_choice("dtype", dtype, (torch.float32, torch.float64))
+        if dtype != torch.float32:
+            check_choice("dtype", dtype, (torch.float32, torch.float64))
         if generator is not None:
             check_generator(generator)
         source = device if generator is None else generator.device

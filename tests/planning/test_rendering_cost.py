@@ -78,7 +78,7 @@ class TestCount(BaseTester):
         """Against the plan that the renderer makes, where every pixel is looked at: some pairs are few pixels."""
         labels = label_pixels(ramp(300, 400), 2, NODES, "linear")
         counted = count_work(labels, len(NODES), 31)
-        plan = plan_blocks(labels, len(NODES), choose_grid(labels, len(NODES), 31), BLOCKS)
+        plan = plan_blocks(labels, len(NODES), choose_grid(labels, len(NODES), 31), BLOCKS, offset=30)
         tiles = counted.works["tiled"]
         assert isinstance(tiles, TiledWork)
         assert (tiles.size, tiles.blocks) == (plan.grid.size, plan.grid.blocks)

@@ -16,7 +16,8 @@ from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.backends.window_plan import plan_windows
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import gather, occlusion, render
-from kornia_tidy.render.layers import Labels, layer_weights
+from kornia_tidy.render.layers import layer_weights
+from kornia_tidy.render.scene import Labels
 from tests.base import BaseTester
 from tests.render.backends.test_tiled import KINDS, LargestTensor, depth_map
 from tests.render.render_tester import METHODS, SMALL_TILES, RenderTester, render_by

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends.tile_plan import Grid, TileKind
-from kornia_tidy.render.layers import Labels
+from kornia_tidy.render.scene import Labels
 
 
 class Run(NamedTuple):
@@ -64,6 +64,8 @@ class BlockPlan:
         labels: the layers of each pixel.
         start: (blocks, D) where the plane of a block and layer starts among its chunk's, in floats; of no meaning if
             they are not a pair.
+        number: (images, rows, columns) block of each pixel of the largest chunk, times D, counted from its first block.
+        inside: (rows, columns) where each of these pixels stands in its plane, in floats.
         chunks: the blocks in the order they are worked on.
         by_slices: pairs are multiplied run by run, which passes over a processor's memory less often; otherwise all at
             once, which starts fewer kernels on an accelerator.
@@ -73,12 +75,22 @@ class BlockPlan:
     present: Tensor
     labels: Labels
     start: Tensor
+    number: Tensor
+    inside: Tensor
     chunks: list[Chunk]
     by_slices: bool
 
 
-def plan_blocks(labels: Labels, layers: int, grid: Grid, kind: TileKind) -> BlockPlan:
-    """List the pairs of block and layer of a grid, and group them into chunks."""
+def plan_blocks(labels: Labels, layers: int, grid: Grid, kind: TileKind, offset: int) -> BlockPlan:
+    """List the pairs of block and layer of a grid, and group them into chunks.
+
+    Args:
+        labels: the layers of each pixel.
+        layers: number of layers D.
+        grid: the blocks.
+        kind: of the tiles.
+        offset: where a tile's first pixel stands in its window, down and across.
+    """
     device = labels.layer_index.device
     stride = 2 * grid.size**2
     itemsize = 4 if labels.layer_weight is None else labels.layer_weight.element_size()
@@ -96,7 +108,14 @@ def plan_blocks(labels: Labels, layers: int, grid: Grid, kind: TileKind) -> Bloc
         start[block[own], layer[own]] = torch.arange(0, (own.stop - own.start) * stride, stride, device=device)
         counts = [stop - start for start, stop in pairwise(ends[first : last + 1])]
         chunks.append(_chunk(grid, extent, block[own] - first, number[own], counts))
-    return BlockPlan(grid, used.nonzero().squeeze(-1), labels, start, chunks, device.type == "cpu")
+    images = torch.arange(max(chunk.extent[0] for chunk in chunks), device=device)
+    y = torch.arange(max(chunk.extent[1] for chunk in chunks) * grid.tile, device=device)
+    x = torch.arange(grid.width, device=device)
+    number = grid.number(images, y, x) * layers  # alike for all rows of blocks
+    down, across = y % grid.tile + offset, x % grid.tile + offset
+    inside = (down * (2 * grid.size))[:, None] + (2 * across + x // grid.tile % 2)
+    by_slices = device.type == "cpu"
+    return BlockPlan(grid, used.nonzero().squeeze(-1), labels, start, number, inside, chunks, by_slices)
 
 
 Extent = tuple[tuple[int, int], ...]  # first and last image, row and column of blocks

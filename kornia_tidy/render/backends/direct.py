@@ -27,8 +27,7 @@ from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
 from kornia_tidy.render.backends.tiled import gather_gradients
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.cost_model import DirectWork, Work
-from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.scene import Labels, LayeredScene
 
 EVERY = 4  # columns of strips are counted in every fourth row of them
 
@@ -77,7 +76,7 @@ class DirectBackend:
         plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
         if wants_gradient(tensors[0]):
-            plan = plan_blocks(labels, layers, choose_grid(labels, layers, side), BLOCKS)
+            plan = plan_blocks(labels, layers, choose_grid(labels, layers, side), BLOCKS, side - 1)
             of_plane, _, _ = gather_gradients(plane, psfs, gradient, plan, (True, False, False))
         if wants_gradient(tensors[1]):
             of_psfs = gather_direct_psf_gradient(plane, gradient, index, weight, layers)

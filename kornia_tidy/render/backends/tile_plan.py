@@ -19,7 +19,7 @@ from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.cost_model import TiledOcclusionWork, TiledWork, seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.cost_store import settled_profile
-from kornia_tidy.render.layers import SAMPLE, Labels
+from kornia_tidy.render.scene import SAMPLE, Labels
 
 TileWork = TiledWork | TiledOcclusionWork
 
@@ -81,6 +81,7 @@ class Grid:
         reach: pixels beyond its lower and right end in which a layer counts as a block's own.
         rows: blocks from top to bottom; the last ones may reach beyond the plane.
         columns: blocks from left to right.
+        spare: rows and columns by which the last blocks reach beyond the plane.
     """
 
     batch: int
@@ -92,6 +93,7 @@ class Grid:
     reach: int
     rows: int
     columns: int
+    spare: tuple[int, int]
 
     @property
     def blocks(self) -> int:
@@ -202,7 +204,8 @@ def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: T
     if not kind.windowed:
         tile = min(tile, max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2))
         rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
-    return Grid(batch, height, width, size, tile, kind.across, reach, rows, columns)
+    spare = rows * tile - height, columns * kind.across * tile - width
+    return Grid(batch, height, width, size, tile, kind.across, reach, rows, columns, spare)
 
 
 def _works(grids: list[Grid], present: list[Tensor], blended: int, kind: TileKind) -> list[TileWork]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ class Offsets(NamedTuple):
     above: tuple[Tensor, Tensor] | None
 
 
+@dataclass(eq=False)
 class TileWorkspace:
     """The steps of one pass over a plan, for one channel of one chunk each, in memory that all of them use again.
 
@@ -33,27 +35,16 @@ class TileWorkspace:
     Args:
         plan: what to compute.
         psfs: (D, C, P, P).
-        offset: where a tile's first pixel stands in its window, down and across.
     """
 
-    def __init__(self, plan: BlockPlan, psfs: Tensor, offset: int) -> None:
-        self.plan, self._psfs = plan, psfs
-        self._memory: dict[tuple[str, torch.dtype], Tensor] = {}
-        self._dtype, self._complex, self._device = psfs.dtype, psfs.dtype.to_complex(), psfs.device
-        size, tile = plan.grid.size, plan.grid.tile
-        largest = max(chunk.extent[0] for chunk in plan.chunks), max(chunk.extent[1] for chunk in plan.chunks)
-        images = torch.arange(largest[0], device=psfs.device)
-        y = torch.arange(largest[1] * tile, device=psfs.device)
-        x = torch.arange(plan.grid.width, device=psfs.device)
-        # A pixel's block times the number of layers, and where it stands in its window, counted in floats: alike for
-        # all rows of blocks.
-        self._number = plan.grid.number(images, y, x) * plan.start.shape[1]
-        self._inside = ((y % tile + offset) * (2 * size))[:, None] + (2 * (x % tile + offset) + x // tile % 2)
+    plan: BlockPlan
+    psfs: Tensor
+    _memory: dict[tuple[str, torch.dtype], Tensor] = field(default_factory=dict)
 
     @cached_property
     def spectra(self) -> Tensor:
         """(C, D', size, size) spectra of the PSFs of the layers that are present."""
-        psfs = self._psfs.transpose(0, 1).index_select(1, self.plan.present)
+        psfs = self.psfs.transpose(0, 1).index_select(1, self.plan.present)
         return torch.fft.fft2(psfs, s=(self.plan.grid.size, self.plan.grid.size))
 
     @cached_property
@@ -63,14 +54,14 @@ class TileWorkspace:
 
     def no_spectra(self) -> Tensor:
         """Return zeros of the shape of :attr:`spectra`."""
-        shape = (self._psfs.shape[1], len(self.plan.present), self.plan.grid.size, self.plan.grid.size)
-        return self._psfs.new_zeros(shape, dtype=self._complex)
+        shape = (self.psfs.shape[1], len(self.plan.present), self.plan.grid.size, self.plan.grid.size)
+        return self.psfs.new_zeros(shape, dtype=self.psfs.dtype.to_complex())
 
     def _buffer(self, name: str, shape: Sequence[int], dtype: torch.dtype | None = None) -> Tensor:
         """Return memory by name, with whatever was left in it."""
-        count, key = math.prod(shape), (name, dtype or self._dtype)
+        count, key = math.prod(shape), (name, dtype or self.psfs.dtype)
         if key not in self._memory or len(self._memory[key]) < count:
-            self._memory[key] = torch.empty(count, dtype=key[1], device=self._device)
+            self._memory[key] = torch.empty(count, dtype=key[1], device=self.psfs.device)
         return self._memory[key][:count].view(*shape)
 
     def windows(self, plane: Tensor, chunk: Chunk) -> Tensor:
@@ -87,7 +78,7 @@ class TileWorkspace:
             whole[:, : part.shape[1], : part.shape[2]] = part
             part = whole
         tiles = part.unfold(1, size, tile).unfold(2, size, tile)
-        cut = self._buffer("windows", (*chunk.extent, size, size), self._complex)
+        cut = self._buffer("windows", (*chunk.extent, size, size), self.psfs.dtype.to_complex())
         return torch.complex(tiles[:, :, 0::2], tiles[:, :, 1::2], out=cut).flatten(0, 2)
 
     def add_windows(self, plane: Tensor, windows: Tensor, chunk: Chunk) -> None:
@@ -116,7 +107,7 @@ class TileWorkspace:
 
     def blur(self, light: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Return each pair's light times the spectrum of its layer, (pairs, size, size)."""
-        pairs = self._buffer("pairs", (len(chunk.layer), *light.shape[1:]), self._complex)
+        pairs = self._buffer("pairs", (len(chunk.layer), *light.shape[1:]), self.psfs.dtype.to_complex())
         if not self.plan.by_slices:
             return torch.index_select(spectra, 0, chunk.layer, out=pairs).mul_(light.index_select(0, chunk.block))
         for run in chunk.runs:
@@ -125,9 +116,10 @@ class TileWorkspace:
 
     def sum_layers(self, own: Tensor, spectra: Tensor, chunk: Chunk) -> Tensor:
         """Return each block's sum over its layers of their light times their spectrum. Writes over ``own``."""
-        total = self._buffer("windows", (len(chunk.counts), *own.shape[1:]), self._complex)
+        total = self._buffer("windows", (len(chunk.counts), *own.shape[1:]), self.psfs.dtype.to_complex())
         if not self.plan.by_slices:
-            own.mul_(torch.index_select(spectra, 0, chunk.layer, out=self._buffer("pairs", own.shape, self._complex)))
+            pairs = self._buffer("pairs", own.shape, own.dtype)
+            own.mul_(torch.index_select(spectra, 0, chunk.layer, out=pairs))
             return total.zero_().index_add_(0, chunk.block, own)
         for run in chunk.runs:
             own[run.pairs].mul_(spectra[run.layers])
@@ -138,7 +130,7 @@ class TileWorkspace:
     def offsets(self, chunk: Chunk) -> Offsets:
         """Find each of a chunk's pixels in the planes of its layers."""
         images, y, x = chunk.pixels
-        number = self._number[: images.stop - images.start, : y.stop - y.start, x]
+        number = self.plan.number[: images.stop - images.start, : y.stop - y.start, x]
         # Blocks are counted from the first of the chunk's first row.
         start = self.plan.start[(images.start * self.plan.grid.rows + chunk.rows.start) * self.plan.grid.columns :]
         key = self._buffer("key", number.shape, torch.int64)
@@ -147,7 +139,7 @@ class TileWorkspace:
             torch.add(layer, number, out=key)
             offset = self._buffer(f"offset {len(found)}", (key.numel(),), torch.int64)
             torch.index_select(start.view(-1), 0, key.view(-1), out=offset)
-            found.append(offset.view(key.shape).add_(self._inside[: y.stop - y.start, x]))
+            found.append(offset.view(key.shape).add_(self.plan.inside[: y.stop - y.start, x]))
         weight = self.plan.labels.layer_weight
         return Offsets(found[0], None if weight is None else (found[1], weight[images, y, x]))
 
@@ -162,7 +154,7 @@ class TileWorkspace:
     def scatter_to_planes(self, light: Tensor, offsets: Offsets, chunk: Chunk) -> Tensor:
         """Split each pixel over the planes of its layers, the transpose of gathering: (pairs, size, size) complex."""
         size = self.plan.grid.size
-        planes = self._buffer("pairs", (len(chunk.layer), size, size), self._complex).zero_()
+        planes = self._buffer("pairs", (len(chunk.layer), size, size), self.psfs.dtype.to_complex()).zero_()
         floats = torch.view_as_real(planes).view(-1)
         if offsets.above is not None:
             above, weight = offsets.above

@@ -18,7 +18,6 @@ from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.tile_plan import (
     BLOCKS,
     WINDOWS,
-    Grid,
     TileKind,
     cheapest_grid,
     choose_grid,
@@ -72,10 +71,16 @@ class TiledBackend:
         grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
-        plan = plan_blocks(labels, layers, grid, kind)
+        offset = scene.psfs.shape[-1] - 1 if scene.compositing == "gather" else 0
+        plan = None if scene.layout is None else scene.layout.get((grid, kind))
+        if plan is None:
+            plan = plan_blocks(labels, layers, grid, kind, offset)
+            if scene.layout is not None:
+                scene.layout[grid, kind] = plan
         if scene.compositing == "scatter":
             return _scatter(scene.plane, scene.psfs, plan)
-        return _gather(_plane_with_spare(scene, grid), scene.psfs, plan)
+        plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, grid.spare)
+        return _gather(plane, scene.psfs, plan)
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the padded planes and of the PSFs."""
@@ -85,17 +90,13 @@ class TiledBackend:
         grid = scene.grids.get(kind) or choose_grid(labels, layers, scene.psfs.shape[-1], kind)
         if scene.compositing == "occlusion":
             return occlusion_gradients(occlusion_planes(scene), labels, grid, kind, gradient)
-        plan, scatters = plan_blocks(labels, layers, grid, kind), scene.compositing == "scatter"
-        tensors = scene.plane if scatters else _plane_with_spare(scene, grid), scene.psfs, scene.batch_weight
+        scatters = scene.compositing == "scatter"
+        plan = plan_blocks(labels, layers, grid, kind, 0 if scatters else scene.psfs.shape[-1] - 1)
+        plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, (0, 0) if scatters else grid.spare)
+        tensors = plane, scene.psfs, scene.batch_weight
         wanted = [wants_gradient(x) for x in tensors]
         gradients = _scatter_gradients if scatters else gather_gradients
         return gradient_pairs(tensors, gradients(tensors[0].detach(), scene.psfs.detach(), gradient, plan, wanted))
-
-
-def _plane_with_spare(scene: LayeredScene, grid: Grid) -> Tensor:
-    """Return the plane with room below and on the right for tiles that hang over, where the border can fill it."""
-    spare = (grid.rows * grid.tile - grid.height, grid.columns * grid.across * grid.tile - grid.width)
-    return pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, spare)
 
 
 def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work:
@@ -106,7 +107,7 @@ def _of_scene(work: TiledWork | TiledOcclusionWork, scene: LayeredScene) -> Work
 
 
 def _gather(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
-    work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
+    work = TileWorkspace(plan, psfs)
     blended = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
     for chunk in plan.chunks:
         offsets = work.offsets(chunk)
@@ -130,7 +131,7 @@ def gather_gradients(
         plan: tiles of the (B, H, W) pixels.
         wanted: of plane, PSFs and layer weight.
     """
-    work = TileWorkspace(plan, psfs, psfs.shape[-1] - 1)
+    work = TileWorkspace(plan, psfs)
     gradients = TileGradients(wanted, plane, work)
     full = work.tiled_plane(plane) if gradients.plane else None
     for chunk in plan.chunks:
@@ -153,7 +154,7 @@ def gather_gradients(
 
 
 def _scatter(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
-    work = TileWorkspace(plan, psfs, 0)
+    work = TileWorkspace(plan, psfs)
     full = work.tiled_plane(plane)
     for chunk in plan.chunks:
         offsets = work.offsets(chunk)
@@ -167,7 +168,7 @@ def _scatter(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
 def _scatter_gradients(
     plane: Tensor, psfs: Tensor, grad: Tensor, plan: BlockPlan, wanted: Sequence[bool]
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    work = TileWorkspace(plan, psfs, 0)
+    work = TileWorkspace(plan, psfs)
     gradients = TileGradients(wanted, plane, work)
     gathered = torch.empty_like(plane) if gradients.plane else None
     full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)

@@ -31,7 +31,8 @@ from kornia_tidy.render.backends.dense_occlusion import (
 )
 from kornia_tidy.render.backends.tile_plan import Grid, TileKind
 from kornia_tidy.render.backends.window_plan import Corner, WindowChunk, WindowPlan, plan_windows
-from kornia_tidy.render.layers import Labels, weight_of_layer
+from kornia_tidy.render.layers import weight_of_layer
+from kornia_tidy.render.scene import Labels
 
 
 class Planes(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.backends.tile_plan import Grid, TileKind
-from kornia_tidy.render.layers import Labels
+from kornia_tidy.render.scene import Labels
 
 Corner = tuple[int, int, int]  # image, first row and first column of a window in the padded plane, and of its tile
 

@@ -17,8 +17,7 @@ from kornia_tidy.render.backends.direct import SOURCE, count_pairs
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
-from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.scene import layered_scene, scene_of_layers
+from kornia_tidy.render.scene import Labels, layered_scene, scene_of_layers
 from tests.base import BaseTester
 from tests.render.backends.test_tiled import ATOL, KINDS, depth_map
 from tests.render.render_tester import RenderTester

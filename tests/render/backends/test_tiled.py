@@ -17,8 +17,7 @@ from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorksp
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
-from kornia_tidy.render.layers import Labels
-from kornia_tidy.render.scene import layered_scene
+from kornia_tidy.render.scene import Labels, layered_scene
 from tests.base import BaseTester
 from tests.render.render_tester import SMALL_TILES, RenderTester, render_by
 from tests.render.scenes import Bank, brute_render, make_bank, make_scene
@@ -168,11 +167,11 @@ class TestTiledRender(RenderTester):
         bank = make_bank(5, 2, 5, device=device)
         image, defocus = make_scene(bank, 2, 31, 46)
         labels = layered_scene(image, defocus, bank.defocus, bank.psfs).labels
-        plan = plan_blocks(labels, 5, choose_grid(labels, 5, 5, SMALL_TILES.blocks), SMALL_TILES.blocks)
+        plan = plan_blocks(labels, 5, choose_grid(labels, 5, 5, SMALL_TILES.blocks), SMALL_TILES.blocks, offset=4)
         plane = torch.nn.functional.pad(image, (2, 2, 2, 2))
         results = []
         for by_slices in (True, False):
-            work = TileWorkspace(replace(plan, by_slices=by_slices), bank.psfs, 4)
+            work = TileWorkspace(replace(plan, by_slices=by_slices), bank.psfs)
             gradients, found = TileGradients((False, True, False), plane, work), []
             for chunk, c in product(plan.chunks, range(2)):
                 light = torch.fft.fft2(work.windows(plane[:, c], chunk))
@@ -270,7 +269,7 @@ class TestPlan(BaseTester):
         psi = depth_map(kind, bank, 37, 51)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
         labels = Labels.of(label, None)
-        plan = plan_blocks(labels, 6, choose_grid(labels, 6, 5, SMALL_TILES.blocks), SMALL_TILES.blocks)
+        plan = plan_blocks(labels, 6, choose_grid(labels, 6, 5, SMALL_TILES.blocks), SMALL_TILES.blocks, offset=4)
         tile = plan.grid.tile
         expected = {
             (b, y // tile, x // (2 * tile), int(label[b, y, x])) for b in range(2) for y in range(37) for x in range(51)
