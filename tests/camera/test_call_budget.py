@@ -59,6 +59,8 @@ def calls(request) -> list[Call]:
     if request.param == "leaves":
         leaves = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
         image, depth = (part[None] for part in leaves)
+        if (backend := optics.explain(image, depth).backend) == "direct":
+            pytest.skip(f"on this machine the cheapest backend is {backend!r}, whose path through C is longer")
     with torch.no_grad():
         optics(image, depth)
         return calls_of(lambda: optics(image, depth))
