@@ -100,16 +100,17 @@ class BankMemory:
 
 
 def plain_attributes(*parts: nn.Module) -> list[Any]:
-    """Return the attributes of modules and their submodules but parameters, buffers and hooks, to compare by equality.
+    """Return the types and attributes of modules and submodules, but no parameters, buffers or hooks, to be compared.
 
     Example:
         >>> from kornia_tidy.modulator.modulator import DwellTimes
         >>> plain_attributes(DwellTimes((3, 1)))
-        ['shares', (0.75, 0.25)]
+        [<class 'kornia_tidy.modulator.modulator.DwellTimes'>, 'shares', (0.75, 0.25)]
     """
     found: list[Any] = []
     for part in parts:
         for module in part.modules():
+            found.append(type(module))
             for name, value in vars(module).items():
                 if name not in _OF_EVERY_MODULE:
                     # Containers are compared by their present values.

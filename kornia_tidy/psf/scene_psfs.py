@@ -57,6 +57,7 @@ class ScenePSFs:
     lock: SharedLock  # held while masks are read, and by whoever changes several of them at once
 
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
+    _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
     _derived: Derived
     # For each moment and state, for their averages, and for each number of threads.
     _memories: dict[tuple[int | None, int | None, int], BankMemory]
@@ -111,6 +112,8 @@ class ScenePSFs:
         for name, value in parts.items():
             if name in PARTS:
                 check_part(name, value, *PARTS[name])
+        if "aperture" in parts:
+            parts["_aperture_mark"] = object()
         if (aperture := parts.get("aperture")) is not None:
             check_part("aperture", aperture, (Tensor, np.ndarray), "a tensor of amplitudes (N, N) such as 23x23")
             parts["aperture"] = check_aperture(aperture, aperture.shape[-1])
@@ -202,7 +205,7 @@ class ScenePSFs:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
         fill_factor = getattr(self.modulator, "fill_factor", 1.0)
-        setting = [side, self.fidelity, self.aperture is None or id(self.aperture), fill_factor]
+        setting = [side, self.fidelity, self._aperture_mark, fill_factor]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
         key = self.moment, state if self.state is None else self.state, torch.get_num_threads()
@@ -293,10 +296,7 @@ class ScenePSFs:
             return tuple(self.measured.defocus.tolist())
         lo, hi = self.camera.defocus_range
         intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
-        nodes = []
-        for i in range(intervals + 1):
-            nodes.append(lo + (hi - lo) * i / intervals)  # noqa: PERF401 (a comprehension would be a frame of its own)
-        return tuple(nodes)
+        return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
 
     @property
     def fixed_window(self) -> int | None:

@@ -95,6 +95,17 @@ class TestBankMemory(BaseTester):
         fresh = TiDyOptics(optics.masks, optics.camera, optics.modulator, None, optics.fidelity)
         self.assert_close(after, fresh.psf_bank().psfs, rtol=0, atol=1e-7)
 
+    def test_feature_apertures_that_come_and_go_are_told_apart(self, optics):
+        """One that is gone leaves its place in memory to another."""
+        for index in range(60):
+            aperture = torch.rand(23, 23, dtype=torch.float64, generator=torch.Generator().manual_seed(index))
+            optics.aperture = aperture
+            if index % 2:
+                continue
+            fresh = TiDyOptics(optics.masks, sensor=None, fidelity=SMALL, aperture=aperture)
+            with torch.no_grad():
+                assert torch.equal(optics.psf_bank().psfs, fresh.psf_bank().psfs), index
+
     def test_feature_what_inference_mode_remembers_serves_training(self, optics):
         image, depth = torch.rand(1, 3, 16, 16, requires_grad=True), torch.full((1, 1, 16, 16), 0.5)
         optics.masks.requires_grad_(False)
