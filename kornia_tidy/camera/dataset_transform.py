@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import nn
+
+from kornia_tidy.render.repeatable import repeatable
 
 
 class DatasetTransform:
@@ -17,8 +18,8 @@ class DatasetTransform:
     Args:
         optics: the camera; shared, so a data set without worker processes sees what training changes.
         seed: None draws noise from torch's global generator, which differs from worker to worker. A number gives each
-            item its own noise, the same for any number of workers, for fork and spawn, and in every epoch; and one
-            thread takes the picture, as in a worker, so that its last digits are the same too.
+            item its own noise, the same for any number of workers, for fork and spawn, and in every epoch; and
+            one thread takes the picture, by the shipped cost profile, so that its last digits are the same too.
         key: with a seed, what tells items apart: the name of an entry of the sample, or a function of the sample that
             returns an integer.
 
@@ -44,7 +45,7 @@ class DatasetTransform:
             if self.seed is None:
                 return self.optics(sample)
             generator = item_generator(self.seed, self._item(sample))
-            with one_thread():
+            with repeatable():
                 return self.optics(sample, generator=generator)
 
     def _item(self, sample: Any) -> int:
@@ -60,26 +61,6 @@ class DatasetTransform:
 
     def __repr__(self) -> str:
         return f"DatasetTransform({self.optics!r}, seed={self.seed}, key={self.key!r})"
-
-
-@contextmanager
-def one_thread() -> Generator[None]:
-    """Let torch use one thread: with more, another way of rendering may be the fastest, and sums are made in parts.
-
-    Example:
-        >>> with one_thread():
-        ...     torch.get_num_threads()
-        1
-    """
-    threads = torch.get_num_threads()
-    if threads == 1:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def item_generator(seed: int, item: int) -> torch.Generator:

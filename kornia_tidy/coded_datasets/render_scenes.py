@@ -1,7 +1,7 @@
 """Photographing of a data set of scenes to captures on disk, resumable and by any number of processes.
 
-A capture depends on camera, scene, seed and number alone. On the CPU its last digit depends on the number of threads:
-every process uses one thread, and several processes share the work.
+A capture depends on camera, scene, seed and number alone. On the CPU its last digit depends on the number of threads
+and on the backend that renders: see :mod:`kornia_tidy.render.repeatable`. Several processes share the work.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from kornia_tidy.coded_datasets.index import INDEX, encode_index
 from kornia_tidy.coded_datasets.item_files import encode_item
 from kornia_tidy.coded_datasets.layout import Layout, Part, item_key
 from kornia_tidy.files import remove_leftovers, replacing, write_bytes, write_folder
+from kornia_tidy.render.repeatable import repeatable
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 
@@ -109,7 +110,7 @@ def render_scenes(
     missing = [part for part in own if not (folder / part.name).exists()]
     total = sum(len(part.items) for part in own)
     found = total - sum(len(part.items) for part in missing)
-    with _one_thread():
+    with repeatable():
         claim(folder, conditions(optics, count, layout, seed, made_from or {}))
         items = _Captures(scenes, optics, layout, seed)
         captures = _rendered(items, [index for part in missing for index in part.items], jobs)
@@ -136,7 +137,7 @@ def shard_items_within(optics: TiDyOptics, scenes: Dataset[Any], layout: Layout,
     Raises:
         ValueError: if the first scene cannot be used.
     """
-    with _one_thread():
+    with repeatable():
         capture = _Captures(scenes, optics, layout, seed)[0]
     if isinstance(capture, str):
         raise ValueError(capture)
@@ -197,16 +198,6 @@ def _counted(captures: Iterator[Capture], each: Each, found: int, total: int) ->
     for done, capture in enumerate(captures, found + 1):
         each(done, total)
         yield capture
-
-
-@contextmanager
-def _one_thread() -> Generator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 # ---------------------------------------------------------------------- writing

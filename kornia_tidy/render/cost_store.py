@@ -21,6 +21,7 @@ import torch
 
 from kornia_tidy.kernels.build import KERNELS, NotBuiltError, cache_folder, find_compiler, is_ours, processor_features
 from kornia_tidy.render.cost_profile import EPYC, RATES, XEON, CostProfile
+from kornia_tidy.render.repeatable import of_thread
 from kornia_tidy.runtime.threads import SharedLock
 
 TUNE = "KORNIA_TIDY_TUNE"  # in the environment, "off": nothing is measured, nothing is read from the cache
@@ -59,7 +60,12 @@ def is_tuning_off() -> bool:
 
 
 def settled() -> StoredProfile:
-    """Return the profile that this process starts from, for torch's threads: from the cache, or as shipped."""
+    """Return the profile that this process starts from, for torch's threads: from the cache, or as shipped.
+
+    Where rendering must be repeatable it is the shipped one, and nothing is measured.
+    """
+    if of_thread.repeatable:
+        return StoredProfile(shipped_profile(), tuple(KINDS))
     threads = torch.get_num_threads()
     if threads not in _settled:
         with profile_lock:

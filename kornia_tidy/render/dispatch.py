@@ -19,6 +19,7 @@ from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.first_use import profile_for
+from kornia_tidy.render.repeatable import of_thread
 from kornia_tidy.render.scene import SAMPLE, LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
@@ -194,7 +195,7 @@ def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
     refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
     inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
     recorded = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
-    threads, shape = torch.get_num_threads(), labels.layer_index.shape
+    threads, shape = (torch.get_num_threads(), of_thread.repeatable), labels.layer_index.shape
     shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
     return scene.compositing, *shapes, refused, recorded, threads, digest.digest()
 

@@ -9,7 +9,7 @@ import torch
 
 from kornia_tidy.kernels import build
 from kornia_tidy.render import cost_store, dispatch
-from kornia_tidy.render.cost_profile import EPYC, XEON
+from kornia_tidy.render.cost_profile import EPYC, RATES, XEON
 from kornia_tidy.render.cost_store import (
     KINDS,
     StoredProfile,
@@ -24,6 +24,9 @@ from kornia_tidy.render.cost_store import (
     shipped_profile,
     write_profile,
 )
+from kornia_tidy.render.dispatch import choose
+from kornia_tidy.render.repeatable import repeatable
+from kornia_tidy.render.scene_samples import sample_scene
 from tests.base import BaseTester
 
 OTHER = EPYC.scaled("another machine", {"direct": 3.0})
@@ -124,6 +127,20 @@ class TestInUse(BaseTester):
         before = settled()
         write_profile(THREADS, StoredProfile(OTHER, tuple(KINDS)))
         assert settled() is before
+
+    def test_feature_repeatable_rendering_knows_the_shipped_profile_only(self, cache):
+        """And its choices are remembered apart."""
+        scene = sample_scene(96, 15)
+        with repeatable():
+            usual = choose(scene).name
+        slow = shipped_profile().scaled("slow", {name: 1e6 for name in RATES if name not in ("dense", "bank")})
+        for threads in {1, THREADS}:
+            write_profile(threads, StoredProfile(slow, tuple(KINDS)))
+        forget_in_process()
+        assert choose(scene).name == "dense" != usual
+        with repeatable():
+            assert (settled_profile(), choose(scene).name) == (shipped_profile(), usual)
+        assert (settled_profile(), choose(scene).name) == (slow, "dense")
 
     def test_feature_what_is_measured_is_kept_beside_what_was(self, cache):
         slow = shipped_profile().scaled("slow", {"direct": 2.0})
