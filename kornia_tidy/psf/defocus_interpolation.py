@@ -151,6 +151,7 @@ def interpolated_bank(
         A bank at the targets; gradients reach the given one.
 
     Example:
+        >>> import torch
         >>> depths = torch.arange(5.0)
         >>> bank = PSFBank(depths.reshape(5, 1, 1, 1) / 10, depths, depths[:, None] / 10)
         >>> interpolated_bank(bank, (0.0, 1.0, 2.0, 3.0, 4.0), (5 / 3, 2.0), None).energy.flatten()

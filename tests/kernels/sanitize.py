@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SHAPES = 2500
 COMPILER = "gcc -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g -O1"
 
@@ -40,12 +40,12 @@ def why_not() -> str | None:
     """Return why sources cannot be sanitized on this machine, or None."""
     if sys.platform != "linux" or shutil.which("gcc") is None:
         return "sanitizers need Linux and gcc"
-    return None if runtime().is_absolute() else "gcc's address sanitizer (libasan) is not on this machine"
+    return None if library("libasan.so").is_absolute() else "gcc's address sanitizer (libasan) is not on this machine"
 
 
-def runtime() -> Path:
-    """Return the library of the address sanitizer; its bare name where gcc has none."""
-    told = subprocess.run(["gcc", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True)
+def library(name: str) -> Path:
+    """Return the file of a library of gcc's; its bare name where gcc has none."""
+    told = subprocess.run(["gcc", f"-print-file-name={name}"], capture_output=True, text=True, check=True)
     return Path(told.stdout.strip())
 
 
@@ -59,7 +59,8 @@ def sanitized(
             "ASAN_OPTIONS": "detect_leaks=0",  # of Python, which frees little at its end
             "UBSAN_OPTIONS": "print_stacktrace=1",
             "CC": COMPILER,
-            "LD_PRELOAD": str(runtime()),
+            # The sanitizer looks for the functions that throw C++ exceptions when it starts; torch throws some.
+            "LD_PRELOAD": f"{library('libasan.so')} {library('libstdc++.so.6')}",
             "OMP_WAIT_POLICY": "passive",  # calls are short, and threads that wait would take the others' time
             "PYTHONPATH": f"{root}{os.pathsep}{ROOT}",
             "XDG_CACHE_HOME": cache,
