@@ -30,13 +30,10 @@ KERNELS = (
     "tests/render/backends/test_direct_occlusion.py",
     "tests/psf/test_mutual_intensity.py",
 )
-RENDERING = (
+COMPILED = (  # what calls the C kernels
+    "tests/kernels",
     "tests/render",
     "tests/psf",
-    "tests/optics",
-    "tests/masks",
-    "tests/modulator",
-    "tests/mask_design",
     "tests/camera/test_tidy_optics.py",
     "tests/camera/test_motion.py",
     "tests/camera/test_burst.py",
@@ -46,7 +43,11 @@ RENDERING = (
     "tests/systems/test_presets.py",
 )
 TRANSFORMS = (  # and matrix products
-    *RENDERING,
+    *COMPILED,
+    "tests/optics",
+    "tests/masks",
+    "tests/modulator",
+    "tests/mask_design",
     "tests/calibration",
     "tests/reconstruction/test_tikhonov.py",
     "tests/reconstruction/test_tikhonov_modules.py",
@@ -153,7 +154,7 @@ def _one_core(_: Machine, used: dict[str, object]) -> str | None:
 
 def _c(name: str, compiler: str, *options: str, needs: frozenset[str] = frozenset(), quick: bool = False) -> Factor:
     environment = {"CC": " ".join((compiler, *options))}
-    return Factor(name, environment, RENDERING, KERNELS if quick else (), needs, compiler, _not_compiled)
+    return Factor(name, environment, COMPILED, KERNELS if quick else (), needs, compiler, _not_compiled)
 
 
 FACTORS = (
@@ -166,13 +167,7 @@ FACTORS = (
     _c("c x86-64-v3", "gcc", "-march=x86-64-v3", needs=V2 | AVX2),
     _c("c native gcc", "gcc"),
     _c("c native clang", "clang", quick=True),
-    Factor(
-        "c no compiler",
-        {"CC": "false"},
-        (*RENDERING, "tests/kernels/test_build.py"),
-        ("tests/render",),
-        refuse=_compiled,
-    ),
+    Factor("c no compiler", {"CC": "false"}, COMPILED, ("tests/render",), refuse=_compiled),
     Factor("threads 1", {"OMP_NUM_THREADS": "1"}, NUMBERS),
     Factor("threads 2", {"OMP_NUM_THREADS": "2"}, NUMBERS, ("tests/render",), refuse=_one_core),
 )

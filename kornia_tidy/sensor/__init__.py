@@ -1,10 +1,11 @@
 """Sensor: converts irradiance to the values that a camera records, with shot, dark and read noise.
 
 A linear-light image in units of full scale comes in. The same image with noise, quantised and clipped, goes out. Read
-``noise.py`` first; ``shot.py`` has the Poisson noise and its gradient.
+``noise.py`` first; ``shot.py`` has the Poisson noise, ``exposure.py`` the light that an f-number admits.
 """
 
+from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor
 from kornia_tidy.sensor.noise import SensorNoise, quantize
 from kornia_tidy.sensor.shot import shot_noise
 
-__all__ = ["SensorNoise", "quantize", "shot_noise"]
+__all__ = ["SensorNoise", "electrons_at", "exposed_sensor", "quantize", "shot_noise"]

@@ -173,6 +173,33 @@ class SensorNoise(nn.Module):
             value = value.clamp(0, 1)
         return value.to(image.dtype)
 
+    def std(self, image: Tensor) -> Tensor:
+        r"""Return the standard deviation of the noise in each pixel, before the clip.
+
+        .. math:: \sqrt{\sigma^2 + (x + d / w) / w + q^2 / 12}
+
+        Here x is the image, d the dark signal, w the full well and q the step of the converter.
+
+        Args:
+            image: linear light without noise, or the capture itself as an estimate of it, any shape. Negative values
+                give no electrons.
+
+        Returns:
+            Standard deviation in units of full scale, same shape and dtype.
+
+        Source: EMVA Standard 1288, 4.0, section 2.3.
+
+        Example:
+            >>> SensorNoise(0.003, full_well=10000.0).std(torch.tensor([0.0, 0.16]))
+            tensor([0.0030, 0.0050])
+        """
+        variance = torch.full_like(image, self.sigma**2)
+        if self.full_well is not None:
+            variance = variance + (image.clamp(min=0) + self.dark / self.full_well) / self.full_well
+        if self.bits is not None:
+            variance = variance + (2**self.bits - 1) ** -2.0 / 12
+        return variance.sqrt()
+
     def draw(
         self,
         shape: Sequence[int],
