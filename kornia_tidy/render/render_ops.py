@@ -22,7 +22,7 @@ from kornia_tidy.render.dispatch import (
     render_unrecorded,
     scene_gradients,
 )
-from kornia_tidy.render.scene import assigned_scene, check_scene, layered_scene, remembered_scene
+from kornia_tidy.render.scene import SceneArguments, assigned_scene, check_scene, layered_scene, remembered_scene
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 _SCENE = (
@@ -87,7 +87,7 @@ def render_layers(
 def _render(*arguments: Any) -> Tensor:
     image, method = arguments[0], arguments[-1]
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
-        scene = remembered_scene(*arguments[:-1])
+        scene = remembered_scene(SceneArguments._make(arguments[:-1]))
         return render_unrecorded(choose(scene, method), scene).contiguous()
 
 
@@ -102,8 +102,7 @@ def _gradients(*arguments: Any) -> list[Tensor]:
     own = leaves_of(tensors, wanted)
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
-        given: list[Any] = [*own, *options]
-        scene = assigned_scene(*given)
+        scene = assigned_scene(SceneArguments._make((*own, *options)))
         found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
     return [
         torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
@@ -132,8 +131,7 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     if torch.is_grad_enabled():  # it is differentiated in turn
 
         def render(*tensors: Tensor | None) -> Tensor:
-            given: list[Any] = [*tensors, *options]
-            return render_unrecorded(DenseBackend(), assigned_scene(*given))
+            return render_unrecorded(DenseBackend(), assigned_scene(SceneArguments._make((*tensors, *options))))
 
         with torch.autocast(gradient.device.type, enabled=False):
             return *differentiable_gradients(render, tensors, gradient, wanted), *rest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -122,6 +122,20 @@ class LayeredScene:
         return self.found["sampled_layers"]
 
 
+class SceneArguments(NamedTuple):
+    """The arguments of :func:`layered_scene` in one value, in the order of the renderer's operator."""
+
+    image: Tensor
+    defocus: Tensor
+    nodes: Tensor
+    psfs: Tensor
+    stray_light: Tensor | None
+    compositing: str
+    layers: str
+    border: str
+    correlate: bool
+
+
 def layered_scene(
     image: Tensor,
     defocus: Tensor,
@@ -162,33 +176,14 @@ def layered_scene(
         ((4, 4), tensor([0]), tensor([0.5000]))
     """
     check_scene(image, defocus, nodes, psfs, stray_light, border)
-    return assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+    return assigned_scene(
+        SceneArguments(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+    )
 
 
-def assigned_scene(
-    image: Tensor,
-    defocus: Tensor,
-    nodes: Tensor,
-    psfs: Tensor,
-    stray_light: Tensor | None,
-    compositing: str,
-    layers: str,
-    border: str,
-    correlate: bool,
-) -> LayeredScene:
-    """Return the scene of :func:`layered_scene`, whose tensors were checked before.
-
-    Args:
-        image: this and the other arguments are those of :func:`layered_scene`.
-        defocus: of each pixel.
-        nodes: defocus of the layers.
-        psfs: of the layers.
-        stray_light: of the layers, or None.
-        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        layers: ``"linear"`` or ``"nearest"``.
-        border: what lies beyond the image.
-        correlate: flip the PSFs by 180 degrees.
-    """
+def assigned_scene(given: SceneArguments) -> LayeredScene:
+    """Return the scene of :func:`layered_scene`, whose tensors were checked before."""
+    image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate = given
     dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
     index, weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
     return scene_of_layers(
@@ -216,35 +211,15 @@ class _Remembered:
 _last: dict[str, _Remembered] = {}
 
 
-def remembered_scene(
-    image: Tensor,
-    defocus: Tensor,
-    nodes: Tensor,
-    psfs: Tensor,
-    stray_light: Tensor | None,
-    compositing: str,
-    layers: str,
-    border: str,
-    correlate: bool,
-) -> LayeredScene:
+def remembered_scene(given: SceneArguments) -> LayeredScene:
     """Return the scene of :func:`assigned_scene`; layers are assigned once for a defocus map that comes again.
 
     The map is compared value by value. Only the last one is remembered, up to :data:`LARGEST_REMEMBERED` pixels and on
     a processor. For use without gradients.
-
-    Args:
-        image: this and the other arguments are those of :func:`assigned_scene`.
-        defocus: of each pixel.
-        nodes: defocus of the layers.
-        psfs: of the layers.
-        stray_light: of the layers, or None.
-        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        layers: ``"linear"`` or ``"nearest"``.
-        border: what lies beyond the image.
-        correlate: flip the PSFs by 180 degrees.
     """
+    image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate = given
     if defocus.device.type != "cpu" or defocus.numel() > LARGEST_REMEMBERED:
-        return assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+        return assigned_scene(given)
     options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads(), of_thread.repeatable
     options += image.dtype, psfs.dtype, defocus.dtype, nodes.dtype
     last = _last.get("scene")  # another thread may put in another one meanwhile
@@ -253,7 +228,7 @@ def remembered_scene(
         or last.options != options
         or not (torch.equal(last.defocus, defocus) and torch.equal(last.nodes, nodes))
     ):
-        scene = assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
+        scene = assigned_scene(given)
         scene = replace(scene, layout={})
         nothing = image.new_empty(0)
         kept = replace(scene, image=nothing, psfs=nothing, stray_light=None, found={})

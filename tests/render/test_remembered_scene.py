@@ -9,7 +9,7 @@ import torch
 
 from kornia_tidy.render import scene as module
 from kornia_tidy.render.compositing import COMPOSITING, render
-from kornia_tidy.render.scene import assigned_scene, remembered_scene
+from kornia_tidy.render.scene import SceneArguments, assigned_scene, remembered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
 
@@ -29,25 +29,25 @@ class TestRememberedScene(BaseTester):
 
     def test_smoke(self):
         tensors = self.given()
-        first, second = (remembered_scene(*tensors, *OPTIONS) for _ in range(2))
+        first, second = (remembered_scene(SceneArguments(*tensors, *OPTIONS)) for _ in range(2))
         assert second.labels is first.labels
         assert second.layout is first.layout
 
     def test_feature_image_and_psfs_are_those_given_now(self):
         tensors = self.given()
-        remembered_scene(*tensors, *OPTIONS)
+        remembered_scene(SceneArguments(*tensors, *OPTIONS))
         tensors[0], tensors[3] = tensors[0] / 2, tensors[3] / 3
-        scene = remembered_scene(*tensors, "gather", "linear", "reflect", True)
+        scene = remembered_scene(SceneArguments(*tensors, "gather", "linear", "reflect", True))
         self.assert_close(scene.image, tensors[0], rtol=0, atol=0)
         self.assert_close(scene.psfs, tensors[3].flip((-2, -1)), rtol=0, atol=0)
 
     def test_feature_a_map_changed_in_place_is_assigned_again(self):
         tensors = self.given()
-        first = remembered_scene(*tensors, *OPTIONS)
+        first = remembered_scene(SceneArguments(*tensors, *OPTIONS))
         tensors[1][0, 0, 7, 9] = float(tensors[2][3])
-        second = remembered_scene(*tensors, *OPTIONS)
+        second = remembered_scene(SceneArguments(*tensors, *OPTIONS))
         assert second.layout is not first.layout
-        expected = assigned_scene(*tensors, *OPTIONS)
+        expected = assigned_scene(SceneArguments(*tensors, *OPTIONS))
         self.assert_close(second.layer_index, expected.layer_index, rtol=0, atol=0)
         self.assert_close(second.layer_weight, expected.layer_weight, rtol=0, atol=0)
 
@@ -61,19 +61,22 @@ class TestRememberedScene(BaseTester):
     )
     def test_feature_other_options_are_assigned_again(self, options):
         tensors = self.given()
-        first, second = remembered_scene(*tensors, *OPTIONS), remembered_scene(*tensors, *options)
+        first, second = (
+            remembered_scene(SceneArguments(*tensors, *OPTIONS)),
+            remembered_scene(SceneArguments(*tensors, *options)),
+        )
         assert second.labels is not first.labels
         assert (second.compositing, second.border) == options[::2]
 
     def test_feature_other_nodes_are_assigned_again(self):
         tensors = self.given()
-        first = remembered_scene(*tensors, *OPTIONS)
+        first = remembered_scene(SceneArguments(*tensors, *OPTIONS))
         tensors[2] = tensors[2] + 0.5
-        assert remembered_scene(*tensors, *OPTIONS).labels is not first.labels
+        assert remembered_scene(SceneArguments(*tensors, *OPTIONS)).labels is not first.labels
 
     def test_feature_large_maps_are_not_remembered(self):
         with patch.object(module, "LARGEST_REMEMBERED", 100):
-            remembered_scene(*self.given(), *OPTIONS)
+            remembered_scene(SceneArguments(*self.given(), *OPTIONS))
         assert not module._last
 
     @pytest.mark.parametrize("method", ["auto", "tiled", "dense"])
