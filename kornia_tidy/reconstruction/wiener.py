@@ -5,8 +5,11 @@ Captures must be linear light. See :mod:`kornia_tidy.reconstruction.tikhonov` fo
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from kornia_tidy.checks import check_choice, check_float_tensor, check_number, check_part
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -69,15 +72,61 @@ def wiener(
     size = _plane(capture, psfs, noise, border)
     precise = torch.promote_types(torch.promote_types(capture.dtype, psfs.dtype), torch.float32)
     captured = torch.fft.rfft2(periodic_extension(capture.to(precise), size))
-    transfer = transfer_function(psfs.to(precise), size, None if veil is None else veil.to(precise))
-    share = psfs.new_full((len(psfs),), 1 / len(psfs)) if depth_weights is None else depth_weights
-    share = share.to(transfer.real)[:, None, None, None]
-    mean = (share * transfer).sum(0)
-    power = (share * (transfer.real.square() + transfer.imag.square())).sum(0)
+    mean, power = transfer_moments(psfs.to(precise), size, depth_weights, veil)
     noise_power = torch.as_tensor(noise, dtype=precise, device=capture.device).square()
     restored = captured * mean.conj() / (power + noise_power * inverse_spectrum(statistics, size).to(power))
     plane = torch.fft.irfft2(restored, s=size)
     return plane[..., : capture.shape[-2], : capture.shape[-1]].to(capture.dtype)
+
+
+class TransferMoments(NamedTuple):
+    """Mean over depth of the transfer function and of its squared modulus."""
+
+    mean: Tensor
+    """(C, M, N // 2 + 1) complex."""
+    power: Tensor
+    """(C, M, N // 2 + 1) real, at least the squared modulus of the mean."""
+
+
+def transfer_moments(
+    psfs: Tensor, size: tuple[int, int], depth_weights: Tensor | None = None, veil: Tensor | None = None
+) -> TransferMoments:
+    """Return the mean over depth of the transfer function and of its squared modulus, on a periodic plane.
+
+    The squared modulus is the transform of the autocorrelation, whose mean over depth fills a small window. So only two
+    small windows per channel are transformed to the plane.
+
+    Args:
+        psfs: (D, C, P, P) with P odd, float32 or float64.
+        size: rows M and columns N of the plane.
+        depth_weights: (D,) share of pixels at each depth, of sum one. Default: equal.
+        veil: (D, C) stray light, the fraction of light spread evenly over the plane, or None.
+
+    Example:
+        >>> points = torch.zeros(2, 1, 3, 3)
+        >>> points[0, 0, 1, 1], points[1, 0, 1, 1] = 1.0, 0.5
+        >>> mean, power = transfer_moments(points, (2, 2))
+        >>> mean.real.unique(), power.unique()
+        (tensor([0.7500]), tensor([0.6250]))
+    """
+    share = psfs.new_full((len(psfs),), 1 / len(psfs)) if depth_weights is None else depth_weights.to(psfs)
+    side = 2 * psfs.shape[-1]
+    window = torch.fft.rfft2(psfs, s=(side, side))
+    squared = torch.einsum("d,dcyx->cyx", share, window.real.square() + window.imag.square())
+    autocorrelation = torch.fft.fftshift(torch.fft.irfft2(squared, s=(side, side)), (-2, -1))[..., 1:, 1:]
+    mean = transfer_function(torch.einsum("d,dcyx->cyx", share, psfs), size)
+    power = transfer_function(autocorrelation, size).real
+    if veil is not None:
+        veil = veil.to(psfs)
+        light = psfs.sum((-2, -1))
+        mean = mean + _at_zero(share @ veil, size)
+        power = power + _at_zero(share @ (veil * (2 * light + veil)), size)
+    return TransferMoments(mean, power.maximum(mean.real.square() + mean.imag.square()))
+
+
+def _at_zero(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return a half spectrum of one value per channel at frequency zero, and zeros."""
+    return functional.pad(values[..., None, None], (0, size[1] // 2, 0, size[0] - 1))
 
 
 def inverse_spectrum(statistics: SceneStatistics, size: tuple[int, int]) -> Tensor:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -48,12 +47,14 @@ class SceneStatistics:
     spread: float
     depths: tuple[float, ...] = (1.0,)
     source: str = ""
+    level: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("exponent", "knee", "mean", "spread"):
             check_positive(name, getattr(self, name))
         if not self.depths or min(self.depths) < 0 or abs(sum(self.depths) - 1) > 1e-3:
             raise ValueError(f"depths must be shares of pixels that add up to 1, got {self.depths}")
+        object.__setattr__(self, "level", self.spread**2 / _integral(self.exponent, self.knee))
 
     def spectrum(self, frequency: Tensor) -> Tensor:
         """Return the power spectral density of light at spatial frequencies.
@@ -71,8 +72,7 @@ class SceneStatistics:
             >>> round(ratio.item(), 2)
             3.97
         """
-        level = self.spread**2 / _integral(self.exponent, self.knee)
-        return level * (frequency.square() + self.knee**2) ** (-self.exponent / 2)
+        return self.level * (frequency.square() + self.knee**2) ** (-self.exponent / 2)
 
     def cell_power(self, size: int) -> Tensor:
         """Return the variance of light in each cell of a grid of frequencies, that of a square image's transform.
@@ -110,29 +110,15 @@ class SceneStatistics:
         """
         if len(defocus) == 1:
             return torch.ones_like(defocus)
-        nodes = defocus.detach().cpu().double().numpy()
-        middles = (nodes[1:] + nodes[:-1]) / 2
-        edges = np.concatenate([nodes[:1], middles, nodes[-1:]])
-        position = (edges - edges[0]) / (edges[-1] - edges[0])
-        below = np.concatenate([[0.0], np.cumsum(self.depths)])
-        cumulative = np.interp(position, np.linspace(0, 1, len(below)), below) / below[-1]
-        return torch.as_tensor(np.diff(cumulative)).to(defocus)
+        middles = (defocus[1:] + defocus[:-1]) / 2
+        edges = torch.cat([defocus[:1], middles, defocus[-1:]])
+        edges = (edges - edges[0]) / (edges[-1] - edges[0])
+        shares = edges.new_tensor(self.depths)
+        ends = torch.arange(len(shares) + 1, device=edges.device, dtype=edges.dtype) / len(shares)
+        overlap = torch.minimum(edges[1:, None], ends[1:]) - torch.maximum(edges[:-1, None], ends[:-1])
+        return overlap.clamp(min=0) @ (shares / shares.sum()) * len(shares)
 
 
-PHOTOGRAPHS = SceneStatistics(
-    exponent=2.76,
-    knee=1 / 344,
-    mean=0.226,
-    spread=0.213,
-    depths=(0.284, 0.148, 0.137, 0.135, 0.106, 0.093, 0.059, 0.038),
-    source="18 photographs and renderings with depth (Middlebury, 7-Scenes, TUM, NYU, Flying Things, ...), the middle 512 "
-    "pixels; python -m tests.benchmarks.scene_statistics, 2026-11-22",
-)
-"""Statistics of photographs of some 500 pixels a side, whose spectrum is within a fifth of this power law. On 13 other
-scenes an exponent of 2.9, a knee near 1/256, a mean of 0.29 and a spread of 0.23 were measured."""
-
-
-@lru_cache(maxsize=64)
 def _integral(exponent: float, knee: float) -> float:
     r"""Return the integral of (f² + f0²)^(-α/2) over the square of frequencies up to 1/2 in x and y.
 
@@ -147,3 +133,16 @@ def _integral(exponent: float, knee: float) -> float:
     else:
         radial = 0.5 * ((squared + knee**2) ** power - knee ** (2 * power)) / power
     return float(8 * (weights * radial).sum() * math.pi / 8)
+
+
+PHOTOGRAPHS = SceneStatistics(
+    exponent=2.76,
+    knee=1 / 344,
+    mean=0.226,
+    spread=0.213,
+    depths=(0.284, 0.148, 0.137, 0.135, 0.106, 0.093, 0.059, 0.038),
+    source="18 photographs and renderings with depth (Middlebury, 7-Scenes, TUM, NYU, Flying Things, ...), the middle 512 "
+    "pixels; python -m tests.benchmarks.scene_statistics, 2026-11-22",
+)
+"""Statistics of photographs of some 500 pixels a side, whose spectrum is within a fifth of this power law. On 13 other
+scenes an exponent of 2.9, a knee near 1/256, a mean of 0.29 and a spread of 0.23 were measured."""
