@@ -168,12 +168,10 @@ def fitted_shade(light: Sequence[Tensor]) -> tuple[float, float]:
                 found.append(_light_at(distance, counts, each))
     means = {distance: sum(found) / len(found) for distance, found in around.items() if found}
     shade = min(means.pop(0), 1.0)
-    rises = [
-        distance * math.log((1 - shade) / (1 - value)) ** (-4 / 3)
-        for distance, value in means.items()
-        if shade < value < 1
-    ]
-    return shade, float(np.exp(np.mean(np.log(rises)))) if rises else float(max(DISTANCES))
+    sizes = np.geomspace(0.5, 4096, 2000)
+    model = 1 - (1 - shade) * np.exp(-((np.array(list(means))[:, None] / sizes) ** 0.75))
+    misfit = ((model - np.array(list(means.values()))[:, None]) ** 2).sum(0)
+    return shade, float(sizes[misfit.argmin()])
 
 
 def _squared_slope(light: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ import statistics
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -151,7 +152,7 @@ def read(path: Path) -> list[dict[str, str]]:
 def predictions(bank: PSFBank, number: float, electrons: float) -> dict[str, float]:
     """Return PSNR in decibels by each form of the measure."""
     sensor = exposed_sensor(number, electrons, REFERENCE)
-    forms = {"before": OLD, "now": PHOTOGRAPHS}
+    forms = {"before": OLD, "linear": replace(PHOTOGRAPHS, shade=1.0), "sRGB": PHOTOGRAPHS}
     return {
         name: -10 * math.log10(float(restoration_error(bank, sensor, form)) * form.spread**2)
         for name, form in forms.items()
@@ -166,7 +167,7 @@ def table(folder: Path) -> None:
     for row in rows:
         key = row["optics"], float(row["f_number"]), int(row["electrons"]), row["restoration"]
         errors[key][row["scene"]] = float(row["linear"]), float(row["encoded"])
-    banks = {pair: camera_at(*pair).psf_bank() for pair in pairs()}
+    banks = {pair: camera_at(*pair).psf_bank() for pair in pairs() if (*pair, LIGHTS[0], "Wiener") in errors}
 
     def mean_db(key: tuple[str, float, int, str], column: int) -> float:
         return statistics.fmean(-10 * math.log10(each[column]) for each in errors[key].values())
@@ -177,12 +178,12 @@ def table(folder: Path) -> None:
     def best(pair: tuple[str, float], electrons: int) -> float:
         return max(mean_db((*pair, electrons, name), 1) for name in RESTORATIONS)
 
-    print("| e- | optics | before | now | linear, pooled | linear, dB | encoded, dB | + bilateral |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| e- | optics | f^-2 | linear | sRGB | pooled, linear | linear | sRGB | + bilateral |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for electrons in LIGHTS:
         reference = predictions(banks[BASE], BASE[1], electrons)
         for pair in pairs():
-            if (*pair, electrons, "Wiener") not in errors:
+            if pair not in banks:
                 continue
             found = predictions(banks[pair], pair[1], electrons)
             here, there = (*pair, electrons, "Wiener"), (*BASE, electrons, "Wiener")

@@ -83,7 +83,7 @@ class TestCellPower(BaseTester):
 
 class TestLightAround(BaseTester):
     def test_feature_rises_from_the_shade_to_the_mean(self):
-        distance = torch.tensor([0.0, 1.0, 10.0, 74.4, 1e6], dtype=torch.float64)
+        distance = torch.tensor([0.0, 1.0, 10.0, 75.8, 1e6], dtype=torch.float64)
         around = PHOTOGRAPHS.light_around(distance)
         assert bool((around.diff() > 0).all())
         assert around[[0, -1]].tolist() == pytest.approx([0.293, 1.0])
