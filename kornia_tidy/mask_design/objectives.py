@@ -128,8 +128,8 @@ def restoration_error(
         - Errors in sRGB are those in linear light times the slope of the curve; clipping is not included.
 
     Source: Diaz, Goudail, Loiseaux and Huignard, Optics Letters 34(19) 2970 (2009), for the error after one filter as
-    an objective of mask design. The weight is our own: for light whose logarithm is a Gaussian process, and a slope that
-    is a power of light, the mean of slope times squared error factorises in this way exactly.
+    an objective of mask design. The weight is our own: if the logarithm of light is a Gaussian process, and the slope a
+    power of light, the mean of squared slope times squared error factorises in this way exactly.
 
     Example:
         >>> point = torch.zeros(2, 1, 9, 9)

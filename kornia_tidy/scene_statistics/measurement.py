@@ -115,7 +115,7 @@ def _periodogram(light: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fitted_power_law(spectrum: RadialSpectrum, variance: float) -> tuple[float, float]:
-    """Return exponent and knee of the power law through a spectrum whose integral is the variance.
+    """Fit a power law to a spectrum and return its exponent and knee; its integral is the variance.
 
     For each knee the exponent is fitted by least squares in logarithms. A smaller knee adds power at low frequencies;
     the one that adds up to the variance is found by bisection.

@@ -171,8 +171,8 @@ PHOTOGRAPHS = SceneStatistics(
     shade=0.293,
     shade_size=75.8,
     depths=(0.284, 0.148, 0.137, 0.135, 0.106, 0.093, 0.059, 0.038),
-    source="18 photographs and renderings with depth (Middlebury, 7-Scenes, TUM, NYU, Flying Things, ...), the middle 512 "
-    "pixels; python -m tests.benchmarks.scene_statistics, 2026-11-22",
+    source="18 photographs and renderings with depth (Middlebury, 7-Scenes, TUM, NYU, Flying Things, ...), the middle "
+    "512 pixels; python -m tests.benchmarks.scene_statistics, 2026-11-22",
 )
 """Statistics of photographs of some 500 pixels a side, whose spectrum is within a fifth of this power law. On 13 other
 scenes an exponent of 2.9, a knee near 1/256, a mean of 0.29 and a spread of 0.23 were measured."""

@@ -29,8 +29,8 @@ from tqdm import tqdm
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.mask_design.objectives import restoration_error
+from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
@@ -57,7 +57,7 @@ FIELDS = ("optics", "f_number", "electrons", "scene", "restoration", "linear", "
 
 
 def camera_at(optics: str, f_number: float) -> TiDyOptics:
-    """Return a camera of some masks at an f-number, noise-free in linear light, for the depths of the default camera."""
+    """Return a camera of some masks at an f-number, without noise, for linear light and the default range of depth."""
     masks: PhaseMasks = PixelwiseMask(1, initial="flat") if optics == "flat" else load_pretrained("edof-5").optics.masks
     lens = ThinLensCamera(aperture_diameter=50e-3 / f_number)
     lo, hi = lens.defocus_range
@@ -110,8 +110,8 @@ def score(folder: Path) -> None:
                 weights = PHOTOGRAPHS.depth_weights(bank.defocus)
                 filters[size] = transfer_moments(bank.psfs, size, weights, bank.veil)
             for electrons in LIGHTS:
-                for row in _scored(light, capture, filters[size], number, electrons, seed):
-                    rows.append((optics, number, electrons, name, *row))
+                found = _scored(light, capture, filters[size], number, electrons, seed)
+                rows.extend((optics, number, electrons, name, *row) for row in found)
         new = not path.exists()
         with path.open("a", newline="") as file:
             csv.writer(file).writerows([FIELDS] * new + rows)

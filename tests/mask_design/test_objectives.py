@@ -131,7 +131,7 @@ class TestRestorationError(BaseTester):
 
     @pytest.mark.parametrize("sensor", [SensorNoise(0.04), SensorNoise(0.01, full_well=200, dark=3)])
     def test_feature_in_srgb_it_is_the_sum_over_all_pairs_of_pixels(self, sensor):
-        """What the filter leaves at each pixel is multiplied by the light around, in the image and not in frequencies."""
+        """What the filter leaves at each pixel is multiplied by the light around, summed over pairs of pixels."""
         scenes = SceneStatistics(2.4, 0.1, 0.4, spread=0.3, depths=(0.6, 0.4), shade=0.4, shade_size=3)
         bank = self._dim_bank(True)
         read, whole = (float(sensor.std(torch.tensor(x).double()) ** 2) for x in (0.0, 0.4))
@@ -178,11 +178,13 @@ class TestRestorationError(BaseTester):
         sharp, blurred = impulse(), torch.full((9, 9), 1 / 81).double()
         far = replace(PHOTOGRAPHS, depths=(1.0, 0.0, 0.0, 0.0))
         bank = bank_of(sharp, sharp, blurred)
-        assert float(restoration_error(bank, 1e-3, far)) == pytest.approx(float(restoration_error(bank_of(sharp), 1e-3)))
+        assert float(restoration_error(bank, 1e-3, far)) == pytest.approx(
+            float(restoration_error(bank_of(sharp), 1e-3))
+        )
         assert float(restoration_error(bank, 1e-3)) > 1e-3
 
     def test_feature_a_halo_costs_more_than_as_much_blur_nearby(self):
-        """Both lose the same in linear light: a ring of light, near to the point or far from it, at one of two depths."""
+        """At one of two depths a ring of light is near to the point, or far from it."""
         errors = {}
         for name, scenes in (("srgb", PHOTOGRAPHS), ("linear", replace(PHOTOGRAPHS, shade=1.0))):
             for radius in (2, 14):
