@@ -1,0 +1,142 @@
+"""Closed-form restoration and depth estimation, by which co-design compares cameras without training a network."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from kornia.color import linear_rgb_to_rgb
+from torch import Tensor
+from torch.nn import functional
+
+from kornia_tidy.mask_design.scene_light import SceneLight, counted_twice, depth_moments
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.periodic import periodic_extension
+from kornia_tidy.reconstruction.tikhonov import transfer_function
+from kornia_tidy.render.borders import next_fast_size
+
+NOISE_FACTORS = (0.1, 0.4, 1.6, 6.4)  # of the noise that the Wiener filter assumes
+BILATERAL = (0.0, 0.05, 0.1, 0.2, 0.4)  # range of the bilateral filter in sRGB values; 0: none
+BILATERAL_WIDTH, BILATERAL_SPACE = 7, 2.0  # pixels
+DEPTHS = 15  # at which the likelihood is computed
+CONTRASTS = (1 / 8, 1.0, 8.0, 64.0)  # of a texture's variance to that of all scenes
+MISFIT = 10.0  # times the noise: edges of depth and other light that one PSF does not explain
+WINDOWS = (15, 31)  # px; squares whose texture tells depth
+TEMPERATURES = (2.0, 8.0, 32.0)  # by which the log-likelihood is divided: neighbouring pixels are not independent
+
+
+class WienerFilter:
+    r"""Wiener filter of a camera's captures, the same for all depths.
+
+    .. math:: \hat X_f = \frac{\overline{\langle H_f \rangle}}{\langle |H_f|^2 \rangle + r / v_f} Y_f
+
+    See :func:`~kornia_tidy.mask_design.scene_light.lost_variance` for the symbols. The mean light is taken off before
+    and added after.
+
+    Args:
+        bank: PSFs; the light outside their window counts as a uniform background.
+        light: statistics of the scenes.
+        variance: of the noise in a pixel, full scale 1.
+        size: (H, W) of the captures.
+
+    Source: Wiener (1949).
+
+    Example:
+        >>> point = torch.zeros(2, 3, 9, 9)
+        >>> point[..., 4, 4] = 1
+        >>> bank = PSFBank(point, torch.tensor([-1.0, 1.0]), torch.ones(2, 3))
+        >>> capture = torch.rand(1, 3, 16, 16)
+        >>> torch.allclose(WienerFilter(bank, SceneLight(), 1e-8, (16, 16))(capture), capture, atol=1e-3)
+        True
+    """
+
+    def __init__(self, bank: PSFBank, light: SceneLight, variance: float, size: tuple[int, int]) -> None:
+        self.size = next_fast_size(size[0] + bank.window), next_fast_size(size[1] + bank.window)
+        self.light = light
+        self.mean, self.power = depth_moments(transfer_function(bank.psfs, self.size), bank.psfs.sum((-2, -1)))
+        pixels = self.size[0] * self.size[1]
+        self.ratio = (variance / light.spread**2 / pixels / light.variances(self.size)).to(self.power)
+
+    def __call__(self, capture: Tensor, noise_factor: float = 1.0) -> Tensor:
+        """Return the restored image of a capture (B, C, H, W) in linear light."""
+        spectrum = torch.fft.rfft2(periodic_extension(capture - self.light.mean, self.size))
+        restored = self.mean.conj() / (self.power + noise_factor * self.ratio) * spectrum
+        plane = torch.fft.irfft2(restored, s=self.size)
+        return plane[..., : capture.shape[-2], : capture.shape[-1]] + self.light.mean
+
+
+def restorations(capture: Tensor, wiener: WienerFilter) -> dict[str, Tensor]:
+    """Return the restorations of a capture: as it is and by the Wiener filter, each without and with bilateral filter.
+
+    Args:
+        capture: (1, 3, H, W) linear light.
+        wiener: of the camera.
+
+    Returns:
+        By a name of the setting, (1, 3, H, W) sRGB in [0, 1].
+
+    Source: Tomasi and Manduchi, Bilateral Filtering for Gray and Color Images (ICCV 1998).
+    """
+    bases = {"capture": capture, **{f"Wiener x {factor:g}": wiener(capture, factor) for factor in NOISE_FACTORS}}
+    images = {}
+    for name, light in bases.items():
+        encoded = linear_rgb_to_rgb(light.clamp(0, 1))
+        pixels = np.ascontiguousarray(encoded[0].permute(1, 2, 0).float().numpy())
+        for scale in BILATERAL:
+            if scale == 0:
+                images[name] = encoded
+                continue
+            smooth = cv2.bilateralFilter(pixels, BILATERAL_WIDTH, scale, BILATERAL_SPACE)
+            images[f"{name}, bilateral {scale:g}"] = torch.from_numpy(smooth).permute(2, 0, 1)[None]
+    return images
+
+
+class DepthLikelihood:
+    r"""Depth from the texture of one capture, by the likelihood of a Gaussian scene at each depth.
+
+    .. math:: \log p(y | d, a) = -\tfrac12 \sum_f \left( \frac{|Y_f|^2}{P_{daf}} + \log P_{daf} \right), \qquad
+              P_{daf} = a \, v_f \, |H_{df}|^2 + 10 \, r
+
+    The first sum is taken over a window around each pixel, of the capture filtered by :math:`P_{da}^{-1/2}`. The
+    contrast a of the texture is unknown: the likelihood of a depth is the sum over some contrasts.
+
+    Args:
+        bank: PSFs at depths evenly spaced over the range of defocus, ascending.
+        light: statistics of the scenes.
+        variance: of the noise in a pixel, full scale 1.
+        size: (H, W) of the captures.
+
+    Source: Levin, Fergus, Durand and Freeman, Image and Depth from a Conventional Camera with a Coded Aperture
+    (SIGGRAPH 2007), for depth by the likelihood of a Gaussian scene.
+    """
+
+    def __init__(self, bank: PSFBank, light: SceneLight, variance: float, size: tuple[int, int]) -> None:
+        self.size = next_fast_size(size[0] + bank.window), next_fast_size(size[1] + bank.window)
+        transfer = transfer_function(bank.psfs.mean(1), self.size)  # of the grey capture
+        pixels, channels = self.size[0] * self.size[1], bank.psfs.shape[1]
+        scene = light.variances(self.size) * light.spread**2 * pixels
+        blurred = scene * (transfer.real.square() + transfer.imag.square()).double()
+        power = torch.stack([contrast * blurred for contrast in CONTRASTS]) + MISFIT * variance / channels
+        self.filters = power.rsqrt().float()
+        self.filters[..., 0, 0] = 0  # the mean light tells nothing
+        weight = counted_twice(self.size[1]) / pixels
+        self.log_power = (power.log() * weight).sum((-2, -1)).float()
+        self.mean = light.mean
+
+    def __call__(self, capture: Tensor) -> dict[str, Tensor]:
+        """Return estimates of normalised inverse depth, (H, W) from 0 (far) to 1, by a name of the setting.
+
+        An estimate is the mean of the depth's probability, which is least wrong on average.
+        """
+        height, width = capture.shape[-2:]
+        spectrum = torch.fft.rfft2(periodic_extension(capture.mean(1) - self.mean, self.size))[0]
+        planes = torch.fft.irfft2(self.filters * spectrum, s=self.size)[..., :height, :width].square()
+        depths = torch.linspace(0, 1, planes.shape[1])[:, None, None]
+        estimates = {}
+        for window in WINDOWS:
+            local = functional.avg_pool2d(planes, window, 1, window // 2, count_include_pad=False)
+            likelihood = -0.5 * window**2 * (local + self.log_power[..., None, None])
+            for temperature in TEMPERATURES:
+                probability = (likelihood / temperature).logsumexp(0).softmax(0)
+                estimates[f"{window} px, temperature {temperature:g}"] = (probability * depths).sum(0)
+        return estimates
