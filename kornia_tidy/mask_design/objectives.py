@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.mask_design.fisher_information import defocus_bound, fisher_information, sampled_response
@@ -18,8 +19,8 @@ from kornia_tidy.masks.base import PhaseMasks, adam_groups
 from kornia_tidy.masks.zernike import ZernikeMask
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.psf_bank import PSFBank
-
-SCENE_SIZE = 64  # pixels; correlation length of the scene in the restoration error, beyond which its spectrum is flat
+from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS, SceneStatistics
+from kornia_tidy.sensor.noise import SensorNoise
 
 
 def design(
@@ -88,20 +89,25 @@ def point_error(bank: PSFBank) -> Tensor:
     return (bank.psfs.square().sum((-2, -1)) - 2 * bank.psfs[..., centre, centre] + 1).mean()
 
 
-def restoration_error(bank: PSFBank, noise: float = 0.05) -> Tensor:
+def restoration_error(
+    bank: PSFBank, noise: float | SensorNoise = 0.05, statistics: SceneStatistics = PHOTOGRAPHS
+) -> Tensor:
     r"""Return the mean squared error of restoration by one Wiener filter for all depths.
 
     .. math:: \sum_f S_f \left( 1 - \frac{|\langle H_f \rangle|^2}{\langle |H_f|^2 \rangle + \sigma^2 / S_f} \right)
         \Big/ \sum_f S_f
 
-    H is the transfer function, :math:`\langle\rangle` the mean over defocus, and S the power spectrum of natural
-    scenes, proportional to one over the frequency squared. The error is low if H is large, so that noise is not
-    amplified, and if it depends little on depth, so that one filter fits all depths. A small PSF at one depth only does
-    not suffice, nor does a large PSF that is the same at all depths.
+    H is the transfer function, :math:`\langle\rangle` the mean over the distribution of depth, and S the power spectrum
+    of the scenes. The error is low if H is large, so that noise is not amplified, and if it depends little on depth, so
+    that one filter fits all depths. A small PSF at one depth only does not suffice, nor does a large PSF that is the
+    same at all depths.
 
     Args:
-        bank: PSFs of a lens whose fidelity discards stray light; the result is the mean over its channels.
-        noise: standard deviation of the noise, as a fraction of that of the scene.
+        bank: PSFs of a lens whose fidelity discards stray light or spreads it over the image; the result is the mean
+            over its channels.
+        noise: the sensor, whose noise at the scenes' mean light is taken; or the standard deviation of the noise as a
+            fraction of that of the scene.
+        statistics: of the scenes: spectrum, light and distribution of depth over the nodes of the bank.
 
     Returns:
         Fraction of the scene's variance, between 0 and 1, 0-dimensional.
@@ -110,7 +116,7 @@ def restoration_error(bank: PSFBank, noise: float = 0.05) -> Tensor:
         ValueError: if the noise is not positive.
 
     Source: Diaz, Goudail, Loiseaux and Huignard, Optics Letters 34(19) 2970 (2009), for the error after one filter as
-    an objective of mask design; Field, J. Opt. Soc. Am. A 4(12) 2379 (1987), for the spectrum.
+    an objective of mask design.
 
     Example:
         >>> point = torch.zeros(2, 1, 9, 9)
@@ -119,19 +125,28 @@ def restoration_error(bank: PSFBank, noise: float = 0.05) -> Tensor:
         >>> bool(restoration_error(bank, noise=1e-3) < 1e-4)
         True
     """
-    check_positive("noise", noise)
+    variance = _noise_variance(noise, statistics)
     size = 2 * bank.window
-    frequency = torch.fft.fftfreq(size, dtype=torch.float64, device=bank.psfs.device)
-    spectrum = 1 / (frequency[:, None] ** 2 + frequency[: size // 2 + 1] ** 2 + (1 / SCENE_SIZE) ** 2)
-    count = torch.full_like(frequency[: size // 2 + 1], 2.0)  # the real transform omits the conjugate frequencies
-    count[0] = count[-1] = 1
-    spectrum = spectrum * size**2 / (spectrum * count).sum()  # variance 1
+    scene = statistics.cell_power(size).to(bank.psfs.device) / statistics.spread**2
+    count = torch.full_like(scene, 2.0)  # the real transform omits the conjugate frequencies
+    count[:, 0] = count[:, -1] = 1
+    noise_ratio = variance * count / size**2 / scene.clamp(min=torch.finfo(scene.dtype).tiny)
     transfer = torch.fft.rfft2(bank.psfs.to(torch.promote_types(bank.psfs.dtype, torch.float32)), s=(size, size))
-    mean = transfer.mean(0)
-    power = (transfer.real.square() + transfer.imag.square()).mean(0)
-    restored = (mean.real.square() + mean.imag.square()) / (power + (noise**2 / spectrum).to(power))
-    variance = (spectrum * count / size**2).to(power)
-    return (variance * (1 - restored)).sum((-2, -1)).mean()
+    if bank.veil is not None:
+        transfer = transfer + functional.pad(bank.veil[..., None, None], (0, size // 2, 0, size - 1))
+    share = statistics.depth_weights(bank.defocus).to(transfer.real)[:, None, None, None]
+    mean = (share * transfer).sum(0)
+    power = (share * (transfer.real.square() + transfer.imag.square())).sum(0)
+    restored = (mean.real.square() + mean.imag.square()) / (power + noise_ratio.to(power))
+    return (scene.to(power) * (1 - restored)).sum((-2, -1)).mean()
+
+
+def _noise_variance(noise: float | SensorNoise, statistics: SceneStatistics) -> float:
+    """Return the variance of the noise as a fraction of that of the scene."""
+    if isinstance(noise, SensorNoise):  # its variance is linear in the light, so that at the mean is the mean one
+        noise = float(noise.std(torch.tensor(statistics.mean, dtype=torch.float64))) / statistics.spread
+    check_positive("noise", noise)
+    return noise**2
 
 
 def design_fisher_mask(

@@ -13,6 +13,7 @@ from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
 from kornia_tidy.reconstruction.tiled import reconstruct_tiled
+from kornia_tidy.reconstruction.wiener import Wiener
 
 __all__ = [
     "AttentionUNet",
@@ -26,6 +27,7 @@ __all__ = [
     "Residual",
     "Tikhonov",
     "TikhonovLayers",
+    "Wiener",
     "load_midas_small",
     "receptive_field",
     "reconstruct_tiled",
