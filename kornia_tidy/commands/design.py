@@ -24,7 +24,7 @@ from kornia_tidy.files import only_here, write_bytes
 from kornia_tidy.mask_design.candidates import coded_candidate, flat_candidate
 from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design, planned_work
 from kornia_tidy.mask_design.design_memory import DesignMemory
-from kornia_tidy.mask_design.design_report import CAMERA, DATA, PICTURE, REPORT, design_files, task_data
+from kornia_tidy.mask_design.design_report import CAMERA, DATA, PICTURE, REPORT, design_files, focus_distance, task_data
 from kornia_tidy.mask_design.design_task import DesignTask
 from kornia_tidy.mask_design.simulated_captures import leaf_scenes, score_candidate
 from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
@@ -182,9 +182,8 @@ def run(args: argparse.Namespace) -> None:
         design = _with_progress(task, scenes, effort, args.seed, memory, work)
         _write(folder, design)
     tell("verdict", design.words)
-    focus = design.optics().camera.focus_distance
-    tell("camera", f"f/{design.recommended.f_number:.3g}, aperture {task.focal_length / design.recommended.f_number:.3g} "
-         f"m, focus at {float(focus):.3g} m")  # fmt: skip
+    focus, f_number = focus_distance(task, design.recommended), design.recommended.f_number
+    tell("camera", f"f/{f_number:.3g}, aperture {task.focal_length / f_number:.3g} m, focus at {focus:.3g} m")
     tell("wrote", f"{folder / REPORT}: read this one")
     for name in (PICTURE, DATA, "masks.npy", CAMERA):
         tell("", str(folder / name))
@@ -249,7 +248,7 @@ def _with_progress(
     task: DesignTask, scenes: list[Scene], effort: Effort, number: int, memory: DesignMemory, work: dict[str, int]
 ) -> CoDesign:
     """Run the co-design with a progress bar for each stage."""
-    bars: dict[str, tqdm[Any]] = {}
+    bars: dict[str, tqdm] = {}
 
     def progress(stage: str, amount: int) -> None:
         if stage not in bars:

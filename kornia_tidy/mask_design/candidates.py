@@ -12,8 +12,7 @@ from torch import Tensor
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.mask_design.design_task import DesignTask, mask_of
 from kornia_tidy.mask_design.fisher_information import defocus_bound, defocus_response, fisher_information
-from kornia_tidy.mask_design.objectives import design
-from kornia_tidy.mask_design.scene_light import lost_variance
+from kornia_tidy.mask_design.objectives import design, restoration_error
 from kornia_tidy.masks.base import mask_axes, metres_to_radians
 from kornia_tidy.masks.initial_heights import SMALL_NOISE, fisher_mask
 from kornia_tidy.masks.pixelwise import PixelwiseMask
@@ -39,7 +38,8 @@ class Candidate:
         start: ``"flat lens"``, or what its masks started from.
         f_number: focal length over aperture diameter.
         focus: in focus, as a fraction of the range of inverse depth, 0 at the far end.
-        lost: share of the scenes' variance that the best linear restoration loses, see :func:`lost_variance`.
+        lost: share of the scenes' variance that the best linear restoration loses, see
+            :func:`~kornia_tidy.mask_design.objectives.restoration_error`.
         depth_error: bound on the RMSE of a point's inverse depth, as a fraction of the range; NaN if depth has no
             weight.
         cost: what is minimised, in dB: see :func:`cost_of`.
@@ -74,7 +74,7 @@ def search_lens(task: DesignTask, masks: PixelwiseMask | None, f_number: float, 
         pixel_tolerance=0.1,
         layer_spacing=(hi - lo) / intervals,
         window=task.search_window(f_number, focus),
-        stray_light="discard",
+        stray_light="veil",
     )
     return task.lens(masks, f_number, focus, fidelity, Spectrum.monochrome())
 
@@ -84,7 +84,7 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
 
     .. math:: 10 \log_{10} \left( L^{1 - w} E^{2 w} \right)
 
-    L is :func:`lost_variance`, E is :func:`depth_bound` and w the weight of depth.
+    L is :func:`~kornia_tidy.mask_design.objectives.restoration_error`, E is :func:`depth_bound` and w the weight of depth.
 
     Args:
         task: light, statistics of the scenes and weight.
@@ -95,7 +95,7 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
         Cost in dB, L and E, each 0-dimensional. What has no weight is NaN.
     """
     weight, unknown = task.depth_weight, torch.tensor(math.nan)
-    lost = lost_variance(lens.psf_bank(), task.light, task.sensor(f_number)) if weight < 1 else unknown
+    lost = restoration_error(lens.psf_bank(), task.sensor(f_number), task.statistics) if weight < 1 else unknown
     bound = depth_bound(task, lens, f_number) if weight > 0 else unknown
     parts = [lost.log10() * (10 * (1 - weight))] * (weight < 1) + [bound.log10() * (20 * weight)] * (weight > 0)
     return torch.stack([part.float() for part in parts]).sum(), lost, bound
@@ -113,9 +113,10 @@ def depth_bound(task: DesignTask, lens: PSFModel, f_number: float) -> Tensor:
     """
     lo, hi = lens.camera.defocus_range
     electrons = task.sensor(f_number).full_well or 0.0
-    background = task.light.mean * electrons + task.read_noise_electrons**2
+    background = task.statistics.mean * electrons + task.read_noise_electrons**2
     bound = defocus_bound(fisher_information(defocus_response(lens), electrons, background))
-    return (12 + ((hi - lo) / bound).square()).reciprocal().mean().sqrt()
+    shares = task.statistics.depth_weights(torch.tensor(lens.defocus_nodes, dtype=bound.dtype))
+    return ((12 + ((hi - lo) / bound).square()).reciprocal() * shares).sum().sqrt()
 
 
 def flat_candidate(task: DesignTask, f_number: float, focus: float) -> Candidate:

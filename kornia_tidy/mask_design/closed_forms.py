@@ -9,11 +9,12 @@ from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.mask_design.scene_light import SceneLight, counted_twice, depth_moments
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.reconstruction.tikhonov import transfer_function
+from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
 from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.scene_statistics.statistics import SceneStatistics
 
 NOISE_FACTORS = (0.1, 0.4, 1.6, 6.4)  # of the noise that the Wiener filter assumes
 BILATERAL = (0.0, 0.05, 0.1, 0.2, 0.4)  # range of the bilateral filter in sRGB values; 0: none
@@ -26,43 +27,40 @@ TEMPERATURES = (2.0, 8.0, 32.0)  # by which the log-likelihood is divided: neigh
 
 
 class WienerFilter:
-    r"""Wiener filter of a camera's captures, the same for all depths.
-
-    .. math:: \hat X_f = \frac{\overline{\langle H_f \rangle}}{\langle |H_f|^2 \rangle + r / v_f} Y_f
-
-    See :func:`~kornia_tidy.mask_design.scene_light.lost_variance` for the symbols. The mean light is taken off before
-    and added after.
+    """Wiener filter of one camera for captures of one size. See :func:`~kornia_tidy.reconstruction.wiener.wiener`.
 
     Args:
-        bank: PSFs; the light outside their window counts as a uniform background.
-        light: statistics of the scenes.
-        variance: of the noise in a pixel, full scale 1.
+        bank: PSFs, with their stray light.
+        noise: standard deviation in units of full scale.
+        statistics: of the scenes.
         size: (H, W) of the captures.
 
-    Source: Wiener (1949).
-
     Example:
+        >>> from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS
         >>> point = torch.zeros(2, 3, 9, 9)
         >>> point[..., 4, 4] = 1
         >>> bank = PSFBank(point, torch.tensor([-1.0, 1.0]), torch.ones(2, 3))
         >>> capture = torch.rand(1, 3, 16, 16)
-        >>> torch.allclose(WienerFilter(bank, SceneLight(), 1e-8, (16, 16))(capture), capture, atol=1e-3)
+        >>> torch.allclose(WienerFilter(bank, 1e-4, PHOTOGRAPHS, (16, 16))(capture), capture, atol=1e-3)
         True
     """
 
-    def __init__(self, bank: PSFBank, light: SceneLight, variance: float, size: tuple[int, int]) -> None:
-        self.size = next_fast_size(size[0] + bank.window), next_fast_size(size[1] + bank.window)
-        self.light = light
-        self.mean, self.power = depth_moments(transfer_function(bank.psfs, self.size), bank.psfs.sum((-2, -1)))
-        pixels = self.size[0] * self.size[1]
-        self.ratio = (variance / light.spread**2 / pixels / light.variances(self.size)).to(self.power)
+    def __init__(self, bank: PSFBank, noise: float, statistics: SceneStatistics, size: tuple[int, int]) -> None:
+        self.size = plane_size(bank, size)
+        shares = statistics.depth_weights(bank.defocus)
+        self.mean, self.power = transfer_moments(bank.psfs, self.size, shares, bank.veil)
+        self.noise_power = noise**2 * inverse_spectrum(statistics, self.size).to(self.power)
 
     def __call__(self, capture: Tensor, noise_factor: float = 1.0) -> Tensor:
-        """Return the restored image of a capture (B, C, H, W) in linear light."""
-        spectrum = torch.fft.rfft2(periodic_extension(capture - self.light.mean, self.size))
-        restored = self.mean.conj() / (self.power + noise_factor * self.ratio) * spectrum
-        plane = torch.fft.irfft2(restored, s=self.size)
-        return plane[..., : capture.shape[-2], : capture.shape[-1]] + self.light.mean
+        """Return the restored image of a capture (B, C, H, W), with so many times the variance of the noise assumed."""
+        spectrum = torch.fft.rfft2(periodic_extension(capture, self.size))
+        restored = self.mean.conj() / (self.power + noise_factor * self.noise_power) * spectrum
+        return torch.fft.irfft2(restored, s=self.size)[..., : capture.shape[-2], : capture.shape[-1]]
+
+
+def plane_size(bank: PSFBank, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the periodic plane for captures of a size (H, W): wider by a PSF, with fast transforms."""
+    return next_fast_size(size[0] + bank.window), next_fast_size(size[1] + bank.window)
 
 
 def restorations(capture: Tensor, wiener: WienerFilter) -> dict[str, Tensor]:
@@ -95,33 +93,35 @@ class DepthLikelihood:
     r"""Depth from the texture of one capture, by the likelihood of a Gaussian scene at each depth.
 
     .. math:: \log p(y | d, a) = -\tfrac12 \sum_f \left( \frac{|Y_f|^2}{P_{daf}} + \log P_{daf} \right), \qquad
-              P_{daf} = a \, v_f \, |H_{df}|^2 + 10 \, r
+              P_{daf} = a \, S_f \, |H_{df}|^2 + 10 \, \sigma^2
 
-    The first sum is taken over a window around each pixel, of the capture filtered by :math:`P_{da}^{-1/2}`. The
+    with the scenes' power spectrum S. The first sum is taken over a window around each pixel, of the capture filtered by :math:`P_{da}^{-1/2}`. The
     contrast a of the texture is unknown: the likelihood of a depth is the sum over some contrasts.
 
     Args:
         bank: PSFs at depths evenly spaced over the range of defocus, ascending.
-        light: statistics of the scenes.
-        variance: of the noise in a pixel, full scale 1.
+        noise: standard deviation in units of full scale.
+        statistics: of the scenes.
         size: (H, W) of the captures.
 
     Source: Levin, Fergus, Durand and Freeman, Image and Depth from a Conventional Camera with a Coded Aperture
     (SIGGRAPH 2007), for depth by the likelihood of a Gaussian scene.
     """
 
-    def __init__(self, bank: PSFBank, light: SceneLight, variance: float, size: tuple[int, int]) -> None:
-        self.size = next_fast_size(size[0] + bank.window), next_fast_size(size[1] + bank.window)
+    def __init__(self, bank: PSFBank, noise: float, statistics: SceneStatistics, size: tuple[int, int]) -> None:
+        self.size = plane_size(bank, size)
         transfer = transfer_function(bank.psfs.mean(1), self.size)  # of the grey capture
-        pixels, channels = self.size[0] * self.size[1], bank.psfs.shape[1]
-        scene = light.variances(self.size) * light.spread**2 * pixels
-        blurred = scene * (transfer.real.square() + transfer.imag.square()).double()
-        power = torch.stack([contrast * blurred for contrast in CONTRASTS]) + MISFIT * variance / channels
-        self.filters = power.rsqrt().float()
+        squared = transfer.real.square() + transfer.imag.square()
+        blurred = (squared / inverse_spectrum(statistics, self.size)).float()
+        floor = MISFIT * noise**2 / bank.psfs.shape[1]
+        power = torch.stack([contrast * blurred for contrast in CONTRASTS]) + floor
+        self.filters = power.rsqrt()
         self.filters[..., 0, 0] = 0  # the mean light tells nothing
-        weight = counted_twice(self.size[1]) / pixels
-        self.log_power = (power.log() * weight).sum((-2, -1)).float()
-        self.mean = light.mean
+        weight = torch.full((squared.shape[-1],), 2.0)  # the half spectrum omits the conjugate frequencies
+        weight[0] = 1
+        self.log_power = (power.log() * weight).sum((-2, -1)) / (self.size[0] * weight.sum())
+        self.log_prior = statistics.depth_weights(bank.defocus).log()
+        self.mean = statistics.mean
 
     def __call__(self, capture: Tensor) -> dict[str, Tensor]:
         """Return estimates of normalised inverse depth, (H, W) from 0 (far) to 1, by a name of the setting.
@@ -137,6 +137,6 @@ class DepthLikelihood:
             local = functional.avg_pool2d(planes, window, 1, window // 2, count_include_pad=False)
             likelihood = -0.5 * window**2 * (local + self.log_power[..., None, None])
             for temperature in TEMPERATURES:
-                probability = (likelihood / temperature).logsumexp(0).softmax(0)
-                estimates[f"{window} px, temperature {temperature:g}"] = (probability * depths).sum(0)
+                posterior = (likelihood / temperature).logsumexp(0) + self.log_prior[:, None, None]
+                estimates[f"{window} px, temperature {temperature:g}"] = (posterior.softmax(0) * depths).sum(0)
         return estimates

@@ -1,7 +1,7 @@
 """Co-design of aperture, focus and masks: a search over f-numbers, decided by simulated captures.
 
-The search minimises :func:`~kornia_tidy.mask_design.candidates.cost_of` in three stages: flat lenses and focal sweeps on
-a coarse grid of f-numbers; masks from several starts on a finer grid around the best; and simulated captures of the
+The search minimises :func:`~kornia_tidy.mask_design.candidates.cost_of`: first flat lenses and focal sweeps on a coarse
+grid of f-numbers, then masks from several starts on a finer grid around the best. Simulated captures are made of the
 finalists, of which :func:`~kornia_tidy.mask_design.verdict.decide` takes one.
 """
 

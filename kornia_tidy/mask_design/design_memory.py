@@ -53,7 +53,9 @@ class DesignMemory:
         """Return the candidate of a name, designed if it is not there."""
         if name in self.entries:
             stored = self.entries[name]
-            return Candidate(**{**stored, "phase": _tensor(stored["phase"])})
+            return Candidate(
+                **{name: stored[name] for name in stored if name != "phase"}, phase=_tensor(stored["phase"])
+            )
         candidate = design()
         values = {field.name: getattr(candidate, field.name) for field in fields(candidate)}
         self._add(name, {**values, "phase": None if candidate.phase is None else _text(candidate.phase)})

@@ -113,8 +113,8 @@ def report_markdown(design: CoDesign) -> str:
         "|---|---|---|---|---|",
         *(_candidate_row(task, one) for one in sorted(design.candidates, key=lambda one: one.cost)),
         "",
-        f"Files: `{CAMERA}` is the recommended camera, `{MASKS}` the heights of the best masks in metres, `{DATA}` this "
-        "page as data.",
+        f"Files: `{CAMERA}` is the recommended camera, `{MASKS}` the heights of the best masks in metres, "
+        f"`{DATA}` this page as data.",
         "",
     ]
     return "\n".join(lines)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_metres, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.mask_design.scene_light import SceneLight
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLensCamera
 from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.sensor.exposure import exposed_sensor
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -28,7 +29,7 @@ class DesignTask:
     """Given quantities of a co-design of aperture, focus and masks. Lengths in metres, light in electrons.
 
     Args:
-        depth_range: nearest and farthest depth; all inverse depths between count alike. The farthest may be ``inf``.
+        depth_range: nearest and farthest depth. The farthest may be ``inf``.
         focal_length: of the lens.
         pixel_pitch: of the sensor.
         electrons: of a white pixel at the reference f-number. The exposure time is the same at every f-number.
@@ -37,7 +38,7 @@ class DesignTask:
         masks: number K of masks in one exposure.
         modulator: shows the masks, with its switching, levels and losses. Default: equal dwell times without delay.
             The flat lens, to which masks are compared, has none.
-        light: statistics of the scenes.
+        statistics: of the scenes: power spectrum, light, and the distribution of inverse depth over the range.
         depth_weight: share of depth in what matters: 0 is the image alone, 1 depth alone.
         mask_size: pixels along a side of a mask.
 
@@ -62,7 +63,7 @@ class DesignTask:
     read_noise_electrons: float = 2.4
     masks: int = 5
     modulator: nn.Module = field(default_factory=DwellTimes)
-    light: SceneLight = field(default_factory=SceneLight)
+    statistics: SceneStatistics = PHOTOGRAPHS
     depth_weight: float = 0.0
     mask_size: int = 23
 
@@ -70,7 +71,7 @@ class DesignTask:
         check_metres("focal_length", self.focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
         check_metres("pixel_pitch", self.pixel_pitch, *PITCHES, "8 um is 8e-6")
         check_part("modulator", self.modulator, nn.Module, "a modulator such as DwellTimes()")
-        check_part("light", self.light, SceneLight, "statistics of scenes such as SceneLight()")
+        check_part("statistics", self.statistics, SceneStatistics, "SceneStatistics such as PHOTOGRAPHS")
         if not isinstance(self.masks, int) or not 1 <= self.masks <= MOST_MASKS:
             raise ValueError(f"masks must be a whole number from 1 to {MOST_MASKS}, got {self.masks}")
         check_positive("mask_size", self.mask_size)
@@ -129,6 +130,10 @@ class DesignTask:
         """Return the sensor, with the light that the f-number admits. See :func:`exposed_sensor`."""
         return exposed_sensor(f_number, self.electrons, self.reference_f_number, self.read_noise_electrons)
 
+    def noise(self, f_number: float) -> float:
+        """Return the standard deviation of the noise at the scenes' mean light, full scale 1."""
+        return float(self.sensor(f_number).std(torch.tensor(self.statistics.mean, dtype=torch.float64)))
+
     def lens(
         self, masks: PixelwiseMask | None, f_number: float, focus: float, fidelity: Fidelity, spectrum: Spectrum
     ) -> PSFModel:
@@ -157,7 +162,6 @@ def mask_of(phase: Tensor) -> PixelwiseMask:
     """Return pixel-wise masks of a phase in radians at 530 nm, (K, N, N).
 
     Example:
-        >>> import torch
         >>> mask_of(torch.ones(2, 23, 23)).phase.shape
         torch.Size([2, 23, 23])
     """

@@ -17,7 +17,6 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.mask_design.candidates import Candidate
 from kornia_tidy.mask_design.closed_forms import DEPTHS, DepthLikelihood, WienerFilter, restorations
 from kornia_tidy.mask_design.design_task import DesignTask, flat_mask
-from kornia_tidy.mask_design.scene_light import noise_variance
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.seeds import keyed_seed
 
@@ -63,15 +62,15 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
         the range.
     """
     optics = candidate_optics(task, candidate)
-    variance = noise_variance(task.sensor(candidate.f_number), task.light)
+    noise = task.noise(candidate.f_number)
     bank = optics.psf_bank()
     lo, hi = optics.camera.defocus_range
     depths = optics.psf_bank(defocus=torch.linspace(lo, hi, DEPTHS).tolist()) if task.depth_weight > 0 else bank
 
     @lru_cache(maxsize=1)
     def filters(size: tuple[int, int]) -> tuple[WienerFilter | None, DepthLikelihood | None]:
-        wiener = WienerFilter(bank, task.light, variance, size) if task.depth_weight < 1 else None
-        return wiener, DepthLikelihood(depths, task.light, variance, size) if task.depth_weight > 0 else None
+        wiener = WienerFilter(bank, noise, task.statistics, size) if task.depth_weight < 1 else None
+        return wiener, DepthLikelihood(depths, noise, task.statistics, size) if task.depth_weight > 0 else None
 
     for number, scene in enumerate(scenes):
         wiener, likelihood = filters((scene.image.shape[-2], scene.image.shape[-1]))

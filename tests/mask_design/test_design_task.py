@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -31,8 +32,8 @@ class TestDesignTask(BaseTester):
     def test_exception_parts_of_another_type(self):
         with pytest.raises(TypeError, match="modulator must be a modulator such as DwellTimes"):
             DesignTask(modulator=8)
-        with pytest.raises(TypeError, match="light must be statistics of scenes"):
-            DesignTask(light=0.3)
+        with pytest.raises(TypeError, match="statistics must be SceneStatistics"):
+            DesignTask(statistics=0.3)
 
     @pytest.mark.parametrize("depth_range", [(0.2975, math.inf), (0.5, 2.0)])
     def test_feature_blur_and_airy_disc_are_equally_wide_at_the_balanced_f_number(self, depth_range):
@@ -57,7 +58,7 @@ class TestDesignTask(BaseTester):
         task = DesignTask()
         grid = task.f_numbers()
         assert task.balanced_f_number in grid
-        for wider, slower in zip(grid, grid[1:], strict=False):
+        for wider, slower in pairwise(grid):
             assert slower / wider == pytest.approx(math.sqrt(2))
 
     def test_feature_light_falls_with_the_square_of_the_f_number(self):
