@@ -24,7 +24,7 @@ from kornia_tidy.seeds import keyed_seed
 FLAT = "flat lens"
 STARTS = ("focal sweep", "Fisher", "random")
 LEARNING_RATE = 4e-8  # m of height in the first Adam step
-FOCI = (0.3, 0.4, 0.5, 0.6, 0.7)  # fractions of the range of inverse depth
+FOCI = (0.2, 0.3, 0.4, 0.5, 0.6)  # fractions of the range of inverse depth
 DEPTH_FOCI = (0.0, 0.25, 0.5, 0.75, 1.0)  # a plain lens tells near from far only if focused at an end
 _SPACING = 3.0  # rad of defocus between the depths of the search, less than the PSFs' band limit
 _DEPTHS = (9, 33)  # fewest and most of them
@@ -84,7 +84,7 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
 
     .. math:: 10 \log_{10} \left( L^{1 - w} E^{2 w} \right)
 
-    L is :func:`~kornia_tidy.mask_design.objectives.restoration_error`, E is :func:`depth_bound` and w the weight of depth.
+    L is :func:`~kornia_tidy.mask_design.objectives.restoration_error`, E is :func:`depth_bound`, w the weight of depth.
 
     Args:
         task: light, statistics of the scenes and weight.

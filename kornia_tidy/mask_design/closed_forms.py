@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -16,8 +18,8 @@ from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.scene_statistics.statistics import SceneStatistics
 
-NOISE_FACTORS = (0.1, 0.4, 1.6, 6.4)  # of the noise that the Wiener filter assumes
-BILATERAL = (0.0, 0.05, 0.1, 0.2, 0.4)  # range of the bilateral filter in sRGB values; 0: none
+NOISE_FACTORS = (0.03, 0.15, 0.8, 4.0)  # of the noise that the Wiener filter assumes
+BILATERAL = (0.0, 0.07, 0.14, 0.28)  # range of the bilateral filter in sRGB values; 0: none
 BILATERAL_WIDTH, BILATERAL_SPACE = 7, 2.0  # pixels
 DEPTHS = 15  # at which the likelihood is computed
 CONTRASTS = (1 / 8, 1.0, 8.0, 64.0)  # of a texture's variance to that of all scenes
@@ -41,7 +43,7 @@ class WienerFilter:
         >>> point[..., 4, 4] = 1
         >>> bank = PSFBank(point, torch.tensor([-1.0, 1.0]), torch.ones(2, 3))
         >>> capture = torch.rand(1, 3, 16, 16)
-        >>> torch.allclose(WienerFilter(bank, 1e-4, PHOTOGRAPHS, (16, 16))(capture), capture, atol=1e-3)
+        >>> torch.allclose(WienerFilter(bank, 1e-4, PHOTOGRAPHS, (16, 16))(capture)[0], capture, atol=1e-3)
         True
     """
 
@@ -51,11 +53,15 @@ class WienerFilter:
         self.mean, self.power = transfer_moments(bank.psfs, self.size, shares, bank.veil)
         self.noise_power = noise**2 * inverse_spectrum(statistics, self.size).to(self.power)
 
-    def __call__(self, capture: Tensor, noise_factor: float = 1.0) -> Tensor:
-        """Return the restored image of a capture (B, C, H, W), with so many times the variance of the noise assumed."""
-        spectrum = torch.fft.rfft2(periodic_extension(capture, self.size))
-        restored = self.mean.conj() / (self.power + noise_factor * self.noise_power) * spectrum
-        return torch.fft.irfft2(restored, s=self.size)[..., : capture.shape[-2], : capture.shape[-1]]
+    def __call__(self, capture: Tensor, noise_factors: Sequence[float] = (1.0,)) -> list[Tensor]:
+        """Return the restored images of a capture (B, C, H, W), for so many times the variance of the noise."""
+        matched = self.mean.conj() * torch.fft.rfft2(periodic_extension(capture, self.size))
+        height, width = capture.shape[-2:]
+        planes = (
+            torch.fft.irfft2(matched / (self.power + factor * self.noise_power), s=self.size)
+            for factor in noise_factors
+        )
+        return [plane[..., :height, :width] for plane in planes]
 
 
 def plane_size(bank: PSFBank, size: tuple[int, int]) -> tuple[int, int]:
@@ -75,9 +81,9 @@ def restorations(capture: Tensor, wiener: WienerFilter) -> dict[str, Tensor]:
 
     Source: Tomasi and Manduchi, Bilateral Filtering for Gray and Color Images (ICCV 1998).
     """
-    bases = {"capture": capture, **{f"Wiener x {factor:g}": wiener(capture, factor) for factor in NOISE_FACTORS}}
+    names = ("capture", *(f"Wiener x {factor:g}" for factor in NOISE_FACTORS))
     images = {}
-    for name, light in bases.items():
+    for name, light in zip(names, (capture, *wiener(capture, NOISE_FACTORS)), strict=True):
         encoded = linear_rgb_to_rgb(light.clamp(0, 1))
         pixels = np.ascontiguousarray(encoded[0].permute(1, 2, 0).float().numpy())
         for scale in BILATERAL:
@@ -95,8 +101,9 @@ class DepthLikelihood:
     .. math:: \log p(y | d, a) = -\tfrac12 \sum_f \left( \frac{|Y_f|^2}{P_{daf}} + \log P_{daf} \right), \qquad
               P_{daf} = a \, S_f \, |H_{df}|^2 + 10 \, \sigma^2
 
-    with the scenes' power spectrum S. The first sum is taken over a window around each pixel, of the capture filtered by :math:`P_{da}^{-1/2}`. The
-    contrast a of the texture is unknown: the likelihood of a depth is the sum over some contrasts.
+    with the scenes' power spectrum S. The first sum is taken over a window around each pixel, of the capture filtered
+    by :math:`P_{da}^{-1/2}`. The contrast a of the texture is unknown: the likelihood of a depth is the sum over some
+    contrasts.
 
     Args:
         bank: PSFs at depths evenly spaced over the range of defocus, ascending.

@@ -7,6 +7,7 @@ finalists, of which :func:`~kornia_tidy.mask_design.verdict.decide` takes one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -135,6 +136,10 @@ def co_design(
     candidates = _search(task, effort, seed, memory, tell)
     taken = _finalists(task, candidates)
     pictures = [*leaf_scenes(effort.scenes, effort.size, task.depth_range, seed), *given]
+    if len(pictures) < 4:
+        raise ValueError(
+            f"a decision needs at least 4 scenes, two to choose settings and two to score, got {len(pictures)}"
+        )
     finalists = []
     for candidate in taken:
         scores = memory.scores(
@@ -191,7 +196,8 @@ def _search(
     best_flat = min((pair[0] for pair in coarse), key=lambda lens: lens.cost)
     best_coded = min((pair[1] for pair in coarse), key=lambda lens: lens.cost)
     for factor in FLAT_FINALISTS:
-        if (f_number := best_flat.f_number * factor) >= FASTEST and factor != 1:
+        f_number, known = best_flat.f_number * factor, [lens.f_number for lens, _ in coarse]
+        if f_number >= FASTEST and not any(math.isclose(f_number, other) for other in known):
             flat(f_number)
     for factor in CODED_FINALISTS:
         if (f_number := best_coded.f_number * factor) >= FASTEST:

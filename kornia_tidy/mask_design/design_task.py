@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from kornia_tidy.checks import check_metres, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLensCamera
 from kornia_tidy.psf.psf_model import PSFModel
@@ -75,6 +75,7 @@ class DesignTask:
         if not isinstance(self.masks, int) or not 1 <= self.masks <= MOST_MASKS:
             raise ValueError(f"masks must be a whole number from 1 to {MOST_MASKS}, got {self.masks}")
         check_positive("mask_size", self.mask_size)
+        timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
         if not 0 <= self.depth_weight <= 1:
             raise ValueError(f"depth_weight must be from 0 (image alone) to 1 (depth alone), got {self.depth_weight}")
         self.sensor(self.reference_f_number)  # refuses light and noise out of range

@@ -118,7 +118,8 @@ def _normalised_inverse(depth: Tensor, depth_range: tuple[float, float]) -> Tens
 
 
 def _decibels(error: Tensor, valid: Tensor) -> float:
-    return -10 * math.log10(max(float(error[valid].square().mean()), 1e-12))
+    squared = (error.square() * valid).sum() / valid.sum().clamp(min=1)
+    return -10 * math.log10(max(float(squared), 1e-12))
 
 
 def progress_over(scores: Iterable[Scores], each: Callable[[], None]) -> list[Scores]:
