@@ -21,11 +21,11 @@ from kornia_tidy.scene_statistics.statistics import SceneStatistics
 NOISE_FACTORS = (0.03, 0.15, 0.8, 4.0)  # of the noise that the Wiener filter assumes
 BILATERAL = (0.0, 0.07, 0.14, 0.28)  # range of the bilateral filter in sRGB values; 0: none
 BILATERAL_WIDTH, BILATERAL_SPACE = 7, 2.0  # pixels
-DEPTHS = 15  # at which the likelihood is computed
-CONTRASTS = (1 / 8, 1.0, 8.0, 64.0)  # of a texture's variance to that of all scenes
+DEPTHS = 11  # at which the likelihood is computed
+CONTRASTS = (1 / 4, 8.0)  # of a texture's variance to that of all scenes
 MISFIT = 10.0  # times the noise: edges of depth and other light that one PSF does not explain
-WINDOWS = (15, 31)  # px; squares whose texture tells depth
-TEMPERATURES = (2.0, 8.0, 32.0)  # by which the log-likelihood is divided: neighbouring pixels are not independent
+WINDOWS = (15, 31)  # px; side of the squares over which the likelihood is summed
+TEMPERATURES = (4.0, 16.0, 64.0)  # by which the log-likelihood is divided: neighbouring pixels are not independent
 
 
 class WienerFilter:
@@ -141,9 +141,16 @@ class DepthLikelihood:
         depths = torch.linspace(0, 1, planes.shape[1])[:, None, None]
         estimates = {}
         for window in WINDOWS:
-            local = functional.avg_pool2d(planes, window, 1, window // 2, count_include_pad=False)
+            local = _window_mean(planes, window)
             likelihood = -0.5 * window**2 * (local + self.log_power[..., None, None])
             for temperature in TEMPERATURES:
                 posterior = (likelihood / temperature).logsumexp(0) + self.log_prior[:, None, None]
                 estimates[f"{window} px, temperature {temperature:g}"] = (posterior.softmax(0) * depths).sum(0)
         return estimates
+
+
+def _window_mean(planes: Tensor, window: int) -> Tensor:
+    """Return the mean over a square window around each pixel, as far as it lies in the image."""
+    half = window // 2
+    columns = functional.avg_pool2d(planes, (window, 1), 1, (half, 0), count_include_pad=False)
+    return functional.avg_pool2d(columns, (1, window), 1, (0, half), count_include_pad=False)

@@ -23,6 +23,7 @@ from kornia_tidy.mask_design.verdict import Finalist, Verdict, decide, finalist,
 from kornia_tidy.optics.thin_lens import FASTEST
 
 STOP = 2**0.5
+FOCUS_STEP = 0.1  # of the range of inverse depth
 FLAT_FINALISTS = (STOP**-1, STOP**-0.5, 1.0, STOP**0.5, STOP)  # times the best f-number of the search
 # The measure rates wide apertures too high, so that slower ones are finalists too.
 CODED_FINALISTS = (STOP**-0.5, 1.0, STOP**0.5, STOP)
@@ -158,10 +159,10 @@ def planned_work(task: DesignTask, effort: Effort, scenes: int = 0) -> dict[str,
 
     Example:
         >>> planned_work(DesignTask(), Effort())
-        {'search': 780, 'captures': 216}
+        {'search': 980, 'captures': 216}
     """
     steps = len(task.f_numbers()) * effort.coarse_steps
-    steps += (len(CODED_FINALISTS) + len(effort.starts) - 1) * effort.steps
+    steps += (len(CODED_FINALISTS) + len(effort.starts) - 1 + 2) * effort.steps  # and two other foci
     return {"search": steps, "captures": (len(FLAT_FINALISTS) + len(CODED_FINALISTS)) * (effort.scenes + scenes)}
 
 
@@ -203,12 +204,19 @@ def _search(
         if (f_number := best_coded.f_number * factor) >= FASTEST:
             for start in effort.starts if factor == 1 else effort.starts[:1]:
                 coded(start, f_number, best_coded.focus, effort.steps)
+    for focus in _neighbours(best_coded.focus):
+        coded(effort.starts[0], best_coded.f_number, focus, effort.steps)
     return found
 
 
 def _focus(task: DesignTask, lens: Candidate) -> float:
     """Return the focus of masks: that of the flat lens, or the middle where masks are to tell depth from both sides."""
     return 0.5 if task.depth_weight else lens.focus
+
+
+def _neighbours(focus: float) -> tuple[float, float]:
+    """Return two foci beside one, within the range."""
+    return max(focus - FOCUS_STEP, 0.0), min(focus + FOCUS_STEP, 1.0)
 
 
 def _finalists(task: DesignTask, candidates: Sequence[Candidate]) -> list[Candidate]:

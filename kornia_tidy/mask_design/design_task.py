@@ -1,4 +1,4 @@
-"""The task of a co-design: what is given of scene, lens, sensor and modulator, and what matters."""
+"""Task of a co-design: the scene, lens, sensor and modulator that are given, and the weight of depth."""
 
 from __future__ import annotations
 

@@ -46,10 +46,17 @@ DEPTH_EFFORT = Effort(coarse_steps=5, steps=20, starts=("focal sweep", "Fisher")
 
 def cells() -> list[tuple[str, str, int, int]]:
     """Return what matters, range, number of masks and electrons of each cell, the most wanted first."""
-    first = next(iter(RANGES))
-    image = [*product(["image"], [first], (5, 1), LIGHTS), *product(["image"], list(RANGES)[1:], (5, 1), LIGHTS)]
-    more = [*product(["image"], [first], (2,), LIGHTS)]
-    return [*image, *product(["depth", "both"], [first], (5, 1), LIGHTS), *more]
+    first, less, more = RANGES
+    return [
+        *product(["image"], [first], (5, 1), LIGHTS),
+        *product(["image"], [less], [5], LIGHTS),
+        *product(["depth"], [first], [5], LIGHTS),
+        *product(["both"], [first], [5], LIGHTS),
+        *product(["image"], [more], [5], LIGHTS),
+        *product(["depth"], [first], [1], LIGHTS),
+        *product(["image"], [less, more], [1], LIGHTS),
+        *product(["image"], [first], [2], LIGHTS),
+    ]
 
 
 def scenes_for(task: DesignTask) -> list[Scene]:

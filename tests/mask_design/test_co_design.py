@@ -12,7 +12,7 @@ from safetensors.torch import load
 
 from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.mask_design import DesignMemory, DesignTask, Effort, co_design, planned_work
+from kornia_tidy.mask_design import Candidate, DesignMemory, DesignTask, Effort, co_design, planned_work
 from kornia_tidy.mask_design.design_report import CAMERA, DATA, MASKS, REPORT, design_files
 from kornia_tidy.mask_design.simulated_captures import candidate_optics, leaf_scenes
 from kornia_tidy.sensor.noise import SensorNoise
@@ -36,17 +36,16 @@ def bright():
     return design, told
 
 
-def same(one, other):
-    return [candidate.cost for candidate in one.candidates] == [candidate.cost for candidate in other.candidates] and [
-        finalist.scores for finalist in one.finalists
-    ] == [finalist.scores for finalist in other.finalists]
-
-
 class TestCoDesign(BaseTester):
     def test_feature_in_little_light_nothing_is_coded(self, dim):
         assert dim.recommended.is_flat
         assert "coding gains nothing" in dim.words
         assert f"f/{dim.recommended.f_number:.3g}" in dim.words
+
+    def test_feature_the_same_seed_the_same_result(self, dim):
+        again = co_design(DIM, effort=TINY)
+        assert [one.scores for one in again.finalists] == [one.scores for one in dim.finalists]
+        assert again.words == dim.words
 
     def test_feature_in_bright_light_masks_pay(self, bright):
         design, _ = bright
@@ -75,23 +74,33 @@ class TestCoDesign(BaseTester):
         assert done["search"] == planned["search"]
         assert done["captures"] == len(design.finalists) * TINY.scenes <= planned["captures"]
 
-    def test_feature_goes_on_where_it_stopped_and_ends_alike(self, dim, tmp_path, monkeypatch):
-        """Interrupted at the last finalist; then nothing is searched again, and the result is that of one run."""
-        path, done = tmp_path / "progress.json", []
-        original = module.score_candidate
+    def test_feature_goes_on_where_it_stopped_and_ends_alike(self, tmp_path, monkeypatch):
+        """Interrupted at the fifth finalist; then nothing is searched or captured twice."""
+        path, calls, captures_left = tmp_path / "progress.json", [], [4]
 
-        def interrupted(*arguments):
-            done.append(1)
-            if len(done) == len(dim.finalists):
+        def searched(task, start, f_number, focus, steps, seed, each_step):
+            calls.append((start, f_number, focus, steps))
+            return Candidate(start, f_number, focus, 1 / f_number, math.nan, abs(f_number - 30), torch.ones(1, 3, 3))
+
+        def captured(task, candidate, scenes, seed):
+            if not captures_left[0]:
                 raise KeyboardInterrupt
-            return original(*arguments)
+            captures_left[0] -= 1
+            calls.append((candidate.start, candidate.f_number))
+            return [{"image": {"only": candidate.f_number + number}} for number, _ in enumerate(scenes)]
 
-        monkeypatch.setattr(module, "score_candidate", interrupted)
+        monkeypatch.setattr(module, "coded_candidate", searched)
+        monkeypatch.setattr(module, "score_candidate", captured)
         with pytest.raises(KeyboardInterrupt):
             co_design(DIM, effort=TINY, memory=DesignMemory(path, "this"))
-        monkeypatch.setattr(module, "score_candidate", original)
-        monkeypatch.setattr(module, "coded_candidate", lambda *_: pytest.fail("searched again"))
-        assert same(co_design(DIM, effort=TINY, memory=DesignMemory(path, "this")), dim)
+        before = len(calls)
+        captures_left[0] = 100
+        again = co_design(DIM, effort=TINY, memory=DesignMemory(path, "this"))
+        assert len(calls) - before == len(again.finalists) - 4
+        assert len(set(calls)) == len(calls)
+        whole = co_design(DIM, effort=TINY)
+        assert [one.cost for one in again.candidates] == [one.cost for one in whole.candidates]
+        assert [one.scores for one in again.finalists] == [one.scores for one in whole.finalists]
         assert len(DesignMemory(path, "another")) == 0
 
     def test_exception_scenes(self):
