@@ -23,8 +23,7 @@ from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.files import only_here, write_bytes
 from kornia_tidy.mask_design.candidates import coded_candidate, flat_candidate
 from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design, planned_work
-from kornia_tidy.mask_design.design_memory import DesignMemory
-from kornia_tidy.mask_design.design_report import CAMERA, DATA, PICTURE, REPORT, design_files, focus_distance, task_data
+from kornia_tidy.mask_design.design_report import CAMERA, DATA, PICTURE, REPORT, design_files, focus_distance
 from kornia_tidy.mask_design.design_task import DesignTask
 from kornia_tidy.mask_design.simulated_captures import leaf_scenes, score_candidate
 from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
@@ -171,15 +170,12 @@ def run(args: argparse.Namespace) -> None:
     scenes = _own_scenes(args.scenes)
     folder.mkdir(parents=True, exist_ok=True)
     with only_here(folder, "a design is running"):
-        about = {"task": task_data(task), "effort": str(effort), "seed": args.seed, "scenes": args.scenes}
-        memory = DesignMemory(folder / PROGRESS, about)
         work = planned_work(task, effort, len(scenes))
         near, far = task.depth_range
         tell("scene", f"depths {near:g} to {far:g} m, {effort.scenes} dead leaves, {len(scenes)} scenes of yours")
         tell("light", f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g}, equal exposure time")
-        gone_on = f"; goes on after {len(memory)} steps of an earlier run" if len(memory) else ""
-        tell("work", f"{_estimate(task, effort, work)}{gone_on}")
-        design = _with_progress(task, scenes, effort, args.seed, memory, work)
+        tell("work", _estimate(task, effort, work) + _earlier(folder / PROGRESS))
+        design = _with_progress(task, scenes, effort, args.seed, folder / PROGRESS, work)
         _write(folder, design)
     tell("verdict", design.words)
     focus, f_number = focus_distance(task, design.recommended), design.recommended.f_number
@@ -244,8 +240,12 @@ def _estimate(task: DesignTask, effort: Effort, work: dict[str, int]) -> str:
     return f"{work['search']} gradient steps and {work['captures']} captures, about {told}"
 
 
+def _earlier(progress_file: Path) -> str:
+    return f"; {progress_file} goes on, if it is of this design" if progress_file.exists() else ""
+
+
 def _with_progress(
-    task: DesignTask, scenes: list[Scene], effort: Effort, number: int, memory: DesignMemory, work: dict[str, int]
+    task: DesignTask, scenes: list[Scene], effort: Effort, number: int, progress_file: Path, work: dict[str, int]
 ) -> CoDesign:
     """Run the co-design with a progress bar for each stage."""
     bars: dict[str, tqdm] = {}
@@ -258,7 +258,7 @@ def _with_progress(
         bars[stage].update(amount)
 
     try:
-        return co_design(task, scenes, effort, number, memory, progress)
+        return co_design(task, scenes, effort, number, progress_file, progress)
     except KeyboardInterrupt:
         tell("stopped", "the same command goes on from here")
         raise

@@ -7,7 +7,6 @@ Read ``objectives.py`` first; for aperture, focus and masks together, and whethe
 
 from kornia_tidy.mask_design.candidates import Candidate
 from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design, planned_work
-from kornia_tidy.mask_design.design_memory import DesignMemory
 from kornia_tidy.mask_design.design_report import design_files
 from kornia_tidy.mask_design.design_task import DesignTask
 from kornia_tidy.mask_design.fisher_information import crlb
@@ -18,7 +17,6 @@ from kornia_tidy.mask_design.verdict import Finalist, Verdict
 __all__ = [
     "Candidate",
     "CoDesign",
-    "DesignMemory",
     "DesignTask",
     "Effort",
     "Finalist",

@@ -8,8 +8,10 @@ finalists, of which :func:`~kornia_tidy.mask_design.verdict.decide` takes one.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
@@ -21,6 +23,7 @@ from kornia_tidy.mask_design.design_task import DesignTask
 from kornia_tidy.mask_design.simulated_captures import candidate_optics, leaf_scenes, progress_over, score_candidate
 from kornia_tidy.mask_design.verdict import Finalist, Verdict, decide, finalist, in_words
 from kornia_tidy.optics.thin_lens import FASTEST
+from kornia_tidy.psf.camera_settings import digest_of, settings_of
 
 STOP = 2**0.5
 FOCUS_STEP = 0.1  # of the range of inverse depth
@@ -91,7 +94,7 @@ def co_design(
     scenes: Sequence[Scene] | None = None,
     effort: Effort | None = None,
     seed: int = 0,
-    memory: DesignMemory | None = None,
+    progress_file: str | os.PathLike[str] | None = None,
     progress: Callable[[str, int], None] | None = None,
 ) -> CoDesign:
     """Design aperture, focus and masks of a camera together, and decide whether the masks pay.
@@ -102,7 +105,8 @@ def co_design(
             are moved to its ends. Half of all scenes choose the settings, the other half decide.
         effort: extent of the search. Default: :class:`Effort`, some minutes on one core.
         seed: of starts, scenes and noise. The same seed gives the same result on the same machine.
-        memory: keeps what is done, so that an interrupted design goes on where it stopped.
+        progress_file: keeps designed masks and scores as JSON, so that an interrupted design goes on where it stopped.
+            A file of another task, effort, seed or other scenes is replaced. Default: nothing is kept.
         progress: called with the name of each stage and the units of work done in it, see :func:`planned_work`.
 
     Returns:
@@ -110,7 +114,7 @@ def co_design(
 
     Raises:
         TypeError: if an argument is of another type.
-        ValueError: if a scene is too small for PSFs of 129 pixels.
+        ValueError: if a scene is too small for PSFs of 129 pixels, or there are fewer than 4 scenes.
 
     Convention:
         - The flat lens has no modulator: no losses, no switching.
@@ -129,18 +133,14 @@ def co_design(
     """
     check_part("task", task, DesignTask, "a DesignTask")
     effort = Effort() if effort is None else effort
-    memory = DesignMemory() if memory is None else memory
     tell = (lambda stage, amount: None) if progress is None else progress
     given = [*(scenes or ())]
-    _check_scenes(given)
+    _check_scenes(given, effort)
+    memory = DesignMemory(progress_file, _about(task, effort, seed, given))
 
     candidates = _search(task, effort, seed, memory, tell)
     taken = _finalists(task, candidates)
     pictures = [*leaf_scenes(effort.scenes, effort.size, task.depth_range, seed), *given]
-    if len(pictures) < 4:
-        raise ValueError(
-            f"a decision needs at least 4 scenes, two to choose settings and two to score, got {len(pictures)}"
-        )
     finalists = []
     for candidate in taken:
         scores = memory.scores(
@@ -246,7 +246,17 @@ def _around(candidates: list[Candidate], factors: Sequence[float]) -> list[Candi
     return sorted(chosen.values(), key=lambda one: one.f_number)
 
 
-def _check_scenes(scenes: Sequence[Scene]) -> None:
+def _about(task: DesignTask, effort: Effort, seed: int, scenes: Sequence[Scene]) -> dict[str, Any]:
+    """Return what a progress file belongs to, as plain data."""
+    pictures = [digest_of(scene.image, scene.depth) for scene in scenes]
+    weights = digest_of(*task.modulator.parameters())  # settings hold none
+    about = {"task": settings_of(task), "modulator": weights, "effort": settings_of(effort)}
+    return {**about, "seed": seed, "scenes": pictures}
+
+
+def _check_scenes(scenes: Sequence[Scene], effort: Effort) -> None:
+    if (count := len(scenes) + effort.scenes) < 4:
+        raise ValueError(f"a decision needs at least 4 scenes, two to choose settings and two to score, got {count}")
     for number, scene in enumerate(scenes):
         check_part(f"scene {number}", scene, Scene, "a Scene of image, depth and valid")
         if min(scene.image.shape[-2:]) < 97:

@@ -42,7 +42,7 @@ class TestDesign(BaseTester):
 
         before = (folder / "report.json").read_bytes()
         assert main(["design", *DIM, "-o", str(folder)]) == 0
-        assert "goes on after" in capsys.readouterr().out
+        assert "progress.json goes on" in capsys.readouterr().out
         assert (folder / "report.json").read_bytes() == before
 
     def test_feature_options_reach_the_task(self):

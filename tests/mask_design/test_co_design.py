@@ -12,7 +12,8 @@ from safetensors.torch import load
 
 from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.mask_design import Candidate, DesignMemory, DesignTask, Effort, co_design, planned_work
+from kornia_tidy.mask_design import Candidate, DesignTask, Effort, co_design, planned_work
+from kornia_tidy.mask_design.design_memory import DesignMemory
 from kornia_tidy.mask_design.design_report import CAMERA, DATA, MASKS, REPORT, design_files
 from kornia_tidy.mask_design.simulated_captures import candidate_optics, leaf_scenes
 from kornia_tidy.sensor.noise import SensorNoise
@@ -92,16 +93,22 @@ class TestCoDesign(BaseTester):
         monkeypatch.setattr(module, "coded_candidate", searched)
         monkeypatch.setattr(module, "score_candidate", captured)
         with pytest.raises(KeyboardInterrupt):
-            co_design(DIM, effort=TINY, memory=DesignMemory(path, "this"))
+            co_design(DIM, effort=TINY, progress_file=path)
         before = len(calls)
         captures_left[0] = 100
-        again = co_design(DIM, effort=TINY, memory=DesignMemory(path, "this"))
+        again = co_design(DIM, effort=TINY, progress_file=path)
         assert len(calls) - before == len(again.finalists) - 4
         assert len(set(calls)) == len(calls)
         whole = co_design(DIM, effort=TINY)
         assert [one.cost for one in again.candidates] == [one.cost for one in whole.candidates]
         assert [one.scores for one in again.finalists] == [one.scores for one in whole.finalists]
-        assert len(DesignMemory(path, "another")) == 0
+
+    def test_feature_progress_of_another_design_is_not_taken(self, tmp_path):
+        path = tmp_path / "progress.json"
+        memory = DesignMemory(path, {"seed": 1})
+        memory.scores(Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3)), lambda: [{}])
+        assert len(DesignMemory(path, {"seed": 1})) == 1
+        assert len(DesignMemory(path, {"seed": 2})) == 0
 
     def test_exception_scenes(self):
         scene = leaf_scenes(1, 96, (0.3, math.inf))[0]
