@@ -53,7 +53,8 @@ EPILOG = """\
 FOLDER gets report.md (read this first), design.png, report.json, masks.npy (heights of
 the best masks in metres) and camera.safetensors (the recommended camera):
   kornia-tidy masks export FOLDER/camera.safetensors -o slm      frames for a modulator
-  kornia-tidy psf FOLDER/camera.safetensors                      its PSFs
+  kornia-tidy psf FOLDER/camera.safetensors --aperture-diameter A --focus-distance Z
+its PSFs, with the aperture and the focus that are printed at the end.
 After Ctrl-C the same command goes on where it stopped (FOLDER/progress.json).
 
 How many electrons? The full well of the pixel if white nearly saturates it. Else roughly
