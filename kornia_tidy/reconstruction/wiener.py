@@ -110,17 +110,18 @@ def transfer_moments(
         (tensor([0.7500]), tensor([0.6250]))
     """
     share = psfs.new_full((len(psfs),), 1 / len(psfs)) if depth_weights is None else depth_weights.to(psfs)
+    share = (share / share.sum())[:, None, None, None]  # no matrix products, which autocast would round
     side = 2 * psfs.shape[-1]
     window = torch.fft.rfft2(psfs, s=(side, side))
-    squared = torch.einsum("d,dcyx->cyx", share, window.real.square() + window.imag.square())
+    squared = (share * (window.real.square() + window.imag.square())).sum(0)
     autocorrelation = torch.fft.fftshift(torch.fft.irfft2(squared, s=(side, side)), (-2, -1))[..., 1:, 1:]
-    mean = transfer_function(torch.einsum("d,dcyx->cyx", share, psfs), size)
+    mean = transfer_function((share * psfs).sum(0), size)
     power = transfer_function(autocorrelation, size).real
     if veil is not None:
-        veil = veil.to(psfs)
-        light = psfs.sum((-2, -1))
-        mean = mean + _at_zero(share @ veil, size)
-        power = power + _at_zero(share @ (veil * (2 * light + veil)), size)
+        veil, light = veil.to(psfs), psfs.sum((-2, -1))
+        added = share[..., 0, 0] * veil
+        mean = mean + _at_zero(added.sum(0), size)
+        power = power + _at_zero((added * (2 * light + veil)).sum(0), size)
     return TransferMoments(mean, power.maximum(mean.real.square() + mean.imag.square()))
 
 

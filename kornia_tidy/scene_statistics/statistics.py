@@ -116,7 +116,7 @@ class SceneStatistics:
         shares = edges.new_tensor(self.depths)
         ends = torch.arange(len(shares) + 1, device=edges.device, dtype=edges.dtype) / len(shares)
         overlap = torch.minimum(edges[1:, None], ends[1:]) - torch.maximum(edges[:-1, None], ends[:-1])
-        return overlap.clamp(min=0) @ (shares / shares.sum()) * len(shares)
+        return (overlap.clamp(min=0) * (shares / shares.sum())).sum(1) * len(shares)
 
 
 def _integral(exponent: float, knee: float) -> float:

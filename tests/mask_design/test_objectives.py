@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, SensorNoise, Spectrum
 from kornia_tidy.mask_design.fisher_information import crlb
 from kornia_tidy.mask_design.objectives import design, design_fisher_mask, point_error, restoration_error
 from kornia_tidy.masks import CubicMask
 from kornia_tidy.masks.initial_heights import fisher_mask
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.scene_statistics import PHOTOGRAPHS, SceneStatistics
 from tests.base import BaseTester
 
 COARSE = Fidelity("coarse", pixel_tolerance=0.1, window=33, stray_light="discard")
@@ -119,17 +120,38 @@ class TestPointError(BaseTester):
 
 
 class TestRestorationError(BaseTester):
-    def test_feature_is_the_error_of_the_best_filter_written_out(self):
+    @pytest.mark.parametrize("veiled", [False, True])
+    def test_feature_is_the_error_of_the_best_filter_written_out(self, veiled):
         """For each frequency in NumPy: the minimum of E|1 - G H|² S + |G|² noise² over complex G."""
-        psfs = torch.rand(3, 7, 7, dtype=torch.float64)
-        psfs /= psfs.sum((1, 2), keepdim=True)
+        scenes = SceneStatistics(2.4, 0.1, mean=0.4, spread=0.3, depths=(0.6, 0.4))
+        bank = bank_of(*0.02 * torch.rand(3, 7, 7, dtype=torch.float64))
+        veil = torch.rand(3, 1, dtype=torch.float64) if veiled else None
         f = np.fft.fftfreq(14)
-        spectrum = 1 / (f[:, None] ** 2 + f**2 + (1 / 64) ** 2)
-        spectrum /= spectrum.mean()
-        transfer = np.fft.fft2(psfs.numpy(), s=(14, 14))
-        best = (transfer.mean(0).conj() * spectrum) / ((np.abs(transfer) ** 2).mean(0) * spectrum + 0.2**2)
-        error = (np.abs(1 - best * transfer) ** 2).mean(0) * spectrum + np.abs(best) ** 2 * 0.2**2
-        assert float(restoration_error(bank_of(*psfs), noise=0.2)) == pytest.approx(error.mean(), rel=1e-9)
+        spectrum = scenes.spectrum(torch.from_numpy(np.hypot(f[:, None], f))).numpy() / 0.3**2
+        spectrum[0, 0] = 0
+        spectrum[0, 0] = 14**2 - spectrum.sum()
+        transfer = np.fft.fft2(bank.psfs[:, 0].numpy(), s=(14, 14))
+        if veil is not None:
+            transfer[:, 0, 0] += veil[:, 0].numpy()
+        share = np.array([0.3, 0.5, 0.2])[:, None, None]
+        mean, power = (share * transfer).sum(0), (share * np.abs(transfer) ** 2).sum(0)
+        best = (mean.conj() * spectrum) / (power * spectrum + 0.2**2)
+        error = (share * np.abs(1 - best * transfer) ** 2).sum(0) * spectrum + np.abs(best) ** 2 * 0.2**2
+        found = restoration_error(PSFBank(bank.psfs, bank.defocus, bank.energy, veil), 0.2, scenes)
+        assert float(found) == pytest.approx(error.mean(), rel=1e-9)
+
+    def test_feature_a_sensor_has_the_noise_at_the_mean_light(self):
+        bank = bank_of(torch.rand(5, 5) / 25)
+        sensor = SensorNoise(0.01, full_well=300)
+        noise = math.sqrt(0.01**2 + PHOTOGRAPHS.mean / 300) / PHOTOGRAPHS.spread
+        assert float(restoration_error(bank, sensor)) == pytest.approx(float(restoration_error(bank, noise)))
+
+    def test_feature_depths_without_pixels_do_not_count(self):
+        sharp, blurred = impulse(), torch.full((9, 9), 1 / 81).double()
+        far = SceneStatistics(2.76, 1 / 344, 0.2, 0.2, depths=(1.0, 0.0, 0.0, 0.0))
+        bank = bank_of(sharp, sharp, blurred)
+        assert float(restoration_error(bank, 1e-3, far)) == pytest.approx(float(restoration_error(bank_of(sharp), 1e-3)))
+        assert float(restoration_error(bank, 1e-3)) > 1e-3
 
     def test_feature_blur_alone_costs_nothing_without_noise_and_change_does(self):
         blur = torch.zeros(9, 9, dtype=torch.float64)

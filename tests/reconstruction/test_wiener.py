@@ -1,0 +1,193 @@
+"""Wiener restoration against NumPy, its optimality, the noise it is told, and its use as a module."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from kornia_tidy import PSFBank, SensorNoise, TiDyOptics
+from kornia_tidy.reconstruction.tikhonov import BORDERS, Preconditioned, tikhonov, transfer_function
+from kornia_tidy.reconstruction.wiener import Wiener, transfer_moments, wiener
+from kornia_tidy.scene_statistics import PHOTOGRAPHS, SceneStatistics
+from tests.base import BaseTester
+from tests.reconstruction.banks import make_bank, make_psfs
+from tests.rounding import gamma
+
+SCENES = SceneStatistics(2.5, 1 / 16, mean=0.4, spread=0.1, depths=(0.7, 0.3))
+borders = pytest.mark.parametrize("border", BORDERS)
+
+
+def shifted(psfs, rows, columns):
+    """Return the transfer functions of PSFs (D, P, P) by NumPy, with their centre at the first pixel."""
+    plane = np.zeros((len(psfs), rows, columns))
+    radius = psfs.shape[-1] // 2
+    for y in range(psfs.shape[-1]):
+        for x in range(psfs.shape[-1]):
+            plane[:, (y - radius) % rows, (x - radius) % columns] += psfs[:, y, x]
+    return np.fft.fft2(plane)
+
+
+class TestTransferMoments(BaseTester):
+    @pytest.mark.parametrize("size", [(12, 15), (9, 8), (4, 3)])
+    @pytest.mark.parametrize("veiled", [False, True])
+    def test_feature_equal_the_moments_of_the_transfer_functions(self, size, veiled, device):
+        psfs, share = make_psfs(4, 2, 7, device=device), torch.tensor([0.1, 0.2, 0.3, 0.4]).double().to(device)
+        veil = torch.rand(4, 2, device=device, dtype=torch.float64) if veiled else None
+        found = transfer_moments(psfs, size, share, veil)
+        transfer = transfer_function(psfs, size, veil)
+        weights = share[:, None, None, None]
+        torch.testing.assert_close(found.mean, (weights * transfer).sum(0))
+        torch.testing.assert_close(found.power, (weights * transfer.abs().square()).sum(0))
+
+    def test_feature_power_is_at_least_that_of_the_mean_in_float32(self):
+        psfs = make_psfs(1, 1, 15, dtype=torch.float32).expand(6, -1, -1, -1)
+        mean, power = transfer_moments(psfs, (64, 64))
+        assert bool((power >= mean.real.square() + mean.imag.square()).all())
+
+
+class TestWiener(BaseTester):
+    @pytest.mark.parametrize("shape", [(12, 15), (9, 8)])
+    def test_feature_is_the_formula_in_numpy(self, shape, device):
+        psfs, share = make_psfs(3, 1, device=device), torch.tensor([0.2, 0.3, 0.5], device=device, dtype=torch.float64)
+        capture = torch.rand(2, 1, *shape, device=device, dtype=torch.float64)
+        transfer = shifted(psfs[:, 0].cpu().numpy(), *shape)
+        weights = share.cpu().numpy()[:, None, None]
+        f = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1]))
+        scene = SCENES.level * (f**2 + SCENES.knee**2) ** -1.25
+        best = (weights * transfer).sum(0).conj() / ((weights * np.abs(transfer) ** 2).sum(0) + 0.03**2 / scene)
+        expected = np.fft.ifft2(np.fft.fft2(capture.cpu().numpy()) * best).real
+        out = wiener(capture, psfs, 0.03, SCENES, depth_weights=share, border="circular")
+        self.assert_close(out.cpu(), torch.from_numpy(expected), rtol=0, atol=1e-9)
+
+    def test_feature_no_tikhonov_filter_has_a_lower_error_on_such_scenes(self, device):
+        """The expected error over scenes, noise and two depths, from the responses to an impulse."""
+        psfs = make_psfs(2, 1, 9, peak=0.1, device=device)
+        size, noise = (48, 48), 0.02
+        impulse = torch.zeros(1, 1, *size, device=device, dtype=torch.float64)
+        impulse[..., 0, 0] = 1
+        down, across = (torch.fft.fftfreq(48, device=device).double() for _ in range(2))
+        scene = SCENES.spectrum(torch.hypot(down[:, None], across))
+        transfer = torch.from_numpy(shifted(psfs[:, 0].cpu().numpy(), *size)).to(device)
+
+        def error(response):
+            gain = torch.fft.fft2(response)[0, 0]
+            return float(((1 - gain * transfer).abs().square().mean(0) * scene + gain.abs().square() * noise**2).mean())
+
+        ours = error(wiener(impulse, psfs, noise, SCENES, border="circular"))
+        others = [
+            error(tikhonov(impulse, psfs.mean(0), weight, prior=prior, border="circular"))
+            for weight in (1e-4, 1e-3, 1e-2, 0.1, 1.0)
+            for prior in (None, impulse)
+        ]
+        changed = [
+            error(wiener(impulse, psfs, sigma, SCENES, border="circular")) for sigma in (0.8 * noise, 1.25 * noise)
+        ]
+        assert ours < 0.98 * min(others)
+        assert ours < min(changed)
+
+    @borders
+    def test_feature_white_stays_white(self, border, device):
+        """To sigma^2 / S(0) and the rounding of transforms: 10 products of magnitude below 2 at each frequency."""
+        bank = make_bank(3, 2, 9, device=device)
+        white = torch.ones(1, 2, 40, 33, device=device, dtype=torch.float64)
+        lost = 0.03**2 / float(PHOTOGRAPHS.spectrum(torch.zeros(()).double()))
+        out = Wiener(0.03, border=border)(white, bank)
+        # Depth-dependent PSFs of equal light: nothing else is lost.
+        self.assert_close(out, white, rtol=0, atol=1.01 * lost + 100 * gamma(40, torch.float64))
+
+    @pytest.mark.parametrize("batch", [1, 3])
+    @borders
+    def test_cardinality(self, batch, border, device, dtype):
+        capture = torch.rand(batch, 2, 12, 9, device=device, dtype=dtype)
+        out = Wiener(border=border)(capture, make_bank(device=device, dtype=torch.float32))
+        assert out.shape == capture.shape
+        assert out.dtype == dtype
+
+    def test_feature_autocast_changes_nothing(self, device):
+        capture, bank = torch.rand(1, 2, 12, 9, device=device), make_bank(device=device, dtype=torch.float32)
+        expected = Wiener()(capture, bank)
+        with torch.autocast(device.type, dtype=torch.bfloat16):
+            assert torch.equal(Wiener()(capture, bank), expected)
+
+    def test_gradcheck(self, device):
+        capture, psfs = torch.rand(1, 2, 7, 6, device=device), make_psfs(2, 2, 3, device=device)
+        sigma = torch.tensor([0.05, 0.1], device=device).view(1, 2, 1, 1)
+        self.gradcheck(lambda c, p, s: wiener(c, p, s, SCENES), (capture, psfs, sigma))
+
+    def test_feature_gradients_are_finite_without_light(self, device):
+        psfs = torch.zeros(2, 1, 3, 3, device=device, requires_grad=True)
+        bank = PSFBank(psfs, torch.arange(2.0, device=device), torch.zeros(2, 1, device=device))
+        module = Wiener().to(device)
+        out = module(torch.zeros(1, 1, 6, 6, device=device), bank)
+        assert (out == 0).all()
+        for gradient in torch.autograd.grad(out.sum(), [psfs, module.log_weight]):
+            assert gradient.isfinite().all()
+
+    def test_exception(self, device):
+        capture, psfs = torch.rand(1, 2, 8, 8, device=device), make_psfs(device=device)
+        with pytest.raises(ValueError, match="noise must be a standard deviation of at least 0 .* got -0.1"):
+            wiener(capture, psfs, -0.1)
+        with pytest.raises(ValueError, match=r"noise must be .* got nan"):
+            Wiener(math.nan)
+        with pytest.raises(ValueError, match=r"\(D, 1, P, P\) with P odd for a capture of 1 channels, got \(3, 2, 5"):
+            wiener(capture[:, :1], psfs, 0.1)
+        with pytest.raises(ValueError, match=r"psfs must have shape \(D, C, P, P\), got \(2, 5, 5\)"):
+            wiener(capture, psfs[0], 0.1)
+        with pytest.raises(ValueError, match=r"capture must have shape \(B, C, H, W\), got \(2, 8, 8\)"):
+            wiener(capture[0], psfs, 0.1)
+        with pytest.raises(ValueError, match="border must be one of 'smooth', 'circular', got 'valid'"):
+            wiener(capture, psfs, 0.1, border="valid")
+        with pytest.raises(TypeError, match="statistics must be SceneStatistics such as PHOTOGRAPHS"):
+            Wiener(0.1, statistics=2.0)
+
+
+class TestModule(BaseTester):
+    def test_feature_is_the_function_with_depths_weighted_by_the_statistics(self, device):
+        capture, bank = torch.rand(2, 2, 12, 9, device=device), make_bank(4, device=device)
+        share = SCENES.depth_weights(bank.defocus)
+        assert share[0] > share[-1]
+        expected = wiener(capture, bank.psfs, 0.02, SCENES, depth_weights=share)
+        self.assert_close(Wiener(0.02, SCENES)(capture, bank), expected, rtol=0, atol=1e-6)
+        flipped = wiener(capture, bank.psfs.flip((-2, -1)), 0.02, SCENES, depth_weights=share)
+        self.assert_close(Wiener(0.02, SCENES, correlate=True)(capture, bank), flipped, rtol=0, atol=1e-6)
+
+    def test_feature_a_sensor_gives_the_noise_at_the_mean_light_of_each_channel(self, device):
+        capture, bank = torch.rand(2, 2, 12, 9, device=device), make_bank(device=device, dtype=torch.float32)
+        capture[:, 1] *= 0.1
+        sensor = SensorNoise(0.01, full_well=200)
+        noise = sensor.std(capture.mean((-2, -1), keepdim=True))
+        assert float(noise[0, 0] / noise[0, 1]) > 2
+        self.assert_close(Wiener(sensor)(capture, bank), wiener(capture, bank.psfs, noise, depth_weights=None), atol=0.2)
+        same = Wiener(0.5)(capture, bank, noise)
+        self.assert_close(Wiener(sensor)(capture, bank), same, rtol=0, atol=1e-6)
+
+    def test_feature_each_image_of_a_batch_may_have_its_own_noise(self, device):
+        capture, bank = torch.rand(2, 2, 12, 9, device=device), make_bank(device=device, dtype=torch.float32)
+        both = Wiener()(capture, bank, torch.tensor([0.001, 0.3], device=device).view(2, 1, 1, 1))
+        for index, sigma in enumerate((0.001, 0.3)):
+            self.assert_close(both[index], Wiener(sigma)(capture, bank)[index], rtol=0, atol=1e-6)
+
+    def test_feature_the_weight_is_learnt_as_a_logarithm(self, device):
+        module = Wiener(0.1, weight=0.5).to(device)
+        capture, bank = torch.rand(1, 2, 12, 9, device=device), make_bank(device=device, dtype=torch.float32)
+        module(capture, bank).square().sum().backward()
+        assert module.log_weight.grad.isfinite()
+        assert module.log_weight.grad != 0
+        assert list(module.state_dict()) == ["log_weight"]
+        self.assert_close(module(capture, bank), Wiener(0.1 * 0.5**0.5)(capture, bank), rtol=0, atol=1e-5)
+
+    def test_feature_gradients_reach_the_masks_through_a_head(self, device):
+        optics = TiDyOptics(fidelity="draft").to(device)
+        head = Preconditioned(nn.Conv2d(6, 1, 1), Wiener()).to(device)
+        head(torch.rand(1, 3, 24, 20, device=device), optics.psf_bank()).square().mean().backward()
+        assert optics.masks.phase.grad.abs().max() > 0
+
+    def test_dynamo(self, device):
+        module, bank = Wiener(SensorNoise(0.01)).to(device), make_bank(device=device, dtype=torch.float32)
+        capture = torch.rand(1, 2, 12, 9, device=device)
+        compiled = torch.compile(module, fullgraph=True, backend="eager")
+        self.assert_close(compiled(capture, bank), module(capture, bank), atol=0, rtol=0)
