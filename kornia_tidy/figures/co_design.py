@@ -69,15 +69,15 @@ def _search(axes: Axes, design: CoDesign) -> None:
     for start, marker in MARKERS.items():
         own = sorted((one for one in design.candidates if one.start == start), key=lambda one: one.f_number)
         if own:
-            values = [one.depth_error if by_depth else one.lost for one in own]
+            values = [one.depth_error if by_depth else one.image_error for one in own]
             color = FAINT if start == FLAT else ACCENT
             label = start if start == FLAT else f"masks, {start}"
             stops = [one.f_number for one in own]
             axes.plot(stops, values, linestyle="", marker=marker, markersize=4.5, color=color, label=label)
     axes.set_yscale("log")
     _f_numbers(axes, [one.f_number for one in design.candidates])
-    axes.set_title("Search: " + ("depth bound" if by_depth else "share of variance lost"), fontsize=TITLE, color=INK)
-    axes.set_ylabel("of the range" if by_depth else "after linear restoration", fontsize=LABEL, color=INK)
+    axes.set_title("Search: " + ("depth bound" if by_depth else "restoration error"), fontsize=TITLE, color=INK)
+    axes.set_ylabel("of the range" if by_depth else "relative to a uniform image", fontsize=LABEL, color=INK)
     open_chart(axes, LABEL)
     axes.legend(fontsize=SMALL, frameon=False)
 

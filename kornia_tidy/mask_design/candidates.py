@@ -38,7 +38,7 @@ class Candidate:
         start: ``"flat lens"``, or what its masks started from.
         f_number: focal length over aperture diameter.
         focus: in focus, as a fraction of the range of inverse depth, 0 at the far end.
-        lost: share of the scenes' variance that the best linear restoration loses, see
+        image_error: error of the best linear restoration, NaN if the image has no weight; see
             :func:`~kornia_tidy.mask_design.objectives.restoration_error`.
         depth_error: bound on the RMSE of a point's inverse depth, as a fraction of the range; NaN if depth has no
             weight.
@@ -49,7 +49,7 @@ class Candidate:
     start: str
     f_number: float
     focus: float
-    lost: float
+    image_error: float
     depth_error: float
     cost: float
     phase: Tensor | None
@@ -82,9 +82,9 @@ def search_lens(task: DesignTask, masks: PixelwiseMask | None, f_number: float, 
 def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, Tensor, Tensor]:
     r"""Return what a co-design minimises, and its two parts.
 
-    .. math:: 10 \log_{10} \left( L^{1 - w} E^{2 w} \right)
+    .. math:: 10 \log_{10} \left( R^{1 - w} E^{2 w} \right)
 
-    L is :func:`~kornia_tidy.mask_design.objectives.restoration_error`, E is :func:`depth_bound`, w the weight of depth.
+    R is :func:`~kornia_tidy.mask_design.objectives.restoration_error`, E is :func:`depth_bound`, w the weight of depth.
 
     Args:
         task: light, statistics of the scenes and weight.
@@ -92,13 +92,13 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
         f_number: of the lens.
 
     Returns:
-        Cost in dB, L and E, each 0-dimensional. What has no weight is NaN.
+        Cost in dB, R and E, each 0-dimensional. What has no weight is NaN.
     """
     weight, unknown = task.depth_weight, torch.tensor(math.nan)
-    lost = restoration_error(lens.psf_bank(), task.sensor(f_number), task.statistics) if weight < 1 else unknown
+    error = restoration_error(lens.psf_bank(), task.sensor(f_number), task.statistics) if weight < 1 else unknown
     bound = depth_bound(task, lens, f_number) if weight > 0 else unknown
-    parts = [lost.log10() * (10 * (1 - weight))] * (weight < 1) + [bound.log10() * (20 * weight)] * (weight > 0)
-    return torch.stack([part.float() for part in parts]).sum(), lost, bound
+    parts = [error.log10() * (10 * (1 - weight))] * (weight < 1) + [bound.log10() * (20 * weight)] * (weight > 0)
+    return torch.stack([part.float() for part in parts]).sum(), error, bound
 
 
 def depth_bound(task: DesignTask, lens: PSFModel, f_number: float) -> Tensor:
@@ -127,8 +127,8 @@ def flat_candidate(task: DesignTask, f_number: float, focus: float) -> Candidate
         True
     """
     with torch.no_grad():
-        cost, lost, depth = map(float, cost_of(task, search_lens(task, None, f_number, focus), f_number))
-    return Candidate(FLAT, f_number, focus, lost, depth, cost, None)
+        cost, error, depth = map(float, cost_of(task, search_lens(task, None, f_number, focus), f_number))
+    return Candidate(FLAT, f_number, focus, error, depth, cost, None)
 
 
 def coded_candidate(
@@ -153,7 +153,7 @@ def coded_candidate(
 
     Example:
         >>> masks = coded_candidate(DesignTask(masks=2), "focal sweep", 35.0, 0.5, steps=2)
-        >>> masks.phase.shape, masks.lost < 1
+        >>> masks.phase.shape, masks.image_error < 1
         (torch.Size([2, 23, 23]), True)
     """
     phase = initial_phase(task, start, f_number, focus, seed) if isinstance(start, str) else start
@@ -167,9 +167,9 @@ def coded_candidate(
 
     design(masks, objective, steps, LEARNING_RATE)
     with torch.no_grad():
-        cost, lost, depth = map(float, cost_of(task, lens, f_number))
+        cost, error, depth = map(float, cost_of(task, lens, f_number))
     name = start if isinstance(start, str) else "refined"
-    return Candidate(name, f_number, focus, lost, depth, cost, masks.phase.detach().clone())
+    return Candidate(name, f_number, focus, error, depth, cost, masks.phase.detach().clone())
 
 
 def initial_phase(task: DesignTask, start: str, f_number: float, focus: float, seed: int = 0) -> Tensor:

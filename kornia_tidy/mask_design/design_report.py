@@ -106,10 +106,10 @@ def report_markdown(design: CoDesign) -> str:
         "",
         "## Search",
         "",
-        "Share of the scenes' variance that the best linear restoration loses; bound on the error of a point's inverse "
-        "depth, as a fraction of the range.",
+        "Error of the best linear restoration with one filter for all depths, by the statistics of scenes, relative to a "
+        "uniform image; bound on the error of a point's inverse depth, as a fraction of the range.",
         "",
-        "| start | f-number | focus, m | variance lost | depth bound |",
+        "| start | f-number | focus, m | restoration error | depth bound |",
         "|---|---|---|---|---|",
         *(_candidate_row(task, one) for one in sorted(design.candidates, key=lambda one: one.cost)),
         "",
@@ -125,7 +125,7 @@ def _candidate_data(task: DesignTask, one: Candidate) -> dict[str, Any]:
         "start": one.start,
         "f_number": one.f_number,
         "focus_m": _known(focus_distance(task, one)),
-        "variance_lost": _known(one.lost),
+        "restoration_error": _known(one.image_error),
         "depth_bound": _known(one.depth_error),
         "cost_dB": one.cost,
     }
@@ -149,7 +149,7 @@ def _finalist_row(task: DesignTask, one: Finalist, is_best: bool) -> str:
 
 def _candidate_row(task: DesignTask, one: Candidate) -> str:
     return (
-        f"| {one.start} | {one.f_number:.3g} | {focus_distance(task, one):.3g} | {_number(one.lost, '.4f')} | "
+        f"| {one.start} | {one.f_number:.3g} | {focus_distance(task, one):.3g} | {_number(one.image_error, '.4f')} | "
         f"{_number(one.depth_error, '.2g')} |"
     )
 

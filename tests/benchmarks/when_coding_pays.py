@@ -86,8 +86,8 @@ def row_of(design: CoDesign) -> dict[str, Any]:
         "flat_score": verdict.flat.score,
         "coded_f_number": verdict.coded.candidate.f_number,
         "coded_score": verdict.coded.score,
-        "lost_flat": _finite(min(one.lost for one in design.candidates if one.is_flat)),
-        "lost_coded": _finite(min(one.lost for one in design.candidates if not one.is_flat)),
+        "flat_error": _finite(min(one.image_error for one in design.candidates if one.is_flat)),
+        "coded_error": _finite(min(one.image_error for one in design.candidates if not one.is_flat)),
     }
 
 

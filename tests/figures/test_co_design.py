@@ -12,8 +12,8 @@ from tests.base import BaseTester
 
 FLAT_50 = Candidate(FLAT, 50.0, 0.5, 0.0210, math.nan, -16.8, None)
 CODED = [
-    Candidate("focal sweep", f, 0.5, lost, math.nan, -18.0, torch.rand(2, 23, 23))
-    for f, lost in ((22, 0.014), (25, 0.015))
+    Candidate("focal sweep", f, 0.5, error, math.nan, -18.0, torch.rand(2, 23, 23))
+    for f, error in ((22, 0.014), (25, 0.015))
 ]
 
 

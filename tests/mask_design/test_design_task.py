@@ -51,8 +51,8 @@ class TestDesignTask(BaseTester):
         """The geometric estimate is right to within one stop."""
         task = DesignTask(depth_range=depth_range, electrons=1e7, read_noise_electrons=0.1)
         stops = [step / 4 for step in range(-8, 9)]
-        lost = {stop: flat_candidate(task, task.balanced_f_number * 2**stop, 0.5).lost for stop in stops}
-        assert abs(min(lost, key=lambda stop: lost[stop])) <= 0.5
+        errors = {stop: flat_candidate(task, task.balanced_f_number * 2**stop, 0.5).image_error for stop in stops}
+        assert abs(min(errors, key=lambda stop: errors[stop])) <= 0.5
 
     def test_feature_the_grid_of_f_numbers_is_half_stops_around_the_balanced_one(self):
         task = DesignTask()
