@@ -63,7 +63,7 @@ at a quantum efficiency of one half: 17,000 lux (day, in the shade) for 33 ms on
 pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
 
 examples:
-  The camera of the paper in bright light, in about a minute:
+  The camera of the paper in bright light, a first answer:
     kornia-tidy design --quick
   A range of 0.5 to 4 m in dim light, with a modulator of 8 bits that takes 4 ms:
     kornia-tidy design --depth-range 0.5 4 --electrons 5000 --bits 8 \\
@@ -90,7 +90,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "-o", "--output", default="outputs/design", metavar="FOLDER", help="made if missing (default: outputs/design)"
     )
-    parser.add_argument("--quick", action="store_true", help="fewer steps and scenes: a first answer")
+    parser.add_argument("--quick", action="store_true", help="fewer steps and scenes: a first answer, in 20 s on one core")
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of all that is random (default: 0)")
 
     default = DesignTask()

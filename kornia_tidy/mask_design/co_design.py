@@ -56,7 +56,7 @@ class Effort:
 
     @classmethod
     def quick(cls) -> Effort:
-        """Return a search of about a minute: less optimised masks, and a larger standard error."""
+        """Return a shorter search, 20 s on one core: masks are optimised less, and the standard error is larger."""
         return cls(coarse_steps=12, steps=30, starts=STARTS[:2], scenes=12, size=192)
 
 
@@ -103,7 +103,7 @@ def co_design(
         task: scene, lens, light, modulator, and what matters.
         scenes: captured in the decision beside dead leaves, at least 97 pixels a side; depths beyond the task's range
             are moved to its ends. Half of all scenes choose the settings, the other half decide.
-        effort: extent of the search. Default: :class:`Effort`, some minutes on one core.
+        effort: extent of the search. Default: :class:`Effort`.
         seed: of starts, scenes and noise. The same seed gives the same result on the same machine.
         progress_file: keeps designed masks and scores as JSON, so that an interrupted design goes on where it stopped.
             A file of another task, effort, seed or other scenes is replaced. Default: nothing is kept.
