@@ -39,8 +39,8 @@ the two is ahead depends on the light and on the range of depths.
 Everything is compared at the same exposure time: light is given as the electrons of a
 white pixel at one f-number, and falls with the square of the f-number.
 
-  search    flat lenses and masks at f-numbers half a stop apart, by the error of the best
-            linear restoration (and the Cramer-Rao bound on depth); masks start from a
+  search    flat lenses and masks at f-numbers one stop apart, by the error of the best linear
+            restoration (and the Cramer-Rao bound on depth); masks start from a
             focal sweep, a Fisher mask and noise, and see the modulator's switching and
             grey levels
   captures  the best of both take pictures of scenes (dead leaves, and yours), which the
@@ -90,7 +90,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "-o", "--output", default="outputs/design", metavar="FOLDER", help="made if missing (default: outputs/design)"
     )
-    parser.add_argument("--quick", action="store_true", help="fewer steps and scenes: a first answer, in 20 s on one core")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer steps and scenes: a first answer, in 20 s on one core"
+    )
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of all that is random (default: 0)")
 
     default = DesignTask()

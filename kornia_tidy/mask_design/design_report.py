@@ -106,8 +106,8 @@ def report_markdown(design: CoDesign) -> str:
         "",
         "## Search",
         "",
-        "Error of the best linear restoration with one filter for all depths, by the statistics of scenes, relative to a "
-        "uniform image; bound on the error of a point's inverse depth, as a fraction of the range.",
+        "Error of the best linear restoration with one filter for all depths, by the statistics of scenes, relative to "
+        "a uniform image; bound on the error of a point's inverse depth, as a fraction of the range.",
         "",
         "| start | f-number | focus, m | restoration error | depth bound |",
         "|---|---|---|---|---|",

@@ -106,7 +106,7 @@ class DesignTask:
         return self.focal_length * math.sqrt(half / (_PER_FOCAL_LENGTH * REFERENCE_WAVELENGTH))
 
     def f_numbers(self) -> tuple[float, ...]:
-        """Return the coarse grid of f-numbers: two stops wider to one stop slower than balanced, in half stops.
+        """Return the coarse grid of f-numbers: from four stops wider to one stop slower than balanced, a stop apart.
 
         A stop is a factor of sqrt 2, which halves the light.
         """

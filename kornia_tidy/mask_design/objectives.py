@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -92,31 +93,43 @@ def point_error(bank: PSFBank) -> Tensor:
 def restoration_error(
     bank: PSFBank, noise: float | SensorNoise = 0.05, statistics: SceneStatistics = PHOTOGRAPHS
 ) -> Tensor:
-    r"""Return the mean squared error of restoration by one Wiener filter for all depths.
+    r"""Return the mean squared error, in sRGB, of restoration by one Wiener filter for all depths.
 
-    .. math:: \sum_f S_f \left( 1 - \frac{|\langle H_f \rangle|^2}{\langle |H_f|^2 \rangle + \sigma^2 / S_f} \right)
-        \Big/ \sum_f S_f
+    .. math:: G_f = \frac{\bar{\langle H_f \rangle}}{\langle |H_f|^2 \rangle + \sigma^2 / S_f}, \qquad
+              u_d = \mathcal{F}^{-1} [G H_d - 1], \qquad
+              \sum_f S_f \langle |\mathcal{F}[w u_d]_f|^2 \rangle + m^2 \langle (w - 1) u_d \rangle^2
+              + \sum_r g_r^2 \, (\sigma_r^2 + \sigma_s^2 \, (w * \langle h \rangle)_r)
 
-    H is the transfer function, :math:`\langle\rangle` the mean over the distribution of depth, and S the power spectrum
-    of the scenes. The error is low if H is large, so that noise is not amplified, and if it depends little on depth, so
-    that one filter fits all depths. A small PSF at one depth only does not suffice, nor does a large PSF that is the
-    same at all depths.
+    H is the transfer function of the PSF h, :math:`\langle\rangle` the mean over the distribution of depth, S the power
+    spectrum of the scenes and m their mean light, g the impulse response of the filter G, and :math:`\sigma_r^2` and
+    :math:`\sigma_s^2` the variances of read noise and of shot noise at the mean light. The weight w is
+    :meth:`~kornia_tidy.scene_statistics.SceneStatistics.light_around`. With w = 1 this is the error in linear light,
+    :math:`\sum_f S_f (1 - |\langle H_f \rangle|^2 / (\langle |H_f|^2 \rangle + \sigma^2 / S_f))`.
+
+    The error is low if H is large, so that noise is not amplified, and if it depends little on depth, so that one
+    filter fits all depths. A small PSF at one depth only does not suffice, nor does a large PSF that is the same at all
+    depths. What the filter leaves far from a point, a halo, counts more than what it leaves near to it: halos of bright
+    objects show on dark ones.
 
     Args:
         bank: PSFs of a lens whose fidelity discards stray light or spreads it over the image; the result is the mean
-            over its channels.
-        noise: the sensor, whose noise at the scenes' mean light is taken; or the standard deviation of the noise as a
-            fraction of that of the scene.
-        statistics: of the scenes: spectrum, light and distribution of depth over the nodes of the bank.
+            over its channels. Windows that cut off much of the light, or are renormalised, give errors too low.
+        noise: the sensor, with its shot and read noise; or the standard deviation of noise that is the same in all
+            pixels, as a fraction of the standard deviation of the scenes' light.
+        statistics: of the scenes. Their distribution of depth is spread over the nodes of the bank.
 
     Returns:
-        Fraction of the scene's variance, between 0 and 1, 0-dimensional.
+        Fraction of the error of an image that has the scenes' mean everywhere, 0-dimensional.
 
     Raises:
         ValueError: if the noise is not positive.
 
+    Convention:
+        - Errors in sRGB are those in linear light times the slope of the curve; clipping is not included.
+
     Source: Diaz, Goudail, Loiseaux and Huignard, Optics Letters 34(19) 2970 (2009), for the error after one filter as
-    an objective of mask design.
+    an objective of mask design. The weight is our own: if the logarithm of light is a Gaussian process, and the slope a
+    power of light, the mean of squared slope times squared error factorises in this way exactly.
 
     Example:
         >>> point = torch.zeros(2, 1, 9, 9)
@@ -125,28 +138,57 @@ def restoration_error(
         >>> bool(restoration_error(bank, noise=1e-3) < 1e-4)
         True
     """
-    variance = _noise_variance(noise, statistics)
+    read, shot = _noise_variances(noise, statistics)
     size = 2 * bank.window
-    scene = statistics.cell_power(size).to(bank.psfs.device) / statistics.spread**2
+    precise = torch.promote_types(bank.psfs.dtype, torch.float32)
+    scene = statistics.cell_power(size).to(bank.psfs.device)
     count = torch.full_like(scene, 2.0)  # the real transform omits the conjugate frequencies
     count[:, 0] = count[:, -1] = 1
-    noise_ratio = variance * count / size**2 / scene.clamp(min=torch.finfo(scene.dtype).tiny)
-    transfer = torch.fft.rfft2(bank.psfs.to(torch.promote_types(bank.psfs.dtype, torch.float32)), s=(size, size))
+    noise_ratio = (read + shot) * count / size**2 / scene.clamp(min=torch.finfo(scene.dtype).tiny)
+    transfer = torch.fft.rfft2(bank.psfs.to(precise), s=(size, size))
     if bank.veil is not None:
         transfer = transfer + functional.pad(bank.veil[..., None, None], (0, size // 2, 0, size - 1))
-    share = statistics.depth_weights(bank.defocus).to(transfer.real)[:, None, None, None]
+    share = statistics.depth_weights(bank.defocus).to(precise)[:, None, None, None]
     mean = (share * transfer).sum(0)
-    power = (share * (transfer.real.square() + transfer.imag.square())).sum(0)
-    restored = (mean.real.square() + mean.imag.square()) / (power + noise_ratio.to(power))
-    return (scene.to(power) * (1 - restored)).sum((-2, -1)).mean()
+    gain = mean.conj() / ((share * _squared(transfer)).sum(0) + noise_ratio.to(precise))
+    around = _light_around(statistics, size).to(bank.psfs.device, precise)
+
+    left = torch.fft.irfft2(gain * transfer - 1, s=(size, size))
+    power = (scene.to(precise) * _squared(torch.fft.rfft2(left * around)) * share).sum((0, 2, 3))
+    shade = statistics.mean * (left * (around - 1)).sum((-2, -1), keepdim=True)
+    light = torch.fft.irfft2(torch.fft.rfft2(around) * mean.conj(), s=(size, size))
+    noise_left = (torch.fft.irfft2(gain, s=(size, size)).square() * (read + shot * light)).sum((-2, -1))
+    # Of the scene's mean everywhere: nothing but the point itself is left.
+    black = (statistics.spread * statistics.shade) ** 2 + (statistics.mean * (1 - statistics.shade)) ** 2
+    return (power + (share * shade.square()).sum((0, 2, 3)) + noise_left).mean() / black
 
 
-def _noise_variance(noise: float | SensorNoise, statistics: SceneStatistics) -> float:
-    """Return the variance of the noise as a fraction of that of the scene."""
-    if isinstance(noise, SensorNoise):  # its variance is linear in the light, so that at the mean is the mean one
-        noise = float(noise.std(torch.tensor(statistics.mean, dtype=torch.float64))) / statistics.spread
-    check_positive("noise", noise)
-    return noise**2
+class _Variances(NamedTuple):
+    """Variance of the noise in units of the square of full scale."""
+
+    read: float
+    """In all pixels alike."""
+    shot: float
+    """At the mean light, and in proportion to light elsewhere."""
+
+
+def _noise_variances(noise: float | SensorNoise, statistics: SceneStatistics) -> _Variances:
+    if not isinstance(noise, SensorNoise):
+        check_positive("noise", noise)
+        return _Variances((noise * statistics.spread) ** 2, 0.0)
+    dark, mean = noise.std(torch.tensor([0.0, statistics.mean], dtype=torch.float64)).square().tolist()
+    check_positive("noise of the sensor", mean)
+    return _Variances(dark, mean - dark)
+
+
+def _light_around(statistics: SceneStatistics, size: int) -> Tensor:
+    """Return the light around a pixel at the corner of a periodic plane, (N, N) float64."""
+    offset = torch.fft.fftfreq(size, 1 / size, dtype=torch.float64)
+    return statistics.light_around(torch.hypot(offset[:, None], offset))
+
+
+def _squared(spectrum: Tensor) -> Tensor:
+    return spectrum.real.square() + spectrum.imag.square()
 
 
 def design_fisher_mask(

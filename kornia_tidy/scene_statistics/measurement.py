@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from kornia.color import rgb_to_linear_rgb
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
@@ -17,6 +17,8 @@ from kornia_tidy.scene_statistics.statistics import SceneStatistics
 DEPTH_PARTS = 8
 BINS = 24  # of frequency, equally wide on a logarithmic scale
 LOWEST = 4.0  # periods of the lowest fitted frequency within a picture; the window widens lines to 2
+ERROR = 0.02  # of linear light, over which the slope of the sRGB curve is taken; a typical error after restoration
+DISTANCES = (4, 8, 16, 32, 64)  # pixels at which light around dark pixels is compared
 TRIMMED = 0.005  # share of pixels beyond either end of a scene's range of depths
 
 
@@ -45,8 +47,8 @@ def measured_statistics(
         source: note on the origin of the numbers.
 
     Returns:
-        Mean and variance over all pixels of a picture, averaged over pictures and channels, and the distribution of
-        depth over each scene's own range of dioptres.
+        Mean and variance over all pixels of a picture, averaged over pictures and channels, the light around dark
+        pixels, and the distribution of depth over each scene's own range of dioptres.
 
     Raises:
         TypeError: if an image or a depth map is not a floating-point tensor.
@@ -68,8 +70,9 @@ def measured_statistics(
     if not variance > 0:
         raise ValueError(f"images must have contrast, got {len(images)} without any")
     exponent, knee = fitted_power_law(radial_spectrum(light), variance)
+    shade, shade_size = fitted_shade(light)
     shares = (1.0,) if depths is None else depth_shares(depths)
-    return SceneStatistics(exponent, knee, mean, math.sqrt(variance), shares, source)
+    return SceneStatistics(exponent, knee, mean, math.sqrt(variance), shade, shade_size, shares, source)
 
 
 def linear_light(image: Tensor) -> Tensor:
@@ -112,7 +115,7 @@ def _periodogram(light: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fitted_power_law(spectrum: RadialSpectrum, variance: float) -> tuple[float, float]:
-    """Return exponent and knee of the power law through a spectrum whose integral is the variance.
+    """Fit a power law to a spectrum and return its exponent and knee; its integral is the variance.
 
     For each knee the exponent is fitted by least squares in logarithms. A smaller knee adds power at low frequencies;
     the one that adds up to the variance is found by bisection.
@@ -144,6 +147,46 @@ def fitted_power_law(spectrum: RadialSpectrum, variance: float) -> tuple[float, 
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return fit((low + high) / 2)[0], math.exp((low + high) / 2)
+
+
+def fitted_shade(light: Sequence[Tensor]) -> tuple[float, float]:
+    """Return ``shade`` and ``shade_size`` of pictures, see :meth:`SceneStatistics.light_around`.
+
+    The light around is measured along rows and columns, up to a quarter of the smaller side of a picture.
+
+    Args:
+        light: (C, H, W) each, linear light.
+
+    Returns:
+        Fraction of the mean of light, at most 1, and distance in pixels.
+    """
+    around: dict[int, list[float]] = {0: [], **{distance: [] for distance in DISTANCES}}
+    for each in light:
+        counts = _squared_slope(each)
+        for distance, found in around.items():
+            if 4 * distance <= min(each.shape[-2:]):
+                found.append(_light_at(distance, counts, each))
+    means = {distance: sum(found) / len(found) for distance, found in around.items() if found}
+    shade = min(means.pop(0), 1.0)
+    sizes = np.geomspace(0.5, 4096, 2000)
+    model = 1 - (1 - shade) * np.exp(-((np.array(list(means))[:, None] / sizes) ** 0.75))
+    misfit = ((model - np.array(list(means.values()))[:, None]) ** 2).sum(0)
+    return shade, float(sizes[misfit.argmin()])
+
+
+def _squared_slope(light: Tensor) -> Tensor:
+    ends = [linear_rgb_to_rgb((light + change).expand(3, -1, -1)[None].clamp(0, 1))[0] for change in (ERROR, -ERROR)]
+    return ((ends[0] - ends[1]) / (2 * ERROR)).square()
+
+
+def _light_at(distance: int, counts: Tensor, light: Tensor) -> float:
+    """Return the light at a distance from pixels weighted by ``counts``, as a fraction of the mean of light."""
+    ratios = []
+    for a, x in ((counts, light), (counts.mT, light.mT)):
+        side = a.shape[-1] - distance
+        for first, second in ((a[..., :side], x[..., distance:]), (a[..., distance:], x[..., :side])):
+            ratios.append((first * second).mean((-2, -1)) / (first.mean((-2, -1)) * second.mean((-2, -1))))
+    return float(torch.stack(ratios).nan_to_num(1.0).mean())
 
 
 def depth_shares(depths: Sequence[Tensor], parts: int = DEPTH_PARTS) -> tuple[float, ...]:

@@ -26,6 +26,10 @@ class SceneStatistics:
         knee: :math:`f_0` in cycles per pixel, positive: below it the spectrum is flat.
         mean: mean of light.
         spread: standard deviation :math:`\sigma` of light within a picture.
+        shade: mean light of the pixels in which errors show, as a fraction of the mean of light, see
+            :meth:`light_around`. 1 counts errors in linear light; less counts them in sRGB, which shows errors of dark
+            pixels.
+        shade_size: distance in pixels over which the light around such pixels rises to the mean.
         depths: share of pixels in each of several equally wide parts of a scene's range of dioptres, from the farthest
             to the nearest. Default: all depths alike.
         source: where the numbers come from.
@@ -45,12 +49,14 @@ class SceneStatistics:
     knee: float
     mean: float
     spread: float
+    shade: float = 1.0
+    shade_size: float = 64.0
     depths: tuple[float, ...] = (1.0,)
     source: str = ""
     level: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("exponent", "knee", "mean", "spread"):
+        for name in ("exponent", "knee", "mean", "spread", "shade", "shade_size"):
             check_positive(name, getattr(self, name))
         if not self.depths or min(self.depths) < 0 or abs(sum(self.depths) - 1) > 1e-3:
             raise ValueError(f"depths must be shares of pixels that add up to 1, got {self.depths}")
@@ -93,6 +99,28 @@ class SceneStatistics:
         power[0, 0] = 0
         power[0, 0] = (self.spread**2 - power.sum()).clamp(min=0)
         return power
+
+    def light_around(self, distance: Tensor) -> Tensor:
+        r"""Return the mean light at a distance from pixels in which errors show, as a fraction of the mean of light.
+
+        .. math:: w(r) = \frac{\langle a(x_p) \, x_{p+r} \rangle}{\langle a \rangle \langle x \rangle}
+                  \approx 1 - (1 - w_0) \, e^{-(r / r_0)^{3/4}}
+
+        a is the squared slope of the sRGB curve, the factor by which an error in linear light counts. It is large in
+        dark pixels, and light near to them is dim too. So what a pixel gets from far away, as from the halo of a wide
+        PSF, counts more than what it gets from its neighbours.
+
+        Args:
+            distance: r in pixels, any shape.
+
+        Returns:
+            Fraction of the mean of light, same shape and dtype; ``shade`` at 0, 1 at infinity.
+
+        Example:
+            >>> PHOTOGRAPHS.light_around(torch.tensor([0.0, 8.0, 64.0])).round(decimals=2)
+            tensor([0.2900, 0.4100, 0.7100])
+        """
+        return 1 - (1 - self.shade) * torch.exp(-((distance / self.shade_size) ** 0.75))
 
     def depth_weights(self, defocus: Tensor) -> Tensor:
         """Return the share of pixels nearest to each node of defocus, where the nodes span the range of the scenes.
@@ -140,9 +168,11 @@ PHOTOGRAPHS = SceneStatistics(
     knee=1 / 344,
     mean=0.226,
     spread=0.213,
+    shade=0.293,
+    shade_size=75.8,
     depths=(0.284, 0.148, 0.137, 0.135, 0.106, 0.093, 0.059, 0.038),
-    source="18 photographs and renderings with depth (Middlebury, 7-Scenes, TUM, NYU, Flying Things, ...), the middle 512 "
-    "pixels; python -m tests.benchmarks.scene_statistics, 2026-11-22",
+    source="18 photographs and renderings with depth (Middlebury, 7-Scenes, TUM, NYU, Flying Things, ...), the middle "
+    "512 pixels; python -m tests.benchmarks.scene_statistics, 2026-11-22",
 )
 """Statistics of photographs of some 500 pixels a side, whose spectrum is within a fifth of this power law. On 13 other
 scenes an exponent of 2.9, a knee near 1/256, a mean of 0.29 and a spread of 0.23 were measured."""

@@ -7,9 +7,10 @@ from tqdm import tqdm
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.mask_design.objectives import design, restoration_error
+from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS
 
 LEAST_SIGMA = 1e-3  # in units of full scale; without noise every blur can be inverted
-SCENE_SPREAD = 0.2  # standard deviation of a scene's light, in units of full scale
+SCENE_SPREAD = PHOTOGRAPHS.spread
 LR_METRES = 8e-8  # restoration error of five masks after 120 steps is within 0.2 % of that after 200
 
 

@@ -54,7 +54,7 @@ class TestDesignTask(BaseTester):
         errors = {stop: flat_candidate(task, task.balanced_f_number * 2**stop, 0.5).image_error for stop in stops}
         assert abs(min(errors, key=lambda stop: errors[stop])) <= 0.5
 
-    def test_feature_the_grid_of_f_numbers_is_half_stops_around_the_balanced_one(self):
+    def test_feature_the_grid_of_f_numbers_is_in_stops_around_the_balanced_one(self):
         task = DesignTask()
         grid = task.f_numbers()
         assert task.balanced_f_number in grid

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,43 +122,83 @@ class TestPointError(BaseTester):
 
 class TestRestorationError(BaseTester):
     @pytest.mark.parametrize("veiled", [False, True])
-    def test_feature_is_the_error_of_the_best_filter_written_out(self, veiled):
+    def test_feature_in_linear_light_is_the_error_of_the_best_filter_written_out(self, veiled):
         """For each frequency in NumPy: the minimum of E|1 - G H|² S + |G|² noise² over complex G."""
-        scenes = SceneStatistics(2.4, 0.1, mean=0.4, spread=0.3, depths=(0.6, 0.4))
+        bank, scenes = self._dim_bank(veiled), SceneStatistics(2.4, 0.1, 0.4, spread=0.3, depths=(0.6, 0.4))
+        share, transfer, spectrum, best = self._best_filter(bank, scenes, 0.2 * 0.3)
+        error = (share * np.abs(1 - best * transfer) ** 2).sum(0) * spectrum + np.abs(best) ** 2 * (0.2 * 0.3) ** 2
+        assert float(restoration_error(bank, 0.2, scenes)) == pytest.approx(error.mean() / 0.3**2, rel=1e-9)
+
+    @pytest.mark.parametrize("sensor", [SensorNoise(0.04), SensorNoise(0.01, full_well=200, dark=3)])
+    def test_feature_in_srgb_it_is_the_sum_over_all_pairs_of_pixels(self, sensor):
+        """What the filter leaves at each pixel is multiplied by the light around, summed over pairs of pixels."""
+        scenes = SceneStatistics(2.4, 0.1, 0.4, spread=0.3, depths=(0.6, 0.4), shade=0.4, shade_size=3)
+        bank = self._dim_bank(True)
+        read, whole = (float(sensor.std(torch.tensor(x).double()) ** 2) for x in (0.0, 0.4))
+        share, transfer, spectrum, best = self._best_filter(bank, scenes, whole**0.5)
+        y = np.minimum(np.arange(14), 14 - np.arange(14))
+        around = 1 - 0.6 * np.exp(-((np.hypot(y[:, None], y) / 3) ** 0.75))
+        covariance = np.fft.ifft2(spectrum).real
+        lags = (np.arange(14)[:, None] - np.arange(14)) % 14
+        error = 0.0
+        for weight, each in zip(share.ravel(), transfer, strict=True):
+            left = np.fft.ifft2(best * each - 1).real
+            pairs = covariance[lags[:, None, :, None], lags[None, :, None, :]]
+            error += weight * np.einsum("ij,ijkl,kl", left * around, pairs, left * around)
+            error += weight * (0.4 * (left * (around - 1)).sum()) ** 2
+        psf = np.fft.ifft2((share * transfer).sum(0)).real
+        light = np.array([[(psf * np.roll(around, (-i, -j), (0, 1))).sum() for j in range(14)] for i in range(14)])
+        error += (np.fft.ifft2(best).real ** 2 * (read + (whole - read) * light)).sum()
+        mean_image = (0.3 * 0.4) ** 2 + (0.4 * 0.6) ** 2
+        assert float(restoration_error(bank, sensor, scenes)) == pytest.approx(error / mean_image, rel=1e-9)
+
+    @staticmethod
+    def _dim_bank(veiled):
         bank = bank_of(*0.02 * torch.rand(3, 7, 7, dtype=torch.float64))
         veil = torch.rand(3, 1, dtype=torch.float64) if veiled else None
+        return PSFBank(bank.psfs, bank.defocus, bank.energy, veil)
+
+    @staticmethod
+    def _best_filter(bank, scenes, noise):
+        """Return shares of depth, transfer functions, spectrum and filter on a plane of 14 pixels, by NumPy."""
         f = np.fft.fftfreq(14)
-        spectrum = scenes.spectrum(torch.from_numpy(np.hypot(f[:, None], f))).numpy() / 0.3**2
+        spectrum = scenes.spectrum(torch.from_numpy(np.hypot(f[:, None], f))).numpy()
         spectrum[0, 0] = 0
-        spectrum[0, 0] = 14**2 - spectrum.sum()
-        transfer = np.fft.fft2(bank.psfs[:, 0].numpy(), s=(14, 14))
-        if veil is not None:
-            transfer[:, 0, 0] += veil[:, 0].numpy()
+        spectrum[0, 0] = 14**2 * scenes.spread**2 - spectrum.sum()
+        plane = np.zeros((3, 14, 14))
+        plane[:, :7, :7] = bank.psfs[:, 0].numpy()
+        transfer = np.fft.fft2(np.roll(plane, (-3, -3), (1, 2)))
+        if bank.veil is not None:
+            transfer[:, 0, 0] += bank.veil[:, 0].numpy()
         share = np.array([0.3, 0.5, 0.2])[:, None, None]
         mean, power = (share * transfer).sum(0), (share * np.abs(transfer) ** 2).sum(0)
-        best = (mean.conj() * spectrum) / (power * spectrum + 0.2**2)
-        error = (share * np.abs(1 - best * transfer) ** 2).sum(0) * spectrum + np.abs(best) ** 2 * 0.2**2
-        found = restoration_error(PSFBank(bank.psfs, bank.defocus, bank.energy, veil), 0.2, scenes)
-        assert float(found) == pytest.approx(error.mean(), rel=1e-9)
-
-    def test_feature_a_sensor_has_the_noise_at_the_mean_light(self):
-        bank = bank_of(torch.rand(5, 5) / 25)
-        sensor = SensorNoise(0.01, full_well=300)
-        noise = math.sqrt(0.01**2 + PHOTOGRAPHS.mean / 300) / PHOTOGRAPHS.spread
-        assert float(restoration_error(bank, sensor)) == pytest.approx(float(restoration_error(bank, noise)))
+        return share, transfer, spectrum, mean.conj() * spectrum / (power * spectrum + noise**2)
 
     def test_feature_depths_without_pixels_do_not_count(self):
         sharp, blurred = impulse(), torch.full((9, 9), 1 / 81).double()
-        far = SceneStatistics(2.76, 1 / 344, 0.2, 0.2, depths=(1.0, 0.0, 0.0, 0.0))
+        far = replace(PHOTOGRAPHS, depths=(1.0, 0.0, 0.0, 0.0))
         bank = bank_of(sharp, sharp, blurred)
-        assert float(restoration_error(bank, 1e-3, far)) == pytest.approx(float(restoration_error(bank_of(sharp), 1e-3)))
+        assert float(restoration_error(bank, 1e-3, far)) == pytest.approx(
+            float(restoration_error(bank_of(sharp), 1e-3))
+        )
         assert float(restoration_error(bank, 1e-3)) > 1e-3
+
+    def test_feature_a_halo_costs_more_than_as_much_blur_nearby(self):
+        """At one of two depths a ring of light is near to the point, or far from it."""
+        errors = {}
+        for name, scenes in (("srgb", PHOTOGRAPHS), ("linear", replace(PHOTOGRAPHS, shade=1.0))):
+            for radius in (2, 14):
+                ring = impulse(31, 0.8)
+                for y, x in ((radius, 0), (-radius, 0), (0, radius), (0, -radius)):
+                    ring[15 + y, 15 + x] = 0.05
+                errors[name, radius] = float(restoration_error(bank_of(ring, impulse(31)), 1e-3, scenes))
+        assert errors["srgb", 14] / errors["srgb", 2] > 1.3 * errors["linear", 14] / errors["linear", 2]
 
     def test_feature_blur_alone_costs_nothing_without_noise_and_change_does(self):
         blur = torch.zeros(9, 9, dtype=torch.float64)
         blur[4, 3:6] = torch.tensor([0.2, 0.6, 0.2])
         assert float(restoration_error(bank_of(blur, blur), noise=1e-6)) < 1e-9
-        assert float(restoration_error(bank_of(blur, impulse()), noise=1e-6)) > 1e-3
+        assert float(restoration_error(bank_of(blur, impulse()), noise=1e-6)) > 1e-4
 
     def test_feature_a_dark_lens_loses_the_scene(self):
         assert float(restoration_error(bank_of(torch.zeros(9, 9)))) == pytest.approx(1)
@@ -173,9 +214,9 @@ class TestRestorationError(BaseTester):
         plain, cubic = PixelwiseMask(1, initial="flat"), CubicMask(15.0)
         ours = PixelwiseMask(initial=cubic.heights().detach())
         lens = lens_with(ours)
-        design(ours, lambda: restoration_error(lens.psf_bank()), 60, 1e-8)
+        design(ours, lambda: restoration_error(lens.psf_bank(), 0.01), 60, 1e-8)
         with torch.no_grad():
-            errors = [float(restoration_error(lens_with(masks).psf_bank())) for masks in (plain, cubic, ours)]
+            errors = [float(restoration_error(lens_with(masks).psf_bank(), 0.01)) for masks in (plain, cubic, ours)]
         assert errors[0] > 1.2 * errors[1] > 1.2 * 1.2 * errors[2]
 
     @pytest.mark.parametrize("noise", [0, -1, math.inf, math.nan])

@@ -129,7 +129,7 @@ class TestWiener(BaseTester):
 
     def test_exception(self, device):
         capture, psfs = torch.rand(1, 2, 8, 8, device=device), make_psfs(device=device)
-        with pytest.raises(ValueError, match="noise must be a standard deviation of at least 0 .* got -0.1"):
+        with pytest.raises(ValueError, match=r"noise must be a standard deviation of at least 0 .* got -0\.1"):
             wiener(capture, psfs, -0.1)
         with pytest.raises(ValueError, match=r"noise must be .* got nan"):
             Wiener(math.nan)
@@ -161,7 +161,9 @@ class TestModule(BaseTester):
         sensor = SensorNoise(0.01, full_well=200)
         noise = sensor.std(capture.mean((-2, -1), keepdim=True))
         assert float(noise[0, 0] / noise[0, 1]) > 2
-        self.assert_close(Wiener(sensor)(capture, bank), wiener(capture, bank.psfs, noise, depth_weights=None), atol=0.2)
+        self.assert_close(
+            Wiener(sensor)(capture, bank), wiener(capture, bank.psfs, noise, depth_weights=None), atol=0.2
+        )
         same = Wiener(0.5)(capture, bank, noise)
         self.assert_close(Wiener(sensor)(capture, bank), same, rtol=0, atol=1e-6)
 

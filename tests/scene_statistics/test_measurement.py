@@ -11,6 +11,7 @@ from kornia_tidy.scene_statistics.measurement import (
     LOWEST,
     depth_shares,
     fitted_power_law,
+    fitted_shade,
     linear_light,
     radial_spectrum,
 )
@@ -99,6 +100,30 @@ class TestFit(BaseTester):
         self.assert_close(spectrum.density[-8:], torch.ones(8, dtype=torch.float64), rtol=0, atol=0.1)
 
 
+class TestShade(BaseTester):
+    def test_feature_a_constant_picture_has_no_dark_pixels(self):
+        assert fitted_shade([torch.full((1, 64, 64), 0.3, dtype=torch.float64)])[0] == pytest.approx(1)
+
+    def test_feature_light_around_is_that_of_the_model_where_the_picture_is_made_so(self):
+        """Half of the columns dark, in stripes of 32 pixels: 4 pixels from a dark pixel an eighth is bright."""
+        light = torch.tensor([0.02, 0.5], dtype=torch.float64).repeat_interleave(32).repeat(8).expand(1, 512, -1)
+        slopes = [
+            (float(linear_rgb_to_rgb(torch.full((1, 3, 1, 1), x + 0.02)).mean())
+             - float(linear_rgb_to_rgb(torch.full((1, 3, 1, 1), x - 0.02)).mean())) / 0.04
+            for x in (0.02, 0.5)
+        ]  # fmt: skip
+        dark, bright = (slope**2 / sum(slope**2 for slope in slopes) for slope in slopes)
+        shade, size = fitted_shade([light])
+        assert shade == pytest.approx((dark * 0.02 + bright * 0.5) / 0.26, rel=1e-6)
+        assert 4 < size < 128
+
+    def test_feature_noise_has_the_mean_light_at_any_distance(self):
+        noise = torch.rand(1, 512, 512, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        shade, size = fitted_shade([noise])
+        assert shade < 0.6
+        assert size < 2
+
+
 class TestDepthShares(BaseTester):
     def test_feature_literals(self):
         depth = torch.tensor([[[math.inf, 4.0, 2.0, 1.25, 1.0, 0.0, math.nan]]])
@@ -124,4 +149,6 @@ class TestPhotographs(BaseTester):
         assert 1 / found.knee == pytest.approx(1 / PHOTOGRAPHS.knee, abs=0.6)
         assert found.mean == pytest.approx(PHOTOGRAPHS.mean, abs=6e-4)
         assert found.spread == pytest.approx(PHOTOGRAPHS.spread, abs=6e-4)
+        assert found.shade == pytest.approx(PHOTOGRAPHS.shade, abs=6e-4)
+        assert found.shade_size == pytest.approx(PHOTOGRAPHS.shade_size, abs=0.06)
         assert found.depths == pytest.approx(PHOTOGRAPHS.depths, abs=6e-4)

@@ -81,6 +81,18 @@ class TestCellPower(BaseTester):
         assert coarse[0, 0] > fine[0, 0] > 0
 
 
+class TestLightAround(BaseTester):
+    def test_feature_rises_from_the_shade_to_the_mean(self):
+        distance = torch.tensor([0.0, 1.0, 10.0, 75.8, 1e6], dtype=torch.float64)
+        around = PHOTOGRAPHS.light_around(distance)
+        assert bool((around.diff() > 0).all())
+        assert around[[0, -1]].tolist() == pytest.approx([0.293, 1.0])
+        assert float(around[3]) == pytest.approx(1 - 0.707 / math.e)
+
+    def test_feature_is_one_everywhere_in_linear_light(self):
+        assert torch.equal(scenes().light_around(torch.rand(5)), torch.ones(5))
+
+
 class TestDepthWeights(BaseTester):
     @pytest.mark.parametrize("count", [1, 2, 5, 40])
     def test_feature_are_the_share_of_pixels_nearest_to_each_node(self, count):
