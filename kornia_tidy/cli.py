@@ -14,10 +14,24 @@ from typing import TextIO
 import torch
 
 import kornia_tidy
-from kornia_tidy.commands import demo, evaluate, info, masks, psf, raw, render, simulate, systems, trade, train, tune
+from kornia_tidy.commands import (
+    demo,
+    design,
+    evaluate,
+    info,
+    masks,
+    psf,
+    raw,
+    render,
+    simulate,
+    systems,
+    trade,
+    train,
+    tune,
+)
 
 # Each has add_parser(subparsers), which sets run(args).
-COMMANDS = (simulate, demo, systems, psf, masks, raw, train, evaluate, render, trade, tune, info)
+COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, info)
 
 DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS = 0, 2, 70, 130, 141  # exit statuses; 70 is EX_SOFTWARE of sysexits.h
 DEBUG = "KORNIA_TIDY_DEBUG"  # environment variable; if set, tracebacks are printed

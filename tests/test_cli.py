@@ -31,6 +31,7 @@ class TestMain(BaseTester):
             [],
             ["simulate"],
             ["demo"],
+            ["design"],
             ["systems"],
             ["trade"],
             ["train"],

@@ -1,0 +1,184 @@
+"""When do phase masks pay? Co-designs over light, depth range and number of masks, decided on real scenes.
+
+- ``python -m tests.benchmarks.when_coding_pays run FILE.json``: designs one cell after the other and writes the file
+  after each; goes on where it stopped. ``--cells N`` stops after N new ones.
+- ``... table FILE.json``: prints the table as Markdown.
+- ``... plot FILE.json PICTURE.png``: draws the map.
+
+Each cell is a :func:`kornia_tidy.mask_design.co_design`, seed 0. Scenes are real ones of ../shared/data, twelve of each
+half: the middle 256 pixels, depth stretched over the range in dioptres. Half A chooses settings and finalists, half B
+scores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from kornia_tidy.commands.demo import stretched
+from kornia_tidy.data.patches import central_crop
+from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.figures.style import ACCENT, FAINT, INK, open_chart
+from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design
+from kornia_tidy.mask_design.design_task import DesignTask
+from tests.scenes import ENTRIES, halves, load_scene
+
+LIGHTS = (57_000, 10_000, 2_000, 500)  # electrons of white at f/17.6
+RANGES = {
+    "0.298 m to inf": (0.2975, math.inf),
+    "0.595 m to inf": (0.595, math.inf),
+    "0.149 m to inf": (0.14875, math.inf),
+}
+WEIGHTS = {"image": 0.0, "depth": 1.0, "both": 0.5}
+SIZE, NUMBER = 256, 12  # pixels a side of the scenes, and scenes of each half
+EFFORT = Effort(coarse_steps=20, steps=60, starts=("focal sweep",), scenes=0)
+# Steps with depth compute derivatives of PSFs too, and take some fifty times as long.
+DEPTH_EFFORT = Effort(coarse_steps=5, steps=20, starts=("focal sweep", "Fisher"), scenes=0)
+
+
+def cells() -> list[tuple[str, str, int, int]]:
+    """Return what matters, range, number of masks and electrons of each cell, the most wanted first."""
+    first, less, more = RANGES
+    return [
+        *product(["image"], [first], (5, 1), LIGHTS),
+        *product(["image"], [less], [5], LIGHTS),
+        *product(["depth"], [first], [5], LIGHTS),
+        *product(["both"], [first], [5], LIGHTS),
+        *product(["image"], [more], [5], LIGHTS),
+        *product(["depth"], [first], [1], LIGHTS),
+        *product(["image"], [less, more], [1], LIGHTS),
+        *product(["image"], [first], [2], LIGHTS),
+    ]
+
+
+def scenes_for(task: DesignTask) -> list[Scene]:
+    """Return the real scenes, those of half A and half B in turn."""
+    camera = task.camera(task.balanced_f_number, 0.5)
+    listed = []
+    first, second = halves(ENTRIES)
+    for pair in zip(first[:NUMBER], second[:NUMBER], strict=True):
+        for name in pair:
+            image, depth, valid = load_scene(name)
+            sample = {"image": image.expand(3, -1, -1), "depth": stretched(depth, valid, camera), "mask": valid}
+            size = tuple(min(SIZE, side) for side in image.shape[-2:])
+            cut = central_crop(sample, (size[0], size[1]))
+            listed.append(Scene(cut["image"], cut["depth"], cut["mask"]))
+    return listed
+
+
+def row_of(design: CoDesign) -> dict[str, Any]:
+    """Return the numbers of a design that the map shows."""
+    verdict = design.verdict
+    return {
+        "words": design.words,
+        "gain": verdict.gain,
+        "standard_error": verdict.standard_error,
+        "scenes": verdict.scenes,
+        "flat_f_number": verdict.flat.candidate.f_number,
+        "flat_score": verdict.flat.score,
+        "coded_f_number": verdict.coded.candidate.f_number,
+        "coded_score": verdict.coded.score,
+        "flat_error": _finite(min(one.image_error for one in design.candidates if one.is_flat)),
+        "coded_error": _finite(min(one.image_error for one in design.candidates if not one.is_flat)),
+    }
+
+
+def run(path: Path, most: int | None) -> None:
+    """Design the cells that the file does not hold yet."""
+    known = read_json(path) if path.exists() else {}
+    todo = [cell for cell in cells() if _key(cell) not in known][:most]
+    for cell in tqdm(todo, desc="cells"):
+        matters, depths, masks, electrons = cell
+        weight = WEIGHTS[matters]
+        task = DesignTask(RANGES[depths], electrons=electrons, masks=masks, depth_weight=weight)
+        design = co_design(task, scenes_for(task), DEPTH_EFFORT if weight else EFFORT)
+        known[_key(cell)] = row_of(design)
+        write_bytes(path, (json.dumps(known, indent=1) + "\n").encode())
+        print(_key(cell), known[_key(cell)]["words"], flush=True)
+
+
+def table(known: dict[str, Any]) -> str:
+    """Return the map as a table of Markdown."""
+    lines = ["| matters | depths | K | " + " | ".join(f"{light:,} e-" for light in LIGHTS) + " |", "|---" * 7 + "|"]
+    rows = dict.fromkeys(cell[:3] for cell in cells())
+    for matters, depths, masks in rows:
+        entries = [known.get(_key((matters, depths, masks, light))) for light in LIGHTS]
+        if any(entries):
+            told = " | ".join("-" if entry is None else _entry(entry) for entry in entries)
+            lines.append(f"| {matters} | {depths} | {masks} | {told} |")
+    return "\n".join(lines)
+
+
+def _entry(entry: dict[str, Any]) -> str:
+    gain = f"{entry['gain']:+.2f} ± {entry['standard_error']:.2f}"
+    pays = entry["gain"] > 2 * entry["standard_error"]
+    return f"{f'**{gain}**' if pays else gain} (f/{entry['coded_f_number']:.0f}, f/{entry['flat_f_number']:.0f})"
+
+
+def plot(known: dict[str, Any], path: Path) -> None:
+    """Draw gain over light, a panel for each range and for each of what matters."""
+    from matplotlib.figure import Figure
+
+    panels = [
+        pair for pair in dict.fromkeys(cell[:2] for cell in cells()) if any(_of(known, *pair, k) for k in (5, 2, 1))
+    ]
+    figure = Figure(figsize=(3.4 * len(panels), 3.6), facecolor="white", layout="constrained")
+    for axes, (matters, depths) in zip(
+        figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True
+    ):
+        for masks, color in ((5, ACCENT), (2, INK), (1, FAINT)):
+            points = _of(known, matters, depths, masks)
+            if points:
+                lights, gains, errors = zip(*points, strict=True)
+                axes.errorbar(lights, gains, [2 * error for error in errors], color=color, marker="o", markersize=4,
+                              capsize=2, linewidth=1.3, label=f"K = {masks}")  # fmt: skip
+        axes.axhline(0, color=INK, linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set_title(f"{matters}, {depths}", fontsize=9, color=INK)
+        axes.set_xlabel("electrons of white at f/17.6", fontsize=8, color=INK)
+        open_chart(axes, 7.5)
+    figure.axes[0].set_ylabel("masks over the best flat lens, dB", fontsize=8, color=INK)
+    figure.axes[0].legend(fontsize=7.5, frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def _of(known: dict[str, Any], matters: str, depths: str, masks: int) -> list[tuple[float, float, float]]:
+    found = ((light, known.get(_key((matters, depths, masks, light)))) for light in LIGHTS)
+    return [(light, entry["gain"], entry["standard_error"]) for light, entry in found if entry]
+
+
+def _key(cell: tuple[str, str, int, int]) -> str:
+    return "{}, {}, K = {}, {} electrons".format(*cell)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def main() -> None:
+    """Read the command line and do what it says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("run", "table", "plot"))
+    parser.add_argument("file", type=Path)
+    parser.add_argument("picture", type=Path, nargs="?")
+    parser.add_argument("--cells", type=int, help="stop after so many new cells")
+    options = parser.parse_args()
+    if options.action == "run":
+        torch.set_num_threads(1)
+        run(options.file, options.cells)
+    elif options.action == "table":
+        print(table(read_json(options.file)))
+    else:
+        plot(read_json(options.file), options.picture)
+
+
+if __name__ == "__main__":
+    main()

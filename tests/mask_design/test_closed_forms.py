@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import torch
+
+from kornia_tidy.mask_design.closed_forms import BILATERAL, NOISE_FACTORS, DepthLikelihood, WienerFilter, restorations
+from kornia_tidy.psf import PSFBank
+from kornia_tidy.reconstruction.wiener import wiener
+from kornia_tidy.scene_statistics import PHOTOGRAPHS
+from tests.base import BaseTester
+
+
+def gaussians(sigmas, window=15):
+    """Return a bank of one PSF for each width, three channels."""
+    x = torch.arange(window) - window // 2
+    psfs = torch.stack([torch.exp(-(x[:, None] ** 2 + x**2) / (2 * sigma**2)) for sigma in sigmas])
+    psfs = (psfs / psfs.sum((1, 2), keepdim=True))[:, None].expand(-1, 3, -1, -1)
+    return PSFBank(psfs.contiguous(), torch.linspace(-1, 1, len(sigmas)), torch.ones(len(sigmas), 3))
+
+
+def texture(size, seed=0):
+    """Return a periodic image whose power falls with the third power of the frequency, of mean 0.3 and spread 0.1."""
+    noise = torch.randn(1, 1, size, size, generator=torch.Generator().manual_seed(seed))
+    frequency = torch.hypot(torch.fft.fftfreq(size)[:, None], torch.fft.rfftfreq(size))
+    shaped = torch.fft.irfft2(torch.fft.rfft2(noise) * (frequency + 1 / 64) ** -1.5, s=(size, size))
+    return (0.3 + 0.1 * (shaped - shaped.mean()) / shaped.std()).expand(-1, 3, -1, -1)
+
+
+class TestWienerFilter(BaseTester):
+    def test_feature_is_the_function_of_the_library(self):
+        bank, capture = gaussians([1.0, 2.0]), texture(40)
+        shares = PHOTOGRAPHS.depth_weights(bank.defocus)
+        once, noisier = WienerFilter(bank, 0.01, PHOTOGRAPHS, (40, 40))(capture, (1.0, 4.0))
+        self.assert_close(once, wiener(capture, bank.psfs, 0.01, depth_weights=shares))
+        self.assert_close(noisier, wiener(capture, bank.psfs, 0.02, depth_weights=shares))
+
+
+class TestRestorations(BaseTester):
+    def test_cardinality_each_base_with_each_bilateral_filter(self):
+        capture = texture(32)
+        images = restorations(capture, WienerFilter(gaussians([1.0, 2.0]), 0.01, PHOTOGRAPHS, (32, 32)))
+        assert len(images) == (1 + len(NOISE_FACTORS)) * len(BILATERAL)
+        assert {tuple(image.shape) for image in images.values()} == {(1, 3, 32, 32)}
+
+    def test_feature_filters_lessen_the_noise_of_a_flat_grey(self):
+        noise = 0.05 * torch.randn(1, 3, 48, 48, generator=torch.Generator().manual_seed(0))
+        images = restorations(0.3 + noise, WienerFilter(gaussians([0.5, 0.5]), 0.05, PHOTOGRAPHS, (48, 48)))
+        spread = {name: float(image.std()) for name, image in images.items()}
+        assert spread["Wiener x 0.8"] < 0.5 * spread["capture"]
+        assert spread["capture, bilateral 0.28"] < 0.5 * spread["capture"]
+
+
+class TestDepthLikelihood(BaseTester):
+    def test_feature_finds_by_which_psf_a_texture_is_blurred(self):
+        """Sharp is far here and the widest PSF is near: three depths, three tenths apart, come out in their order."""
+        bank, size = gaussians([0.3 + 0.3 * depth for depth in range(11)]), 96
+        likelihood = DepthLikelihood(bank, 0.001, PHOTOGRAPHS, (size, size))
+        noise = 0.001 * torch.randn(1, 3, size, size, generator=torch.Generator().manual_seed(1))
+        found = []
+        for depth in (2, 5, 8):
+            transfer = torch.fft.rfft2(bank.psfs[depth], s=(size, size))
+            capture = torch.fft.irfft2(torch.fft.rfft2(texture(size)) * transfer, s=(size, size)).roll((-7, -7), (2, 3))
+            estimates = likelihood(capture + noise)
+            assert {tuple(estimate.shape) for estimate in estimates.values()} == {(size, size)}
+            found.append([float(estimate[32:64, 32:64].mean()) for estimate in estimates.values()])
+        for far, middle, near in zip(*found, strict=True):
+            assert far + 0.05 < middle < near - 0.05
+
+    def test_feature_without_texture_it_says_what_scenes_are_like(self):
+        bank = gaussians([0.5 + 0.2 * depth for depth in range(11)])
+        shares = PHOTOGRAPHS.depth_weights(bank.defocus)
+        expected = float((shares * torch.linspace(0, 1, 11)).sum())
+        same = PSFBank(bank.psfs[:1].expand(11, -1, -1, -1).contiguous(), bank.defocus, bank.energy)
+        for estimate in DepthLikelihood(same, 0.01, PHOTOGRAPHS, (32, 32))(texture(32)).values():
+            self.assert_close(estimate, torch.full((32, 32), expected))
