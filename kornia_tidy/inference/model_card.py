@@ -71,13 +71,8 @@ def model_card(system: TrainedSystem, title: str, license: str | None = None) ->
 
     Example:
         >>> from kornia_tidy.inference.pretrained import load_pretrained
-        >>> print(model_card(load_pretrained("joint-5"), "joint-5", "apache-2.0")[:102])
-        ---
-        library_name: kornia_tidy
-        license: apache-2.0
-        pipeline_tag: depth-estimation
-        tags:
-        - kornia_tidy
+        >>> model_card(load_pretrained("joint-5"), "joint-5", "apache-2.0").splitlines()[1:4]
+        ['library_name: kornia_tidy', 'license: apache-2.0', 'pipeline_tag: depth-estimation']
     """
     check_license(license)
     settings = system.settings
