@@ -17,7 +17,7 @@ from kornia_tidy.reconstruction.midas_small import IMAGE_DEVIATION, IMAGE_MEAN
 
 NEAREST = 1e-3  # m; smaller metric estimates are taken for this depth
 
-# Published sizes by width: the layers whose output is taken, the channels of their maps, and those of the fusion.
+# Published sizes by width: the layers used, the channels of their maps, and the channels of the fusion.
 _DEPTH_ANYTHING = {
     384: ((3, 6, 9, 12), (48, 96, 192, 384), 64),
     768: ((3, 6, 9, 12), (96, 192, 384, 768), 128),
@@ -99,7 +99,7 @@ class MonocularDepth(ReconstructionHead):
 
     @torch.no_grad()
     def fit(self, image: Tensor, truth: Tensor, valid: Tensor | None = None) -> Self:
-        """Set scale and shift by least squares over all pixels of scenes whose depth is known.
+        """Set scale and shift by least squares over the pixels of scenes with known depth.
 
         Args:
             image: (B, 3, H, W), pictures in focus everywhere.
@@ -118,7 +118,7 @@ class MonocularDepth(ReconstructionHead):
 
     @torch.no_grad()
     def for_camera(self, camera: ThinLensCamera) -> Self:
-        """Set scale and shift of a metric network by a camera, whose defocus is an affine function of inverse depth.
+        """Set scale and shift of a metric network from a camera: defocus is affine in inverse depth.
 
         Raises:
             TypeError: if the camera is no :class:`~kornia_tidy.ThinLensCamera`.

@@ -159,19 +159,20 @@ class TestByName(BaseTester):
             make_head(name, **options)
 
     @pytest.mark.parametrize(
-        ("name", "width", "millions"),
+        ("name", "width", "millions", "layers"),
         [
-            ("depth-anything-v2", 384, 24.8),
-            ("depth-anything-v2", 768, 97.5),
-            ("depth-anything-v2", 1024, 335.3),
-            ("zoedepth", 1024, 345),
+            ("depth-anything-v2", 384, 24.8, [3, 6, 9, 12]),
+            ("depth-anything-v2", 768, 97.5, [3, 6, 9, 12]),
+            ("depth-anything-v2", 1024, 335.3, [5, 12, 18, 24]),
+            ("zoedepth", 1024, 345, [6, 12, 18, 24]),
         ],
     )
-    def test_feature_published_numbers_of_parameters(self, name, width, millions, transformers):
+    def test_feature_published_sizes(self, name, width, millions, layers, transformers):
         """Of the papers' tables."""
         with torch.device("meta"):
             head = make_head(name, 1, width)
         assert sum(p.numel() for p in head.parameters()) / 1e6 == pytest.approx(millions, rel=0.005)
+        assert list(head.network.config.backbone_config.out_indices) == layers
 
 
 @pytest.mark.usefixtures("transformers")
