@@ -91,9 +91,10 @@ class RGBDFolder(SceneDataset):
     def read(self, index: int) -> Scene:
         """Read image and depth of a pair."""
         _, image, depth = self.pairs[index]
-        options = self.options
+        options: dict[str, Any] = self.options
         if self.calibrations is not None:
-            options = {**options, **read_calibration(self.calibrations[index])}
+            calibration: dict[str, Any] = {**read_calibration(self.calibrations[index])}
+            options = options | calibration
         return read_rgbd(self.root / image, self.root / depth, **options)
 
     def _calibrations(self, pattern: str) -> list[Path]:
