@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +32,7 @@ def middlebury(root: str | os.PathLike[str], transform: Transform | None = None)
     Source: Scharstein et al., High-Resolution Stereo Datasets with Subpixel-Accurate Ground Truth (GCPR 2014).
     """
     layouts = [("*/im0.png", "*/disp0.pfm"), ("*/im0.png", "*/disp0GT.pfm")]
-    options = {"kind": "disparity", "invalid": [math.inf], "calibration": "*/calib.txt"}
+    options = {"kind": "disparity", "calibration": "*/calib.txt"}
     return _folder("Middlebury", root, layouts, transform, **options)
 
 

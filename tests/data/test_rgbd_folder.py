@@ -160,6 +160,15 @@ class TestDescribedFolder(BaseTester):
         (sample,) = described_folder(tmp_path)
         self.assert_close(sample["depth"].unique(), torch.tensor([2.5]))
 
+    def test_feature_size_calibration_and_fill_are_described_too(self, tmp_path):
+        write(tmp_path, "1.png", "1_d.png", 2)
+        write(tmp_path, "unused/1.png", "1_d.png", 2, size=(2, 3))
+        (tmp_path / "1.json").write_text('{"scale": 0.5}')
+        about = '"calibration": "*.json", "resample": "depth", "fill": "guided", "rotated_bits": 0'
+        (tmp_path / "rgbd.json").write_text('{"image": "*.png", "depth": "*_d.png", ' + about + "}")
+        (sample,) = described_folder(tmp_path)
+        assert torch.equal(sample["depth"], torch.ones(1, 4, 6))
+
     def test_exception_without_a_description(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"there is no .*rgbd\.json: it tells which files"):
             described_folder(tmp_path)

@@ -41,6 +41,10 @@ class TestTUMSequence(BaseTester):
             assert (~sample["mask"]).nonzero().tolist() == [[0, 0, 0]]
         assert len(TUMSequence(tmp_path, max_difference=0.03)) == 3
 
+    def test_feature_a_depth_between_two_images_belongs_to_the_nearer_one(self, tmp_path):
+        write(tmp_path, images=("10.000", "10.009"), depths=("10.005",))
+        assert [sample["name"] for sample in TUMSequence(tmp_path)] == ["10.009"]
+
     @pytest.mark.parametrize("name", ["associations.txt", "associate.txt"])
     @pytest.mark.parametrize("depth_first", [True, False])
     def test_feature_listed_pairs_in_both_orders(self, name, depth_first, tmp_path):
