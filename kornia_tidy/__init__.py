@@ -1,5 +1,9 @@
 """kornia_tidy: a differentiable camera with programmable phase masks that change during the exposure."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -12,6 +16,9 @@ from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.sensor.noise import SensorNoise
+
+if TYPE_CHECKING:
+    from kornia_tidy.augmentation.arrays import reconstruct, simulate
 
 __version__ = "0.1.0"
 
@@ -31,4 +38,15 @@ __all__ = [
     "TiDyOptics",
     "burst",
     "moving_capture",
+    "reconstruct",
+    "simulate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the functions on arrays when they are first asked for: they need much of the package."""
+    if name not in {"reconstruct", "simulate"}:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from kornia_tidy.augmentation import arrays  # noqa: PLC0415
+
+    return getattr(arrays, name)

@@ -6,5 +6,6 @@ A camera and a data set of scenes come in, files and a data set of captures go o
 from kornia_tidy.coded_datasets.captures import CodedCaptures
 from kornia_tidy.coded_datasets.layout import Layout
 from kornia_tidy.coded_datasets.render_scenes import Rendered, render_scenes, shard_items_within
+from kornia_tidy.coded_datasets.shard_samples import decode_sample
 
-__all__ = ["CodedCaptures", "Layout", "Rendered", "render_scenes", "shard_items_within"]
+__all__ = ["CodedCaptures", "Layout", "Rendered", "decode_sample", "render_scenes", "shard_items_within"]

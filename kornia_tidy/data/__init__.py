@@ -10,11 +10,15 @@ from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
+from kornia_tidy.data.published_folders import hypersim, kitti, middlebury, scannet, seven_scenes
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
+from kornia_tidy.data.sun_rgbd import SUNRGBD
+from kornia_tidy.data.tum_sequence import TUMSequence
 
 __all__ = [
+    "SUNRGBD",
     "DeadLeaves",
     "DepthMap",
     "FlyingThings3D",
@@ -23,17 +27,23 @@ __all__ = [
     "RGBDFolder",
     "Scene",
     "SceneDataset",
+    "TUMSequence",
     "UnreadableItemError",
     "central_crop",
     "crop",
     "dead_leaves",
     "described_folder",
     "from_opencv",
+    "hypersim",
+    "kitti",
+    "middlebury",
     "paper_patches",
     "random_crop",
     "read_depth",
     "read_image",
     "read_rgbd",
+    "scannet",
+    "seven_scenes",
     "split_frames",
     "to_opencv",
     "write_depth",

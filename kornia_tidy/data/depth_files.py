@@ -37,24 +37,27 @@ def read_depth(
     path: str | os.PathLike[str],
     scale: float = 1.0,
     *,
-    kind: Literal["depth", "disparity"] = "depth",
+    kind: Literal["depth", "disparity", "distance"] = "depth",
     invalid: Collection[float] = (),
     focal_px: float | None = None,
     baseline_m: float | None = None,
     doffs_px: float = 0.0,
+    rotated_bits: int = 0,
 ) -> DepthMap:
     r"""Read a depth map in metres, with holes marked in a mask and filled from the nearest known pixel.
 
-    Stored values v are depth, :math:`z = s v`, or disparity, :math:`z = f B / (s v + d)`.
+    Stored values v are depth, :math:`z = s v`, disparity, :math:`z = f B / (s v + d)`, or the distance along the ray
+    to a pixel x, y from the middle of the image, :math:`z = s v f / \sqrt{f^2 + x^2 + y^2}`.
 
     Args:
-        path: a PNG, TIFF, PGM, PFM or NPY file with one channel; an NPY file is (H, W) and is never unpickled.
+        path: a PNG, TIFF, PGM, PFM, NPY or HDF5 file with one channel; an NPY file is (H, W) and is never unpickled.
         scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres.
         kind: quantity that is stored.
         invalid: stored values that mean *unknown*, besides those under Convention.
-        focal_px: f, focal length in pixels; disparity only.
+        focal_px: f, focal length in pixels; disparity and distance only.
         baseline_m: B, distance between the two cameras in metres; disparity only.
         doffs_px: d, difference of the principal points in pixels; disparity only.
+        rotated_bits: places by which the bits of stored 16-bit values were rotated to the left; 3 for SUN RGB-D.
 
     Returns:
         The depth and where it is valid, each :math:`(1, H, W)`.
@@ -81,17 +84,24 @@ def read_depth(
         >>> depth, valid
         (tensor([[[0.5000, 0.5000, 2.0000, 2.0000]]]), tensor([[[ True, False, False,  True]]]))
     """
-    check_depth_options(scale, kind=kind, focal_px=focal_px, baseline_m=baseline_m, doffs_px=doffs_px)
+    calibration: dict[str, Any] = {"focal_px": focal_px, "baseline_m": baseline_m, "doffs_px": doffs_px}
+    check_depth_options(scale, kind=kind, **calibration, rotated_bits=rotated_bits)
     stored = read_stored(path)
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
     stored = stored[..., 0]
+    if rotated_bits:
+        if stored.dtype != np.uint16:
+            raise ValueError(f"cannot read {path}: rotated_bits is for 16-bit values, these are {stored.dtype}")
+        stored = (stored >> int(rotated_bits)) | (stored << (16 - int(rotated_bits)))
     _tell_of_unknown(path, stored, kind, invalid)
     known = stored != 0 if stored.dtype.kind in "ui" else ~np.isnan(stored)
     for value in invalid:
         known &= stored != value
     metres = stored.astype(np.float64) * scale
-    if focal_px is not None and baseline_m is not None:
+    if kind == "distance" and focal_px is not None:
+        metres *= _cosine(metres.shape, focal_px)
+    elif focal_px is not None and baseline_m is not None:
         metres = _disparity_to_depth(metres + doffs_px, focal_px * baseline_m)
     with np.errstate(over="ignore"):
         depth = metres.astype(np.float32)
@@ -140,17 +150,25 @@ def check_depth_options(
     focal_px: float | None = None,
     baseline_m: float | None = None,
     doffs_px: float = 0.0,
+    rotated_bits: int = 0,
 ) -> None:
     """Raise ``ValueError`` if options of :func:`read_depth` contradict each other.
 
     Raises:
-        ValueError: if disparity comes without calibration or depth with one, or if a number is not positive.
+        ValueError: if disparity or distance comes without calibration, depth with one, or a number is not positive.
     """
-    check_choice("kind", kind, ("depth", "disparity"))
+    check_choice("kind", kind, ("depth", "disparity", "distance"))
     check_positive("scale", scale)
+    check_choice("rotated_bits", rotated_bits, range(16))
     if kind == "depth":
         if focal_px is not None or baseline_m is not None or doffs_px:
             raise ValueError("focal_px, baseline_m and doffs_px belong to kind='disparity', got kind='depth'")
+    elif kind == "distance":
+        if baseline_m is not None or doffs_px:
+            raise ValueError("baseline_m and doffs_px belong to kind='disparity', got kind='distance'")
+        if focal_px is None:
+            raise ValueError("distance along the ray gives depth by focal_px, the focal length in pixels, got None")
+        check_positive("focal_px", focal_px, "pixels")
     elif focal_px is None or baseline_m is None:
         raise ValueError(
             "disparity without calibration cannot give metres: focal_px and baseline_m are needed, "
@@ -212,6 +230,12 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
         raise ValueError(f"a 16-bit file with scale {scale} holds {scale} to {65535 * scale:.6g} m, got {bad:.6g}")
     encoded = cv2.imencode(suffix, units.astype(np.uint16))[1].tobytes()
     write_bytes(path, with_text(encoded, {"depth_scale": f"{scale:g}", "Description": text}))
+
+
+def _cosine(shape: tuple[int, ...], focal_px: float) -> NDArray[np.float64]:
+    """Return the cosine of the angle between each pixel's ray and the optical axis, through the middle of the map."""
+    y, x = (np.arange(length) - (length - 1) / 2 for length in shape)
+    return focal_px / np.sqrt(focal_px**2 + x**2 + y[:, None] ** 2)
 
 
 def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -> NDArray[np.float64]:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import cv2
+import numpy as np
+import torch
 from torch import Tensor
 
-from kornia_tidy.data.depth_files import read_depth
+from kornia_tidy.checks import check_choice
+from kornia_tidy.data.depth_files import DepthMap, read_depth
+from kornia_tidy.data.guided_fill import fill_guided
 from kornia_tidy.data.image_files import read_image
+
+SAME_RATIO = 0.02  # relative difference of the ratios of sides: ScanNet's 1296 x 968 and 640 x 480 differ by 0.004
 
 
 class Scene(NamedTuple):
@@ -22,12 +29,24 @@ class Scene(NamedTuple):
     """(1, H, W) bool, False where depth was unknown and is filled in."""
 
 
-def read_rgbd(image_path: str | os.PathLike[str], depth_path: str | os.PathLike[str], **depth_options: Any) -> Scene:
+def read_rgbd(
+    image_path: str | os.PathLike[str],
+    depth_path: str | os.PathLike[str],
+    *,
+    resample: Literal["image", "depth"] | None = None,
+    fill: Literal["nearest", "guided"] = "nearest",
+    **depth_options: Any,
+) -> Scene:
     """Read a picture and its depth.
 
     Args:
         image_path: see :func:`~kornia_tidy.data.image_files.read_image`.
         depth_path: see :func:`~kornia_tidy.data.depth_files.read_depth`.
+        resample: of image and depth in different sizes, which of them is brought to the size of the other: ``"image"``
+            by averaging over areas (linear interpolation where it is enlarged), ``"depth"`` by the nearest pixel. None:
+            different sizes raise ``ValueError``.
+        fill: of unknown depth: ``"nearest"`` known pixel, or ``"guided"`` by the edges of the image, for sparse depth;
+            see :func:`~kornia_tidy.data.guided_fill.fill_guided`.
         **depth_options: passed on to :func:`~kornia_tidy.data.depth_files.read_depth`.
 
     Returns:
@@ -35,7 +54,8 @@ def read_rgbd(image_path: str | os.PathLike[str], depth_path: str | os.PathLike[
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if a file cannot be read, or the two differ in size.
+        ValueError: if a file cannot be read, or the two differ in size and are not to be resampled, or differ in the
+            ratio of their sides by more than 2 %.
 
     Example:
         >>> import tempfile, torch
@@ -48,12 +68,47 @@ def read_rgbd(image_path: str | os.PathLike[str], depth_path: str | os.PathLike[
         >>> scene.image.shape, scene.depth.unique(), bool(scene.valid.all())
         (torch.Size([3, 4, 6]), tensor([1.2500]), True)
     """
+    check_pairing_options(resample, fill)
     image = read_image(image_path)
     depth, valid = read_depth(depth_path, **depth_options)
     if image.shape[1:] != depth.shape[1:]:
         sizes = [f"{t.shape[1]} x {t.shape[2]}" for t in (image, depth)]
-        raise ValueError(
-            f"image and depth must have the same size (rows x columns): {image_path} has {sizes[0]}, "
-            f"{depth_path} has {sizes[1]}"
-        )
+        told = f"{image_path} has {sizes[0]}, {depth_path} has {sizes[1]}"
+        if resample is None:
+            raise ValueError(
+                f"image and depth must have the same size (rows x columns): {told} (resample='image' or 'depth' brings "
+                f"one to the size of the other)"
+            )
+        ratios = [t.shape[1] / t.shape[2] for t in (image, depth)]
+        if not 1 - SAME_RATIO < ratios[0] / ratios[1] < 1 + SAME_RATIO:
+            raise ValueError(f"image and depth must show the same view, and their sides have other ratios: {told}")
+        if resample == "image":
+            image = _resized_image(image, depth.shape[1], depth.shape[2])
+        else:
+            depth, valid = _nearest(depth, valid, image.shape[1], image.shape[2])
+    if fill == "guided":
+        depth = torch.from_numpy(fill_guided(depth[0].numpy(), valid[0].numpy(), image))[None]
     return Scene(image, depth, valid)
+
+
+def check_pairing_options(resample: str | None = None, fill: str = "nearest") -> None:
+    """Raise ``ValueError`` if an option of :func:`read_rgbd` is not one of those allowed."""
+    check_choice("resample", resample, (None, "image", "depth"))
+    check_choice("fill", fill, ("nearest", "guided"))
+
+
+def _resized_image(image: Tensor, height: int, width: int) -> Tensor:
+    """Return an image averaged over areas to a smaller size, or interpolated to a larger one."""
+    smaller = height <= image.shape[1] and width <= image.shape[2]
+    planes = image.permute(1, 2, 0).numpy()
+    resized = cv2.resize(planes, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    return torch.from_numpy(np.ascontiguousarray(np.atleast_3d(resized).transpose(2, 0, 1))).clamp(0, 1)
+
+
+def _nearest(depth: Tensor, valid: Tensor, height: int, width: int) -> DepthMap:
+    """Return depth and validity at another size, each pixel from the nearest one."""
+    rows, columns = (
+        torch.from_numpy(((np.arange(new) + 0.5) * old / new).astype(np.int64))
+        for new, old in ((height, depth.shape[1]), (width, depth.shape[2]))
+    )
+    return DepthMap(depth[:, rows][..., columns], valid[:, rows][..., columns])

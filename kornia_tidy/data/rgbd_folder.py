@@ -8,13 +8,16 @@ import re
 from pathlib import Path, PurePath
 from typing import Any
 
+from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.data.depth_files import check_depth_options
-from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.data.rgbd import Scene, check_pairing_options, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import read_json
 
 ABOUT = "rgbd.json"
 KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m", "doffs_px")
+KNOWN += ("rotated_bits", "resample", "fill", "calibration")
+_TEXTS = ("image", "depth", "kind", "resample", "fill", "calibration")
 
 
 class RGBDFolder(SceneDataset):
@@ -26,10 +29,14 @@ class RGBDFolder(SceneDataset):
             everything else is literal.
         depth: pattern of the depth files. Image and depth are a pair if every ``*`` matches the same in both.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
-        **depth_options: how depth is stored, see :func:`~kornia_tidy.data.depth_files.read_depth`.
+        calibration: pattern of the file with the calibration of each pair, see
+            :func:`~kornia_tidy.data.calibration_files.read_calibration`. Its ``*`` are what the first ones of the pair
+            match; there may be fewer. What it holds goes before ``options``.
+        **options: how depth is stored and joined with the image, see :func:`~kornia_tidy.data.rgbd.read_rgbd` and
+            :func:`~kornia_tidy.data.depth_files.read_depth`.
 
     Raises:
-        FileNotFoundError: if there is no folder, or no file fits a pattern.
+        FileNotFoundError: if there is no folder, no file fits a pattern, or a calibration is missing.
         ValueError: if a file has no partner; if a pattern has no ``*``, another number of them than the other one, or
             leads out of the folder; or if the options contradict each other.
 
@@ -59,13 +66,19 @@ class RGBDFolder(SceneDataset):
         depth: str,
         *,
         transform: Transform | None = None,
-        **depth_options: Any,
+        calibration: str | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(transform)
-        check_depth_options(**{key: value for key, value in depth_options.items() if key != "invalid"})
+        joined = {key: options[key] for key in ("resample", "fill") if key in options}
+        check_pairing_options(**joined)
+        if calibration is None:
+            stored = {key: value for key, value in options.items() if key != "invalid" and key not in joined}
+            check_depth_options(**stored)
         self.root = Path(root)
         self.pairs = _pair(self.root, image, depth)
-        self.depth_options = depth_options
+        self.options: dict[str, Any] = options
+        self.calibrations = None if calibration is None else self._calibrations(calibration)
 
     def __len__(self) -> int:
         """Return the number of pairs."""
@@ -78,7 +91,27 @@ class RGBDFolder(SceneDataset):
     def read(self, index: int) -> Scene:
         """Read image and depth of a pair."""
         _, image, depth = self.pairs[index]
-        return read_rgbd(self.root / image, self.root / depth, **self.depth_options)
+        options: dict[str, Any] = self.options
+        if self.calibrations is not None:
+            calibration: dict[str, Any] = {**read_calibration(self.calibrations[index])}
+            options = options | calibration
+        return read_rgbd(self.root / image, self.root / depth, **options)
+
+    def _calibrations(self, pattern: str) -> list[Path]:
+        """Return the file with the calibration of each pair."""
+        _check_within(pattern)
+        first, *others = pattern.split("*")
+        files = []
+        for name, _, _ in self.pairs:
+            parts = name.split("/")
+            if len(others) > len(parts):
+                raise ValueError(
+                    f"calibration must have at most {len(parts)} * as the images have, got {pattern!r:.80}"
+                )
+            files.append(self.root / (first + "".join(map("".join, zip(parts, others, strict=False)))))
+            if not files[-1].is_file():
+                raise FileNotFoundError(f"there is no {files[-1]}, the calibration of {name}")
+        return files
 
 
 def described_folder(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
@@ -121,9 +154,7 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
 
 
 def _kind(name: str) -> str:
-    return {"image": "a text", "depth": "a text", "kind": "a text", "invalid": "a list of numbers"}.get(
-        name, "a number"
-    )
+    return "a text" if name in _TEXTS else "a list of numbers" if name == "invalid" else "a number"
 
 
 def _fits(name: str, value: Any) -> bool:
@@ -147,8 +178,7 @@ def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
             f"patterns must have a * and equally many of them, got image={image!r:.80}, depth={depth!r:.80}"
         )
     for pattern in (image, depth):
-        if PurePath(pattern).is_absolute() or ".." in PurePath(pattern).parts or "\0" in pattern:
-            raise ValueError(f"patterns must stay within the folder, got {pattern!r:.80}")
+        _check_within(pattern)
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder {root}")
     images, depths = _matches(root, image), _matches(root, depth)
@@ -166,6 +196,12 @@ def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
         shown = ", ".join(sorted(unpaired)[:3]) + (", ..." if len(unpaired) > 3 else "")
         raise ValueError(f"{len(unpaired)} files in {root} have no partner by {image!r:.80} and {depth!r:.80}: {shown}")
     return [("/".join(name), images[name], depths[name]) for name in sorted(images)]
+
+
+def _check_within(pattern: str) -> None:
+    """Raise ``ValueError`` if a pattern leads out of the folder."""
+    if PurePath(pattern).is_absolute() or ".." in PurePath(pattern).parts or "\0" in pattern:
+        raise ValueError(f"patterns must stay within the folder, got {pattern!r:.80}")
 
 
 def _matches(root: Path, pattern: str) -> dict[tuple[str, ...], str]:

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_tidy.data.hdf5 import MAGIC as HDF5
+from kornia_tidy.data.hdf5 import decode_hdf5
 from kornia_tidy.data.npy import MAGIC as NPY
 from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.data.pfm import decode_pfm
@@ -22,7 +24,7 @@ _HARMLESS = "extraneous bytes before marker 0xd9"
 
 
 def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Read the numbers in a PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP or NPY file, without any conversion.
+    """Read the numbers in a PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP, NPY or HDF5 file, without any conversion.
 
     The format is recognised by content, not by name. The size in the header is checked before decoding, see
     :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. The orientation in EXIF is ignored: depth maps
@@ -50,6 +52,8 @@ def decode_stored(data: bytes, path: str | os.PathLike[str]) -> NDArray[Any]:
     try:
         if data.startswith(NPY):
             stored = decode_npy(data)
+        elif data.startswith(HDF5):
+            stored = decode_hdf5(data)
         elif data.startswith((b"PF", b"Pf")):
             stored = decode_pfm(data)
         else:

@@ -13,8 +13,10 @@ from kornia_tidy.reconstruction.head import ReconstructionHead
 # Each takes in_channels, out_channels and width, and maps (B, in_channels, H, W) to (B, out_channels, H, W).
 HEADS = {
     "attention-unet": "kornia_tidy.reconstruction:AttentionUNet",
+    "depth-anything-v2": "kornia_tidy.inference.baselines:depth_anything_v2",
     "phasecam3d": "kornia_tidy.reconstruction:PhaseCam3DUNet",
     "plain": "kornia_tidy.inference.heads:PlainHead",
+    "zoedepth": "kornia_tidy.inference.baselines:zoedepth",
 }
 
 

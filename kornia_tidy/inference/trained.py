@@ -35,6 +35,8 @@ class TrainedSystem(NamedTuple):
     """Steps of the optimiser that it was trained for."""
     run: Mapping[str, Any] = {}
     """The other settings in its checkpoint, unchecked: those of the run that trained it."""
+    record: Mapping[str, Any] = {}
+    """Record of the training, such as scores, from a folder of :func:`kornia_tidy.inference.hub.save_pretrained`."""
 
 
 def build_optics(settings: SystemSettings) -> TiDyOptics:
@@ -106,7 +108,11 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
         FileNotFoundError: if there is no file.
         ValueError: if it is no checkpoint, or weights and settings do not fit; the message names the difference.
     """
-    state = read_state(path)
+    return system_of_state(read_state(path), path)
+
+
+def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> TrainedSystem:
+    """Return the system of a state that was read; the path is for messages. See :func:`load_trained`."""
     _check_parts(state, path)
     if state["settings"] is None:
         raise ValueError(

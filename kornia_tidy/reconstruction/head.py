@@ -38,6 +38,7 @@ class ReconstructionHead(nn.Module, ABC):
     """
 
     stride: int
+    whole_image = False  # True if each output depends on the whole image, which then cannot be tiled
     looked = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:

@@ -62,6 +62,9 @@ def receptive_field(head: nn.Module) -> int:
     """
     if any(module.training for module in head.modules()):
         raise ValueError("the head must be in eval mode, not training: call head.eval()")
+    for module in head.modules():
+        if isinstance(module, ReconstructionHead) and module.whole_image:
+            raise ValueError(f"the head cannot be tiled: {type(module).__name__} sees the whole image")
     if head not in _found:
         _found[head] = _measure(copy.deepcopy(head).float().cpu(), total_stride(head))
     return _found[head]

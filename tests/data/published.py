@@ -49,6 +49,19 @@ def write_flying_things(
                     number += 1
 
 
+def write_frames(root: Path, image: str, depth: str, count: int = 3) -> None:
+    """Write frames of noise whose paths have the number of the frame in the place of {}."""
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        for pattern, values in (
+            (image, rng.integers(0, 255, (36, 44, 3), np.uint8)),
+            (depth, rng.integers(0, 65535, (36, 44), np.uint16)),
+        ):
+            path = root / pattern.format(number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(path), values)
+
+
 def flying_things_disparity(number: int, size: tuple[int, int] = (12, 20)) -> NDArray[np.float32]:
     """Whole pixels from 1 to 31, different for each file written, and not symmetric in any way."""
     rows, columns = np.indices(size)

@@ -86,7 +86,7 @@ class TestReadDepth(BaseTester):
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"kind": "inverse"}, "kind must be one of 'depth', 'disparity', got 'inverse'"),
+            ({"kind": "inverse"}, "kind must be one of 'depth', 'disparity', 'distance', got 'inverse'"),
             ({"scale": 0.0}, "scale must be positive and finite, got 0.0"),
             ({"scale": NAN}, "scale must be positive and finite, got nan"),
             ({"kind": "disparity"}, "disparity without calibration cannot give metres"),
@@ -96,6 +96,10 @@ class TestReadDepth(BaseTester):
             ({**STEREO, "doffs_px": INF}, "doffs_px must be finite pixels, got inf"),
             ({"focal_px": 900.0}, "belong to kind='disparity'"),
             ({"doffs_px": 1.0}, "belong to kind='disparity'"),
+            ({"kind": "distance"}, "gives depth by focal_px, the focal length in pixels, got None"),
+            ({**STEREO, "kind": "distance"}, "belong to kind='disparity', got kind='distance'"),
+            ({"kind": "distance", "focal_px": -1.0}, "focal_px must be positive and finite pixels, got -1.0"),
+            ({"rotated_bits": 16}, "rotated_bits must be one of 0, 1, .*, got 16"),
         ],
     )
     def test_exception_names_the_bad_option(self, options, message, tmp_path):

@@ -55,6 +55,32 @@ class TestRGBDFolder(BaseTester):
         assert sample["mask"][0, 0].tolist() == [True, True, False, False, True, True]
         self.assert_close(sample["depth"][0, 0], torch.tensor([2.0, 1.0, 1.0, 0.5, 0.5, torch.inf]))
 
+    @pytest.mark.parametrize(("pattern", "path"), [("*/*.json", "{}/{}.json"), ("*/all.json", "{}/all.json")])
+    def test_feature_each_pair_has_its_calibration(self, pattern, path, tmp_path):
+        for scene, frame in (("a", "0"), ("a", "1"), ("b", "0")):
+            write(tmp_path, f"{scene}/{frame}.png", f"{scene}/{frame}_depth.png", 2)
+            scale = {"a": 0.5, "b": 2.0}[scene] if pattern == "*/all.json" else {"0": 0.5, "1": 2.0}[frame]
+            (tmp_path / path.format(scene, frame)).write_text(f'{{"scale": {scale}}}')
+        data = RGBDFolder(tmp_path, "*/*.png", "*/*_depth.png", calibration=pattern, scale=7)
+        found = [sample["depth"].unique().item() for sample in data]
+        assert found == ([1, 1, 4] if pattern == "*/all.json" else [1, 4, 1])
+
+    def test_exception_calibrations(self, tmp_path):
+        write(tmp_path, "x.png", "x_depth.png", 1)
+        patterns = ("*.png", "*_depth.png")
+        for pattern, error, sentence in (
+            ("*.json", FileNotFoundError, r"x\.json, the calibration of x$"),
+            ("*/*.json", ValueError, r"at most 1 \* as the images have, got '\*/\*\.json'"),
+            ("../*.json", ValueError, "must stay within the folder"),
+        ):
+            with pytest.raises(error, match=sentence):
+                RGBDFolder(tmp_path, *patterns, calibration=pattern)
+        (tmp_path / "x.json").write_text('{"focal_px": 5}')
+        with pytest.raises(UnreadableItemError, match="focal_px, baseline_m and doffs_px belong to"):
+            RGBDFolder(tmp_path, *patterns, calibration="*.json")[0]
+        with pytest.raises(ValueError, match="resample must be one of"):
+            RGBDFolder(tmp_path, *patterns, resample="area")
+
     def test_feature_grey_pictures_get_three_channels(self, tmp_path):
         write(tmp_path, "x.png", "x_depth.png", 500)
         cv2.imwrite(str(tmp_path / "x.png"), np.full((4, 6), 51, np.uint8))
@@ -133,6 +159,15 @@ class TestDescribedFolder(BaseTester):
         (tmp_path / "rgbd.json").write_text('{"image": "a/*.png", "depth": "b/*.png", "scale": 0.001, "invalid": [9]}')
         (sample,) = described_folder(tmp_path)
         self.assert_close(sample["depth"].unique(), torch.tensor([2.5]))
+
+    def test_feature_size_calibration_and_fill_are_described_too(self, tmp_path):
+        write(tmp_path, "1.png", "1_d.png", 2)
+        write(tmp_path, "unused/1.png", "1_d.png", 2, size=(2, 3))
+        (tmp_path / "1.json").write_text('{"scale": 0.5}')
+        about = '"calibration": "*.json", "resample": "depth", "fill": "guided", "rotated_bits": 0'
+        (tmp_path / "rgbd.json").write_text('{"image": "*.png", "depth": "*_d.png", ' + about + "}")
+        (sample,) = described_folder(tmp_path)
+        assert torch.equal(sample["depth"], torch.ones(1, 4, 6))
 
     def test_exception_without_a_description(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"there is no .*rgbd\.json: it tells which files"):

@@ -10,6 +10,7 @@ from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
 from torch.utils.data import ConcatDataset, DataLoader, Subset
 
 from kornia_tidy.data import (
+    SUNRGBD,
     DeadLeaves,
     FlyingThings3D,
     NYUDepthV2,
@@ -17,12 +18,13 @@ from kornia_tidy.data import (
     RGBDFolder,
     Scene,
     SceneDataset,
+    TUMSequence,
     UnreadableItemError,
 )
 from tests.base import BaseTester
-from tests.data.published import write_flying_things, write_nyu
+from tests.data.published import write_flying_things, write_frames, write_nyu
 
-KINDS = ("dead leaves", "flying things", "nyu", "folder")
+KINDS = ("dead leaves", "flying things", "nyu", "folder", "tum", "sun rgb-d")
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +33,18 @@ def data(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     write_flying_things(root, {"TRAIN/A": 2}, size=(32, 40))
     write_nyu(root, 3)
+    write_frames(root / "tum", "rgb/{}.png", "depth/{}.png")
+    write_frames(root / "sun", "{}/image/a.png", "{}/depth_bfx/b.png")
+    for part in ("rgb", "depth"):
+        (root / f"tum/{part}.txt").write_text("".join(f"{i} {part}/{i}.png\n" for i in range(3)))
     things = {"kind": "disparity", "focal_px": 1050.0, "baseline_m": 1.0}
     sets = (
         DeadLeaves(3, 40, 48, num_leaves=60),
         FlyingThings3D(root, subsets="A"),
         NYUDepthV2(root, "all"),
         RGBDFolder(root, "frames_cleanpass/TRAIN/*/*/*/*.png", "disparity/TRAIN/*/*/*/*.pfm", **things),
+        TUMSequence(root / "tum"),
+        SUNRGBD(root / "sun"),
     )
     return dict(zip(KINDS, sets, strict=True))
 

@@ -51,6 +51,18 @@ def about_pretrained() -> dict[str, Any]:
     return json.loads((FOLDER / "heads.json").read_text())
 
 
+def pretrained_record(name: str) -> dict[str, Any]:
+    """Return the record of the training of a shipped system: seed, scores by test set, machine and date.
+
+    Example:
+        >>> sorted(pretrained_record("edof-5")["scores"])
+        ['dead leaves', 'real scenes']
+    """
+    check_choice("name", name, PRETRAINED)
+    about = about_pretrained()
+    return {**about["systems"][name], **{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}}
+
+
 def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
     """Write a checkpoint without the state of the run, in half the size, for shipping.
 

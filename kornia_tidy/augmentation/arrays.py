@@ -1,0 +1,257 @@
+"""Captures and reconstructions of NumPy arrays in one call, in OpenCV's layout and colour order."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from kornia.color import rgb_to_linear_rgb
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_choice, check_part, check_positive, described
+from kornia_tidy.data.depth_files import fill_holes
+from kornia_tidy.inference.hub import from_pretrained
+from kornia_tidy.inference.light_head import LightHead, reconstruct_light
+from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+
+Color = Literal["bgr", "rgb"]
+IMAGES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
+SHAPES = "(H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3)"
+
+
+class Reconstructed(NamedTuple):
+    """Arrays that a system reconstructs from captures; None for a map that it was not trained for."""
+
+    image: NDArray[Any] | None
+    """All-in-focus image, in the captures' data type and colour order, encoded as sRGB."""
+    depth: NDArray[np.float32] | None
+    """Depth in metres, (H, W) or (B, H, W); may be infinite."""
+
+
+def simulate(
+    image: NDArray[Any],
+    depth: NDArray[Any],
+    depth_scale: float | None = None,
+    *,
+    optics: TiDyOptics | None = None,
+    color: Color = "bgr",
+    seed: int | None = None,
+) -> NDArray[Any]:
+    """Simulate the coded capture of arrays, such as OpenCV reads.
+
+    Args:
+        image: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8 or uint16 in the range of the type,
+            or float32 in [0, 1]. Encoded as sRGB, or as the camera's colour space has it.
+        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. 0 and NaN are unknown.
+        depth_scale: metres per unit of the depth; 0.001 for millimetres. Integers need it; default of floats: 1.
+        optics: the camera. Default: ``TiDyOptics`` with five random masks, the same ones in every call.
+        color: order of the three channels of image and capture; ``cv2.imread`` gives ``"bgr"``.
+        seed: of the sensor's noise. Default: drawn from torch's global generator.
+
+    Returns:
+        The capture, in the layout, data type and colour order of the image; integers are rounded.
+
+    Raises:
+        TypeError: if an argument is no array, or of another data type.
+        ValueError: if shapes do not fit, a value is out of range, no depth is known, or integers come without
+            ``depth_scale``.
+
+    Convention:
+        - Unknown depth is taken from the nearest known pixel.
+        - Nothing is differentiated: gradients need tensors and :class:`~kornia_tidy.TiDyOptics`.
+
+    Example:
+        >>> bgr = np.full((32, 48, 3), (255, 128, 0), np.uint8)
+        >>> millimetres = np.full((32, 48), 600, np.uint16)
+        >>> capture = simulate(bgr, millimetres, depth_scale=0.001, seed=0)
+        >>> capture.shape, capture.dtype
+        ((32, 48, 3), dtype('uint8'))
+    """
+    optics = _default_optics() if optics is None else optics
+    check_part("optics", optics, TiDyOptics, "a TiDyOptics")
+    pixels = to_tensor(image, color, light=optics.color_space == "linear")
+    metres = depth_to_tensor(depth, depth_scale)
+    if metres.shape[0] != pixels.shape[0] or metres.shape[-2:] != pixels.shape[-2:]:
+        raise ValueError(f"depth must have the rows, columns and batch of the image {image.shape}, got {depth.shape}")
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        coded = optics(pixels, metres, generator=generator)
+    return to_array(coded, image.dtype, color, image.ndim)
+
+
+def reconstruct(
+    capture: NDArray[Any],
+    system: TrainedSystem | LightHead | str | os.PathLike[str] = "joint-5",
+    *,
+    color: Color = "bgr",
+    linear: bool = False,
+    memory_budget: int = 512 << 20,
+) -> Reconstructed:
+    """Reconstruct all-in-focus image and depth from captures in arrays, in tiles that fit the memory.
+
+    Args:
+        capture: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8, uint16, or float32 in [0, 1].
+        system: the trained system: a name of :data:`~kornia_tidy.inference.pretrained.PRETRAINED`, or what
+            :func:`~kornia_tidy.inference.hub.from_pretrained` takes or returns. For many calls with a system of your
+            own, a :class:`~kornia_tidy.inference.light_head.LightHead` of it saves the preparation.
+        color: order of the three channels of capture and image.
+        linear: True if captures hold linear light, False if they are encoded as sRGB.
+        memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+
+    Returns:
+        Image and depth, None for a map that the system was not trained for.
+
+    Raises:
+        TypeError: if an argument is no array, or of another data type.
+        ValueError: if the shape or a value is not as above.
+
+    Example:
+        >>> capture = np.zeros((32, 48, 3), np.uint16)
+        >>> image, depth = reconstruct(capture)
+        >>> image.shape, image.dtype, depth.shape, depth.dtype
+        ((32, 48, 3), dtype('uint16'), (32, 48), dtype('float32'))
+    """
+    pixels = to_tensor(capture, color)
+    head = _light_head(system)
+    light = pixels if linear else rgb_to_linear_rgb(pixels.expand(-1, 3, -1, -1))
+    found = [reconstruct_light(head, one, memory_budget=memory_budget) for one in light]
+    images = [one.image for one in found if one.image is not None]
+    depths = [one.depth[0] for one in found if one.depth is not None]
+    ndim = max(3, capture.ndim)  # a grey capture becomes an image of three channels too
+    near = torch.stack(depths).numpy() if depths else None
+    return Reconstructed(
+        to_array(torch.stack(images), capture.dtype, color, ndim) if images else None,
+        near if near is None or capture.ndim == 4 else near[0],
+    )
+
+
+def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) -> Tensor:
+    """Convert an array of images to a tensor (B, C, H, W) in RGB, float32; integers are scaled to [0, 1].
+
+    Args:
+        image: as for :func:`simulate`.
+        color: order of three channels.
+        light: whether floats above 1 are allowed, as linear light may be.
+
+    Raises:
+        TypeError: if it is no array, or of another data type.
+        ValueError: if the shape or a value is not allowed.
+
+    Example:
+        >>> to_tensor(np.array([[[0, 51, 255]]], np.uint8)).flatten().tolist()
+        [1.0, 0.20000000298023224, 0.0]
+    """
+    check_choice("color", color, ("bgr", "rgb"))
+    if not isinstance(image, np.ndarray) or image.dtype not in IMAGES:
+        kind = image.dtype if isinstance(image, np.ndarray) else described(image)
+        raise TypeError(f"image must be an array of uint8, uint16 or float32, got {kind}")
+    planes = {2: lambda: image[None, ..., None], 3: lambda: image[None], 4: lambda: image}
+    pixels = planes[image.ndim]() if image.ndim in planes else image
+    if pixels.ndim != 4 or pixels.shape[3] not in {1, 3} or 0 in pixels.shape[1:]:
+        raise ValueError(f"image must have shape {SHAPES}, got {image.shape}{_shape_remedy(image)}")
+    if image.dtype == np.float32:
+        lowest, highest = (float(image.min()), float(image.max())) if image.size else (0.0, 0.0)
+        if not (lowest >= 0 and (highest <= 1 or (light and np.isfinite(highest)))):  # True for NaN
+            remedy = ": divide by 255, or give uint8" if 1 < highest <= 255 and lowest >= 0 else ""
+            limits = "be finite and not negative" if light else "lie in [0, 1]"
+            raise ValueError(f"a float32 image must {limits}, found {lowest:.6g} to {highest:.6g}{remedy}")
+    if color == "bgr":
+        pixels = pixels[..., ::-1]
+    values = pixels.transpose(0, 3, 1, 2).astype(np.float32, order="C")
+    if image.dtype.kind == "u":
+        values /= np.iinfo(image.dtype).max
+    return torch.from_numpy(values)
+
+
+def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Tensor:
+    """Convert an array of depths to metres, (B, 1, H, W) float32; unknown ones get that of the nearest known pixel.
+
+    Args:
+        depth: as for :func:`simulate`.
+        depth_scale: metres per unit. None: floats are metres.
+
+    Raises:
+        TypeError: if it is no array of integers or floats.
+        ValueError: if the shape or a value is not allowed, no depth is known, or integers come without a scale.
+
+    Example:
+        >>> depth_to_tensor(np.array([[0, 500, 2000]], np.uint16), 0.001)
+        tensor([[[[0.5000, 0.5000, 2.0000]]]])
+    """
+    if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "uif":
+        kind = depth.dtype if isinstance(depth, np.ndarray) else described(depth)
+        raise TypeError(f"depth must be an array of integers or floats, got {kind}")
+    if depth.ndim not in {2, 3, 4} or 0 in depth.shape[-2:] or (depth.ndim == 4 and depth.shape[3] != 1):
+        raise ValueError(f"depth must have shape (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1), got {depth.shape}")
+    if depth_scale is None and depth.dtype.kind != "f":
+        raise ValueError(f"a depth of {depth.dtype} needs depth_scale, metres per unit, such as 0.001 for millimetres")
+    check_positive("depth_scale", 1.0 if depth_scale is None else depth_scale, "metres per unit")
+    if depth.ndim == 2 or (depth.ndim == 3 and depth.shape[2] == 1):
+        maps = depth.reshape(1, *depth.shape[:2])
+    else:
+        maps = depth.reshape(depth.shape[:3])
+    if (bad := maps < 0).any():
+        raise ValueError(f"depth must not be negative, got {maps[bad][0]}")
+    metres = (maps.astype(np.float64) * (1.0 if depth_scale is None else depth_scale)).astype(np.float32)
+    known = metres > 0  # False for NaN too
+    for i, one in enumerate(known):
+        if not one.any():
+            raise ValueError(
+                f"depth must be known at one pixel or more, and map {i} of {len(known)} holds 0 or NaN alone"
+            )
+    filled = [fill_holes(one, where) for one, where in zip(metres, known, strict=True)]
+    return torch.from_numpy(np.stack(filled)[:, None] if filled else metres[:, None])
+
+
+def to_array(images: Tensor, dtype: np.dtype[Any], color: Color, ndim: int) -> NDArray[Any]:
+    """Convert images (B, C, H, W) to an array of a data type with 2, 3 (without batch) or 4 axes.
+
+    Example:
+        >>> to_array(torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1), np.dtype(np.uint8), "bgr", 3).tolist()
+        [[[0, 128, 255]]]
+    """
+    values = images.detach().cpu().permute(0, 2, 3, 1).numpy()
+    if color == "bgr":
+        values = values[..., ::-1]
+    if dtype.kind == "u":
+        values = np.rint(values.astype(np.float64).clip(0, 1) * np.iinfo(dtype).max)
+    array = np.ascontiguousarray(values, dtype)
+    return array if ndim == 4 else array[0, ..., 0] if ndim == 2 else array[0]
+
+
+@cache
+def _default_optics() -> TiDyOptics:
+    return TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
+
+
+def _light_head(system: Any) -> LightHead:
+    """Return the network of a system for linear light."""
+    if isinstance(system, LightHead):
+        return system
+    if isinstance(system, str) and system in PRETRAINED:
+        return _shipped(system)
+    if isinstance(system, (str, os.PathLike)):
+        system = from_pretrained(system)
+    check_part("system", system, TrainedSystem, "a TrainedSystem, a LightHead, a name or a folder")
+    return LightHead(system)
+
+
+@cache
+def _shipped(name: str) -> LightHead:
+    return LightHead(load_pretrained(name))
+
+
+def _shape_remedy(image: NDArray[Any]) -> str:
+    """Return the remedy for usual other layouts: alpha, channels first, a batch of grey images."""
+    if image.ndim == 3 and image.shape[2] == 4:
+        return ": drop alpha with image[..., :3]"
+    if image.ndim in {3, 4} and image.shape[-3] in {1, 3}:
+        return f": channels come last, np.moveaxis(image, {image.ndim - 3}, -1)"
+    return ": a batch of grey images is image[..., None]" if image.ndim == 3 else ""

@@ -1,0 +1,142 @@
+"""Published RGB-D data sets in folders: their patterns of names, and how they store depth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from kornia_tidy.data.rgbd_folder import RGBDFolder
+from kornia_tidy.data.scene_dataset import Transform
+
+HYPERSIM_FOCAL_PX = 886.81  # of all its images, 1024 x 768
+
+
+def middlebury(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
+    """Return the stereo scenes of Middlebury from 2014 and 2021, with depth in metres by the calibration of each.
+
+    Args:
+        root: folder of folders such as ``Motorcycle-perfect`` with ``im0.png``, ``disp0.pfm`` or, as in the evaluation
+            sets, ``disp0GT.pfm``, and ``calib.txt``.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        ValueError: if an image has no depth, or depth no image.
+
+    Convention:
+        Infinite disparity is unknown. Disparity is not valid at pixels that the right camera does not see, unless the
+        file tells it.
+
+    Source: Scharstein et al., High-Resolution Stereo Datasets with Subpixel-Accurate Ground Truth (GCPR 2014).
+    """
+    layouts = [("*/im0.png", "*/disp0.pfm"), ("*/im0.png", "*/disp0GT.pfm")]
+    options = {"kind": "disparity", "calibration": "*/calib.txt"}
+    return _folder("Middlebury", root, layouts, transform, **options)
+
+
+def seven_scenes(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
+    """Return the frames of 7-Scenes; depth is in millimetres, and 0 and 65535 are unknown.
+
+    Args:
+        root: folder of a scene, with ``seq-01/frame-000000.color.png`` and ``.depth.png``, or of a sequence.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        ValueError: if an image has no depth, or depth no image.
+
+    Convention:
+        Image and depth are of two cameras, and are not aligned in the published files.
+
+    Source: Shotton et al., Scene Coordinate Regression Forests (CVPR 2013).
+    """
+    names = [("frame-*.color.png", "frame-*.depth.png"), ("frame-*.color.jpg", "frame-*.depth.png")]
+    layouts = [(f"*/{image}", f"*/{depth}") for image, depth in names] + names
+    return _folder("7-Scenes", root, layouts, transform, scale=0.001, invalid=[65535])
+
+
+def scannet(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
+    """Return the frames of ScanNet, exported from its ``.sens`` files; depth is in millimetres, 0 and 65535 unknown.
+
+    Args:
+        root: folder of scans, with ``scene0000_00/color/0.jpg`` and ``scene0000_00/depth/0.png``, or of one scan.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        ValueError: if an image has no depth, or depth no image.
+
+    Convention:
+        Images, 1296 x 968, are averaged to the size of the depth, 640 x 480.
+
+    Source: Dai et al., ScanNet (CVPR 2017).
+    """
+    layouts = [("*/color/*.jpg", "*/depth/*.png"), ("color/*.jpg", "depth/*.png")]
+    return _folder("ScanNet", root, layouts, transform, scale=0.001, invalid=[65535], resample="image")
+
+
+def kitti(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
+    """Return the selected validation frames of KITTI's depth benchmark, with sparse depth filled along image edges.
+
+    Args:
+        root: the folder ``val_selection_cropped``, with ``image`` and ``groundtruth_depth``.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        ValueError: if an image has no depth, or depth no image.
+
+    Convention:
+        Stored values are metres times 256, and 0 is unknown. The mask is True where the laser measured. Everything
+        else is filled, see :func:`~kornia_tidy.data.guided_fill.fill_guided`; the sky above the laser's reach gets the
+        depth of what is below it.
+
+    Source: Uhrig et al., Sparsity Invariant CNNs (3DV 2017).
+    """
+    layouts = [("image/*_image_*_image_*.png", "groundtruth_depth/*_groundtruth_depth_*_image_*.png")]
+    return _folder("KITTI", root, layouts, transform, scale=1 / 256, fill="guided")
+
+
+def hypersim(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
+    """Return the frames of Hypersim; the stored distance along the ray is converted to depth.
+
+    It needs ``pip install 'kornia-tidy[data]'``.
+
+    Args:
+        root: folder of scenes, with ``ai_001_001/images/scene_cam_00_final_preview/frame.0000.tonemap.jpg`` and
+            ``ai_001_001/images/scene_cam_00_geometry_hdf5/frame.0000.depth_meters.hdf5``.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        ValueError: if an image has no depth, or depth no image.
+
+    Convention:
+        NaN, such as a window, is unknown. A focal length of 886.81 px is taken for every camera; some scenes have
+        tilted lenses, for which it is an approximation.
+
+    Source: Roberts et al., Hypersim (ICCV 2021).
+    """
+    folder = "*/images/scene_*"
+    layouts = [(f"{folder}_final_preview/frame.*.tonemap.jpg", f"{folder}_geometry_hdf5/frame.*.depth_meters.hdf5")]
+    return _folder("Hypersim", root, layouts, transform, kind="distance", focal_px=HYPERSIM_FOCAL_PX)
+
+
+def _folder(
+    name: str,
+    root: str | os.PathLike[str],
+    layouts: Sequence[tuple[str, str]],
+    transform: Transform | None,
+    **options: Any,
+) -> RGBDFolder:
+    """Return the pairs of the first layout that files in the folder have."""
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"there is no folder {root}")
+    for image, depth in layouts:
+        if any(root.glob(image)) and any(root.glob(depth)):
+            return RGBDFolder(root, image, depth, transform=transform, **options)
+    wanted = " or ".join(f"{image} with {depth}" for image, depth in layouts)
+    raise FileNotFoundError(f"{name} is not in {root}: there should be {wanted}")

@@ -1,0 +1,64 @@
+"""SUN RGB-D: indoor frames of four depth cameras, whose 16-bit depth has rotated bits."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+
+ROTATED_BITS = 3  # to the left, in the published files
+
+
+class SUNRGBD(SceneDataset):
+    """Data set of the frames of SUN RGB-D, as published.
+
+    Args:
+        root: folder ``SUNRGBD`` or a part of it, such as ``SUNRGBD/kv2``. Each frame is a folder that holds ``image``,
+            ``depth`` and ``depth_bfx``, each with one file.
+        raw: the measured depth, ``depth``. Default: ``depth_bfx``, whose holes were filled by the publishers from
+            several frames.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
+
+    Raises:
+        FileNotFoundError: if there is no folder, or it holds no frame.
+        ValueError: if a frame does not have one image and one depth.
+
+    Convention:
+        - Depth is in millimetres once the bits are rotated back, and 0 is unknown. The publishers' code clips it at
+          8 m; it is not clipped here.
+        - A name is the path of a frame's folder.
+
+    Source: Song et al., SUN RGB-D (CVPR 2015), with the bit rotation of its toolbox.
+    """
+
+    def __init__(self, root: str | os.PathLike[str], *, raw: bool = False, transform: Transform | None = None) -> None:
+        super().__init__(transform)
+        self.root = Path(root)
+        part = "depth" if raw else "depth_bfx"
+        if not self.root.is_dir():
+            raise FileNotFoundError(f"there is no folder {self.root}")
+        frames = sorted(Path(at) for at, folders, _ in os.walk(self.root) if {"image", part} <= set(folders))
+        if not frames:
+            raise FileNotFoundError(f"SUN RGB-D is not in {self.root}: a frame is a folder with image/ and {part}/")
+        self.pairs = [(_only_file(frame / "image"), _only_file(frame / part)) for frame in frames]
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.pairs)
+
+    def name(self, index: int) -> str:
+        """Return the path of a frame's folder."""
+        return self.pairs[index][0].parent.parent.relative_to(self.root).as_posix()
+
+    def read(self, index: int) -> Scene:
+        """Read a frame."""
+        return read_rgbd(*self.pairs[index], scale=0.001, rotated_bits=ROTATED_BITS)
+
+
+def _only_file(folder: Path) -> Path:
+    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    if len(files) != 1:
+        raise ValueError(f"{folder} should hold one file, found {len(files)}")
+    return files[0]

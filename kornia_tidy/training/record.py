@@ -1,0 +1,55 @@
+"""Record of a training run, read from its folder: scores of its evaluation and of its validation."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+from kornia_tidy.files import read_bytes, read_json
+
+EVALUATION, VALIDATION = "evaluation/summary.json", "validation.csv"
+
+
+def training_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    r"""Read the record of a run for its model card, see :func:`kornia_tidy.inference.hub.save_pretrained`.
+
+    Args:
+        folder: of the run. ``evaluation/summary.json`` in it, which ``kornia-tidy evaluate`` writes, has the scores on
+            test scenes, ``validation.csv`` those after each epoch.
+
+    Returns:
+        ``"scores"`` by test set, if the run was evaluated, and ``"validation"``, the lines of ``validation.csv``.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or neither file in it.
+        ValueError: if a file is damaged.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "validation.csv").write_text("epoch,val_loss\n0,0.5\n")
+        ...     training_record(folder)
+        {'validation': [{'epoch': '0', 'val_loss': '0.5'}]}
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no folder {folder}")
+    record: dict[str, Any] = {}
+    if (summary := folder / EVALUATION).exists():
+        about = read_json(summary)
+        try:
+            test_set = f"{about['settings']['data']}, {about['split']}, {about['scenes']} scenes"
+            record["scores"] = {test_set: {str(name): float(value) for name, value in about["mean"].items()}}
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"cannot read {summary}: it is no summary of an evaluation: {error!r:.80}") from error
+    if (validation := folder / VALIDATION).exists():
+        try:
+            record["validation"] = list(csv.DictReader(io.StringIO(read_bytes(validation).decode()), strict=True))
+        except (csv.Error, ValueError) as error:
+            raise ValueError(f"cannot read {validation}: {error}") from error
+    if not record:
+        raise FileNotFoundError(f"{folder} has neither {EVALUATION} nor {VALIDATION}: it is no folder of a run")
+    return record

@@ -1,0 +1,187 @@
+"""Captures and reconstructions of arrays: the same pixels as tensors give, in each layout, type and colour order."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import kornia_tidy
+from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
+from kornia_tidy.data import read_rgbd
+from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.inference.light_head import LightHead, reconstruct_opencv
+from kornia_tidy.inference.pretrained import load_pretrained
+from tests.base import BaseTester
+
+MOST = {"uint8": 255, "uint16": 65535, "float32": 1}
+
+
+def picture(dtype, *shape, seed=0):
+    values = np.random.default_rng(seed).random(shape)
+    return (values * MOST[dtype]).astype(dtype)
+
+
+@pytest.fixture(scope="module")
+def optics():
+    return TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(1)), sensor=None, fidelity="draft")
+
+
+@pytest.fixture(scope="module")
+def head():
+    return LightHead(load_pretrained("joint-1"))
+
+
+class TestSimulate(BaseTester):
+    @pytest.mark.parametrize("kind", MOST)
+    @pytest.mark.parametrize("color", ["bgr", "rgb"])
+    def test_feature_the_capture_of_the_same_tensors(self, kind, color, optics):
+        """Within the rounding to the data type and of the division to [0, 1]."""
+        image, depth = picture(kind, 24, 32, 3), picture("float32", 24, 32, seed=1) + 0.5
+        rgb = image[..., ::-1] if color == "bgr" else image
+        tensor = torch.from_numpy(np.ascontiguousarray(rgb.astype(np.float64) / MOST[kind])).permute(2, 0, 1)
+        expected = optics(tensor.float(), torch.from_numpy(depth)[None]).detach().permute(1, 2, 0).numpy()
+        found = kornia_tidy.simulate(image, depth, optics=optics, color=color)
+        assert found.dtype == image.dtype
+        assert found.flags.c_contiguous
+        found = (found[..., ::-1] if color == "bgr" else found) / MOST[kind]
+        assert np.abs(found - expected).max() <= (0.5 / MOST[kind] if MOST[kind] > 1 else 0) + 1e-5
+
+    @pytest.mark.parametrize("shape", [(24, 32), (24, 32, 1), (24, 32, 3), (2, 24, 32, 1), (2, 24, 32, 3)])
+    def test_cardinality(self, shape, optics):
+        size = shape[:3] if len(shape) == 4 else shape[:2]
+        depth = np.full(size, 0.7, np.float32)
+        for one in (depth, depth[..., None]):
+            assert kornia_tidy.simulate(picture("uint8", *shape), one, optics=optics).shape == shape
+
+    def test_feature_a_batch_is_its_images(self, optics):
+        image, depth = picture("uint16", 2, 24, 32, 3), picture("float32", 2, 24, 32) + 0.4
+        found = kornia_tidy.simulate(image, depth, optics=optics)
+        for i in range(2):
+            one = kornia_tidy.simulate(image[i], depth[i], optics=optics).astype(int)
+            assert np.abs(found[i] - one).max() <= 1
+
+    def test_feature_files_of_opencv_and_the_readers_agree(self, tmp_path, optics):
+        bgr, millimetres = picture("uint8", 24, 32, 3), (1000 * (picture("float32", 24, 32) + 0.5)).astype(np.uint16)
+        millimetres[4:9, 5:20] = 0  # unknown
+        cv2.imwrite(str(tmp_path / "a.png"), bgr)
+        cv2.imwrite(str(tmp_path / "d.png"), millimetres)
+        scene = read_rgbd(tmp_path / "a.png", tmp_path / "d.png", scale=0.001)
+        expected = optics(scene.image, scene.depth).detach().numpy()[::-1].transpose(1, 2, 0)
+        read = cv2.imread(str(tmp_path / "a.png")), cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
+        found = kornia_tidy.simulate(*read, depth_scale=0.001, optics=optics)
+        assert np.abs(found / 255 - expected).max() <= 0.5 / 255 + 1e-5
+
+    def test_feature_the_same_masks_in_every_call_and_noise_by_seed(self):
+        image, depth = picture("uint16", 40, 48, 3), np.full((40, 48), 0.4)
+        first, second, other = (kornia_tidy.simulate(image, depth, seed=seed) for seed in (0, 0, 1))
+        told = TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
+        assert (first == kornia_tidy.simulate(image, depth, optics=told, seed=0)).all()
+        assert (first == second).all()
+        assert (first != other).any()
+        assert np.abs(first.astype(int) - other).max() < 0.2 * 65535  # noise of 0.01 in linear light, not other masks
+
+    def test_feature_float_light_above_one_where_the_camera_is_linear(self):
+        optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity="draft", color_space="linear")
+        image = np.full((24, 32, 3), 4.0, np.float32)
+        found = kornia_tidy.simulate(image, np.full((24, 32), 0.6), optics=optics)
+        assert found.max() == pytest.approx(4.0, rel=1e-3)
+
+    @pytest.mark.parametrize(
+        ("change", "error", "sentence"),
+        [
+            ({"image": np.zeros((4, 5, 3))}, TypeError, "uint8, uint16 or float32, got float64"),
+            ({"image": [[0]]}, TypeError, "image must be an array of .*, got a list"),
+            ({"image": np.zeros((4, 5, 4), np.uint8)}, ValueError, r"got \(4, 5, 4\): drop alpha"),
+            ({"image": np.zeros((3, 4, 5), np.uint8)}, ValueError, r"channels come last, np.moveaxis\(image, 0, -1\)"),
+            ({"image": np.zeros((7, 4, 5), np.uint8)}, ValueError, r"batch of grey images is image\[..., None\]"),
+            ({"image": np.zeros((4,), np.uint8)}, ValueError, r"image must have shape .*, got \(4,\)"),
+            ({"image": np.zeros((0, 5, 3), np.uint8)}, ValueError, r"image must have shape .*, got \(0, 5, 3\)"),
+            (
+                {"image": np.full((4, 5, 3), 200, np.float32)},
+                ValueError,
+                r"in \[0, 1\], found 200 to 200: divide by 255",
+            ),
+            ({"image": np.full((4, 5, 3), -0.1, np.float32)}, ValueError, r"in \[0, 1\], found -0.1 to -0.1"),
+            ({"image": np.full((4, 5, 3), np.nan, np.float32)}, ValueError, r"in \[0, 1\], found nan"),
+            ({"depth": np.ones((4, 5), np.uint16)}, ValueError, "depth of uint16 needs depth_scale, .* such as 0.001"),
+            ({"depth": np.ones((4, 5), bool)}, TypeError, "depth must be an array of integers or floats, got bool"),
+            ({"depth": -np.ones((4, 5))}, ValueError, "depth must not be negative, got -1.0"),
+            ({"depth": np.zeros((4, 5))}, ValueError, "must be known at one pixel or more"),
+            ({"depth": np.ones((5, 4))}, ValueError, r"rows, columns and batch of the image \(4, 5, 3\), got \(5, 4\)"),
+            ({"depth": np.ones((2, 4, 5))}, ValueError, "rows, columns and batch"),
+            ({"depth": np.ones((4, 5, 2, 2))}, ValueError, r"depth must have shape .*, got \(4, 5, 2, 2\)"),
+            ({"depth_scale": 0.0}, ValueError, "depth_scale must be positive"),
+            ({"color": "BGR"}, ValueError, "color must be one of 'bgr', 'rgb', got 'BGR'"),
+            ({"optics": "tidy-5"}, TypeError, "optics must be a TiDyOptics, got 'tidy-5'"),
+        ],
+    )
+    def test_exception(self, change, error, sentence):
+        given = {"image": np.zeros((4, 5, 3), np.uint8), "depth": np.ones((4, 5)), **change}
+        with pytest.raises(error, match=sentence) as raised:
+            kornia_tidy.simulate(**given)
+        assert "\n" not in str(raised.value)
+
+
+class TestReconstruct(BaseTester):
+    @pytest.mark.parametrize("kind", MOST)
+    def test_feature_the_images_of_the_existing_function(self, kind, head):
+        capture = picture(kind, 2, 32, 48, 3)
+        image, depth = kornia_tidy.reconstruct(capture, head)
+        assert image.dtype == capture.dtype
+        assert image.shape == capture.shape
+        assert depth.shape == (2, 32, 48)
+        given = capture[1] if kind != "float32" else np.rint(65535 * capture[1]).astype(np.uint16)
+        expected, metres = reconstruct_opencv(head, given)
+        most = np.iinfo(given.dtype).max
+        assert np.abs(image[1] / MOST[kind] - expected / most).max() < 1e-3
+        assert np.allclose(1 / depth[1], 1 / metres, atol=1e-3)
+
+    def test_cardinality(self, head):
+        for shape, found in (((32, 48), (32, 48, 3)), ((32, 48, 1), (32, 48, 3)), ((1, 32, 48, 1), (1, 32, 48, 3))):
+            image, depth = kornia_tidy.reconstruct(picture("uint8", *shape), head)
+            assert image.shape == found
+            assert depth.shape == found[:-1]
+
+    def test_feature_colours_by_name(self, head):
+        capture = picture("uint16", 32, 48, 3)
+        bgr = kornia_tidy.reconstruct(capture, head, color="bgr").image
+        rgb = kornia_tidy.reconstruct(np.ascontiguousarray(capture[..., ::-1]), head, color="rgb").image
+        assert (bgr == rgb[..., ::-1]).all()
+
+    def test_feature_a_system_without_depth(self):
+        image, depth = kornia_tidy.reconstruct(picture("uint8", 32, 48, 3), load_pretrained("edof-1"))
+        assert depth is None
+        assert image.shape == (32, 48, 3)
+
+    def test_exception(self, head):
+        with pytest.raises(FileNotFoundError, match="there is no folder"):
+            kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), "joint-9")
+        with pytest.raises(ValueError, match=r"image must have shape .*, got \(8, 8, 4\): drop alpha"):
+            kornia_tidy.reconstruct(picture("uint8", 8, 8, 4), head)
+        with pytest.raises(TypeError, match="system must be a TrainedSystem"):
+            kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), 5)
+
+
+class TestConversion(BaseTester):
+    @pytest.mark.parametrize("kind", ["uint8", "uint16"])
+    def test_feature_every_number_comes_back(self, kind):
+        numbers = np.arange(MOST[kind] + 1, dtype=kind).reshape(2, -1)
+        assert (to_array(to_tensor(numbers), numbers.dtype, "bgr", 2) == numbers).all()
+
+    def test_feature_holes_get_the_nearest_depth(self, tmp_path):
+        depth = torch.rand(1, 9, 11) + 0.5
+        write_depth(tmp_path / "a.npy", depth)
+        holes = depth[0].numpy().copy()
+        holes[2:5, 3:4], holes[0, 0] = np.nan, 0
+        found = depth_to_tensor(holes)[0, 0]
+        assert torch.equal(found[holes > 0], depth[0][holes > 0])
+        assert found[3, 3] in depth[0, 2:5, 2:5]
+        assert found[0, 0] in depth[0, :2, :2]
+
+    def test_feature_the_names_are_there_and_others_are_not(self):
+        assert {"simulate", "reconstruct"} <= set(kornia_tidy.__all__)
+        with pytest.raises(AttributeError, match="has no attribute 'simulat'"):
+            _ = kornia_tidy.simulat
