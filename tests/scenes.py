@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import pytest
+import torch
 
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from tests.base import DATA, shared
@@ -43,6 +45,17 @@ def load_scene(name: str) -> Scene:
         plain = Path(folder) / "depth.png"
         cv2.imwrite(str(plain), (rotated >> 3) | (rotated << 13))
         return read_rgbd(image, plain, **options)
+
+
+def halves(names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Split scenes into half A, from which statistics and settings are taken, and half B, which only scores.
+
+    Names are sorted and drawn in a random order of seed 0. Half A is the first half of that order, with the middle one.
+    """
+    ordered = sorted(names)
+    order = torch.randperm(len(ordered), generator=torch.Generator().manual_seed(0)).tolist()
+    drawn, middle = [ordered[index] for index in order], (len(ordered) + 1) // 2
+    return sorted(drawn[:middle]), sorted(drawn[middle:])
 
 
 def _unknown(text: str) -> list[float]:
