@@ -51,8 +51,9 @@ class Capture:
     light: Tensor
     """(1, 3, H, W), linear light in [0, 1]."""
     system: System
-    sigma: float
-    """Standard deviation of the noise at a fifth of full scale, in linear light."""
+    noise: Tensor
+    """Standard deviation of the noise in linear light by the sensor's model: (1, 1, 1, 1), with shot noise of each
+    pixel, (1, 3, H, W)."""
     restored: dict[object, Tensor] = field(default_factory=dict)
     """Linear light of inversions that were computed, by name and settings."""
 
@@ -67,7 +68,9 @@ def capture(system: System, scene: BenchScene, light: Tensor, noise: str) -> Cap
     sensor = sensor_of(noise, system.f_number)
     generator = torch.Generator().manual_seed(keyed_seed("results", scene.name, noise))
     with torch.no_grad():
-        return Capture(sensor(light, generator=generator), system, sigma_of(noise, system.f_number))
+        taken = sensor(light, generator=generator)
+    noise_map = torch.full((1, 1, 1, 1), sensor.sigma) if sensor.full_well is None else sensor.std(taken)
+    return Capture(taken, system, noise_map)
 
 
 def sigma_of(noise: str, f_number: float) -> float:

@@ -119,7 +119,7 @@ def _network(factor: float) -> Restoration:
         system = capture.system
         assert system.head is not None
         assert system.task is not None
-        told = {"noise": torch.full((1, 1, 1, 1), factor * capture.sigma)} if takes_noise(system) else {}
+        told = {"noise": factor * capture.noise} if takes_noise(system) else {}
         maps = split_maps(system.task, system.head(capture.image, **told).float())
         return {name: value.clamp(0, 1) for name, value in maps.items()}
 
