@@ -78,7 +78,8 @@ def _wrong_noise(results: Results) -> Iterator[Verdict]:
         yield Verdict(claim, "no network takes a noise level", target, None)
     else:
         loss = losses[worst]
-        words = f"{loss}: {worst.system}, {worst.noise}, {worst.restoration.removeprefix(f'{NETWORK}, ')}"
+        level = worst.restoration.removeprefix(f"{NETWORK}, noise ")
+        words = f"{loss}: {worst.system}, noise {worst.noise}, noise level {level}"
         yield Verdict(claim, words, target, loss.mean <= WRONG_NOISE_LOSS)
 
 
