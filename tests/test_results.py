@@ -95,13 +95,21 @@ class TestNoise(BaseTester):
 class TestSystems(BaseTester):
     def test_feature_kinds_are_told_from_the_masks(self):
         makers = available()
-        kinds = {name: makers[name]().kind for name in ("edof-5", "edof-0", FLAT, "preset chang2019")}
-        assert list(kinds.values()) == ["coded", "Fresnel", "flat", "published"]
+        kinds = {
+            name: makers[name]().kind for name in ("edof-5", "edof-0", FLAT, "preset chang2019", "edof-1 as trained")
+        }
+        assert list(kinds.values()) == ["coded", "Fresnel", "flat", "published", "as trained"]
 
     def test_feature_psfs_of_129_pixels_and_stray_light_hold_all_light(self):
         bank = available()["edof-1"]().optics.psf_bank(defocus=[-20.0, 0.0])
         assert bank.window == WINDOW == 129
         self.assert_close(bank.psfs.sum((-2, -1)) + bank.veil, torch.ones(2, 3))
+
+    def test_feature_a_system_as_trained_has_its_window_and_no_stray_light(self):
+        system = available()["edof-1 as trained"]()
+        assert system.optics.window == load_pretrained("edof-1").optics.window < WINDOW
+        assert f"PSFs of {system.optics.window} px" in system.title
+        assert system.optics.psf_bank(defocus=[0.0]).veil is None
 
     def test_feature_flat_lenses_have_their_f_number(self):
         assert available()["flat f/22"]().f_number == pytest.approx(22.0)

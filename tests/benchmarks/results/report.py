@@ -45,8 +45,9 @@ this page, and goes on where it was interrupted.
 - **Scores** are those of sRGB images clipped to [0, 1]. Chroma PSNR is that of Cb and Cr. ± is the standard error of
   the mean of differences, taken scene by scene.
 - **Systems.** `edof-5` has five masks, `edof-1` one, and `edof-0` a Fresnel element of 10 rad, the paper's camera of
-  no masks. `joint` systems estimate depth too. *Flat* is a lens without masks at its f-number. *Preset* is a published
-  camera with its masks as before training.
+  no masks. `joint` systems estimate depth too. *As trained* is the camera in the small window of its training, whose
+  PSFs are scaled to sum one: without stray light. *Flat* is a lens without masks at its f-number. *Preset* is a
+  published camera with its masks as before training.
 """
 
 

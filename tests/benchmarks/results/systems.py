@@ -31,7 +31,7 @@ class System:
 
     name: str
     kind: str
-    """``"coded"``, ``"flat"``, ``"Fresnel"`` or ``"published"``."""
+    """``"coded"``, ``"flat"``, ``"Fresnel"``, ``"published"`` or ``"as trained"``."""
     optics: TiDyOptics
     """From linear light to linear light."""
     head: nn.Module | None
@@ -53,6 +53,7 @@ class System:
             "flat": "flat lens",
             "Fresnel": "Fresnel element of 10 rad, as in the paper",
             "published": f"{count} mask{'s' * (count > 1)} as before training",
+            "as trained": f"K = {count}, PSFs of {self.optics.window} px of sum one",
             "coded": f"K = {count}",
         }
         return f"{words[self.kind]}, f/{self.f_number:.3g}"
@@ -61,6 +62,7 @@ class System:
 def available() -> dict[str, Callable[[], System]]:
     """Return a function for each system that the benchmark knows by name."""
     known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in PRETRAINED}
+    known |= {f"{name} as trained": _as_trained(name) for name in PRETRAINED if not name.endswith("-0")}
     known |= {f"flat f/{number:g}": _flat(number) for number in FLAT}
     return known | {f"preset {name}": _published(name) for name in SYSTEMS}
 
@@ -83,6 +85,19 @@ def _shipped(name: str) -> Callable[[], System]:
     return lambda: of_trained(name, load_pretrained(name))
 
 
+def _as_trained(name: str) -> Callable[[], System]:
+    """A shipped system in the small window that it was trained with: captures without stray light."""
+
+    def make() -> System:
+        trained = load_pretrained(name)
+        fidelity = trained.optics.fidelity
+        return _system(
+            f"{name} as trained", "as trained", trained.optics, trained.head, trained.settings.task, fidelity
+        )
+
+    return make
+
+
 def _flat(f_number: float) -> Callable[[], System]:
     def make() -> System:
         camera = ThinLensCamera(FOCAL_LENGTH, FOCAL_LENGTH / f_number)
@@ -99,9 +114,16 @@ def _published(name: str) -> Callable[[], System]:
     return make
 
 
-def _system(name: str, kind: str, optics: TiDyOptics, head: nn.Module | None = None, task: str | None = None) -> System:
+def _system(
+    name: str,
+    kind: str,
+    optics: TiDyOptics,
+    head: nn.Module | None = None,
+    task: str | None = None,
+    fidelity: Fidelity = FIDELITY,
+) -> System:
     assert isinstance(optics.camera, ThinLensCamera)
-    optics.fidelity, optics.sensor, optics.color_space = FIDELITY, None, "linear"
+    optics.fidelity, optics.sensor, optics.color_space = fidelity, None, "linear"
     optics.eval()
     digest = hashlib.sha256()
     for part in (optics, *([] if head is None else [head.eval()])):
