@@ -1,4 +1,4 @@
-"""Tests of the benchmark of results: halves, noise, search, what is chosen on which half, and a short run."""
+"""Tests of the benchmark of results: halves, noise, search, choice on half A, and a short run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Benchmark of results: image and depth that each optical system and each restoration make of the same scenes.
+"""Benchmark of results: scores of images and depth, by optical system, restoration and noise, on the same scenes.
 
 - Scenes: the 35 real scenes of ``../shared/data`` (middle 512 pixels, depths stretched in dioptres over the camera's
   range) and dead leaves. Each set is split by a fixed seed: settings are chosen on half A, half B only scores.

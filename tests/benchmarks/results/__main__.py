@@ -1,4 +1,4 @@
-"""Measure what optical systems and restorations make of the same scenes, and write tables, CSV and a picture.
+"""Measure scores of optical systems and restorations on the same scenes, and write tables, CSV and a picture.
 
 - ``python -m tests.benchmarks.results`` measures all systems, restorations and noises: some hours on one core. A value
   is kept in FOLDER/results.sqlite as soon as it is measured; the same command goes on where it was interrupted. Two of
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     systems = _systems(args)
     for noise in args.noises:
-        sensor_of(noise, 17.6)  # a noise that cannot be is told before any work
+        sensor_of(noise, 17.6)  # raises for an unknown noise, before any work
     sets = _sets(args)
     with Store(folder / "results.sqlite", _provenance()) as store:
         if not args.report:

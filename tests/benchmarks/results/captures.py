@@ -17,7 +17,7 @@ from tests.benchmarks.results.systems import System
 REFERENCE_F_NUMBER, READ_NOISE = 17.6, 2.4  # at which electrons are counted; electrons
 FIXED = ("0.002", "0.01", "0.03")
 PHYSICAL = ("57000e", "10000e", "2000e", "500e")
-MIDDLE = 0.2  # of full scale, about the median of photographs in linear light: at which a noise is told as one number
+MIDDLE = 0.2  # of full scale, near the median of photographs in linear light
 
 
 def sensor_of(noise: str, f_number: float) -> SensorNoise:

@@ -55,7 +55,7 @@ def in_words(settings: Settings) -> str:
 
 
 class Measurement:
-    """Measures systems on one set of scenes into a store; what is there already is not measured again."""
+    """Measures systems on one set of scenes; values in the store are not measured again."""
 
     def __init__(self, store: Store, scenes: SceneSet, wanted: Sequence[str] | None = None) -> None:
         self.store, self.scenes, self.wanted = store, scenes, wanted

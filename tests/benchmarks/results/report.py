@@ -84,7 +84,7 @@ def scores_csv(results: Results) -> str:
 
 
 def reference_row(results: Results, scenes: str, noise: str) -> Key | None:
-    """Return the row that others are compared with: the best closed form of five masks, or of what there is."""
+    """Return the reference of the differences: the best closed form of five masks, or of all systems without them."""
     own = results.keys(scenes, noise, system=FIVE, network=False)
     return results.best(own or results.keys(scenes, noise, network=False))
 
@@ -152,7 +152,7 @@ def _measured_where(cells: Sequence[Measured]) -> str:
 
 
 def _missing(results: Results, cells: Sequence[Measured]) -> list[str]:
-    """Say what of the protocol was not measured."""
+    """Return sentences on parts of the protocol without measurements."""
     lines = []
     if not any("lpips" in cell.scores for cell in cells):
         lines.append("LPIPS was not measured: its weights are not on this machine.")

@@ -86,7 +86,7 @@ def restorations_for(system: System) -> dict[str, Restoration]:
 
 
 def takes_noise(system: System) -> bool:
-    """Whether a system's network is told the noise level."""
+    """Return whether a system's network takes the noise level."""
     return system.head is not None and "noise" in inspect.signature(system.head.forward).parameters
 
 

@@ -51,7 +51,7 @@ class SceneSet(NamedTuple):
 
 
 def real_scenes() -> SceneSet:
-    """Return the 35 real scenes, of which none is ever trained on; none at all where their files are missing."""
+    """Return the 35 real scenes, on which nothing is trained; an empty set where their files are missing."""
     return SceneSet("real", *halves(ENTRIES), lru_cache(maxsize=None)(_real))
 
 

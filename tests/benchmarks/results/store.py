@@ -82,7 +82,7 @@ class Store:
             self.connection.execute(f"INSERT OR REPLACE INTO cells VALUES ({', '.join('?' * len(row))})", row)
 
     def put_system(self, row: SystemRow) -> None:
-        """Keep what a system is; values of its namesake with other weights are left out from now on."""
+        """Keep the description of a system; from now on, values of other weights of the same name are left out."""
         with self.connection:
             self.connection.execute("INSERT OR REPLACE INTO systems VALUES (?, ?, ?, ?, ?)", row)
 

@@ -46,7 +46,7 @@ class System:
 
     @property
     def title(self) -> str:
-        """What the optics are, in words."""
+        """The optics in words."""
         masks = self.optics.masks
         count = len(masks.phase)
         words = {

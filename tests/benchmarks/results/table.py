@@ -91,7 +91,7 @@ class Results:
         return best if all(is_whole(found.get(name, {})) for name in scenes.names) else None
 
     def values(self, key: Key, score: str, half: str = "B") -> dict[str, float]:
-        """Return a score by scene; nothing for what was not measured."""
+        """Return a score by scene; an empty mapping for a row without measurements."""
         if key not in self.rows:
             return {}
         scenes, by_scene = self.sets[key.scenes], self.rows[key]

@@ -1,4 +1,4 @@
-"""Targets and what was measured against them, on half B of the real scenes."""
+"""Verdicts: measured gains against their targets, on half B of the real scenes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEXTURED_GAIN = 0.35  # of the RMSE of the best ramp
 
 
 class Verdict(NamedTuple):
-    """A target with what was measured."""
+    """A target with the measurement."""
 
     claim: str
     measured: str
