@@ -19,7 +19,7 @@ from tests.benchmarks.results.systems import System
 
 Settings = dict[str, float]
 WEIGHTS = tuple(10 ** (quarter / 4) for quarter in range(-20, 5))
-COLORS, SPACES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8), (1.0, 1.5, 2.0, 3.0, 5.0)
+COLORS, SPACES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6), (1.0, 1.5, 2.0, 3.0, 5.0)
 DIAMETER = 7  # pixels of the bilateral filter
 NETWORK = "network"
 
