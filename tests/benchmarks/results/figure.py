@@ -32,7 +32,10 @@ def draw_results(results: Results, scenes: str = REAL) -> Figure:
         open_chart(axes, SMALL)
         axes.set_ylabel("PSNR, dB", fontsize=LABEL, color=INK)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=SMALL, frameon=False)
+            axes.legend(fontsize=SMALL, frameon=False, handlelength=3.5)
+        else:
+            axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, fontsize=LABEL, color=FAINT, ha="center")
+            axes.set(xticks=[], yticks=[])
     return figure
 
 
@@ -50,7 +53,7 @@ def _over_noise(axes: Axes, results: Results, scenes: str) -> None:
         for noise in FIXED
     ]
     found = [(float(row.noise), row) for row in rows if row]
-    label = "best flat lens, best closed form: its noise does not grow with its f-number here"
+    label = "best flat lens at the same noise, best closed form"
     _line(axes, results, found, GREEN, ":", label)
     axes.set_xscale("log")
     axes.set_xticks([float(noise) for noise in FIXED], FIXED)
