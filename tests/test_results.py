@@ -20,7 +20,7 @@ from tests.benchmarks.results import measure
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
 from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
 from tests.benchmarks.results.report import page
-from tests.benchmarks.results.restorations import NETWORK, bilateral, restorations_for
+from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK, bilateral, restorations_for
 from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
 from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, perceptual_distance, ramp
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
@@ -187,6 +187,22 @@ class TestRestorations(BaseTester):
             (image - scene.image).square().mean() for image in (Capture(light, system, light).image, restored["image"])
         )
         assert after < 0.7 * before
+
+    def test_feature_the_inversion_by_depth_takes_the_psf_of_the_depth(self):
+        """A scene at one depth that the network knows: better than the mean PSF, and than a wrong depth."""
+        flat = available()["flat f/25"]()
+        scene = dead_leaves(1, 96).load("leaves 00")._replace(inverse_depth=torch.full((1, 1, 96, 96), 0.82))
+        light, errors = measure.irradiance(flat, scene), []
+        for guess in (0.82, 0.5, None):
+            head = nn.Conv2d(3, 4, 1, bias=True)
+            nn.init.zeros_(head.weight)
+            nn.init.constant_(head.bias, guess or 0.0)
+            taken = Capture(light, System("mine", "coded", flat.optics, head, "joint", ""), torch.zeros(1, 1, 1, 1))
+            found = restorations_for(taken.system)[TIKHONOV if guess is None else BY_DEPTH]
+            with torch.inference_mode():
+                errors.append((found.restore(taken, {"weight": 1e-3})["image"] - scene.image).square().mean().item())
+        assert errors[0] < 0.8 * min(errors[1:])
+        assert BY_DEPTH not in restorations_for(flat)
 
     def test_feature_bilateral_smooths_noise_and_keeps_edges(self):
         noise = 0.02 * torch.randn(1, 3, 40, 40)

@@ -55,7 +55,9 @@ class Capture:
     """Standard deviation of the noise in linear light by the sensor's model: (1, 1, 1, 1), with shot noise of each
     pixel, (1, 3, H, W)."""
     restored: dict[object, Tensor] = field(default_factory=dict)
-    """Linear light of inversions that were computed, by name and settings."""
+    """Images of inversions that were computed, by name and settings."""
+    estimates: dict[object, dict[str, Tensor]] = field(default_factory=dict)
+    """Maps that the network estimated, by the noise level that it was told."""
 
     @cached_property
     def image(self) -> Tensor:

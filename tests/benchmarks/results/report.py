@@ -40,7 +40,8 @@ this page, and goes on where it was interrupted.
   the same exposure time, shot noise and 2.4 electrons of read noise. All systems get the same random numbers.
 - **Restorations** take the capture, the camera's PSFs and the noise level. *Capture* is the capture as it is.
   *Tikhonov* inverts the mean PSF of all depths with one weight for all frequencies, in linear light, towards the
-  capture. *Bilateral* is OpenCV's filter on the result, 7 pixels wide. *Network* is the one that was trained with the
+  capture; *by estimated depth* it inverts the PSFs of 11 depths, blended by the depth that the network estimates.
+  *Bilateral* is OpenCV's filter on the result, 7 pixels wide. *Network* is the one that was trained with the
   camera.
 - **Scores** are those of sRGB images clipped to [0, 1]. Chroma PSNR is that of Cb and Cr. ± is the standard error of
   the mean of differences, taken scene by scene.

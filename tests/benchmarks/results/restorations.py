@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.inference.tasks import split_maps
+from kornia_tidy.inference.tasks import MAPS, split_maps
 from kornia_tidy.reconstruction.tikhonov import tikhonov
 from tests.benchmarks.results.captures import Capture, encode
 from tests.benchmarks.results.systems import System
@@ -21,6 +21,7 @@ Settings = dict[str, float]
 WEIGHTS = tuple(10 ** (quarter / 4) for quarter in range(-20, 5))
 COLORS, SPACES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6), (1.0, 1.5, 2.0, 3.0, 5.0)
 DIAMETER = 7  # pixels of the bilateral filter
+LAYERS = 11  # depths of an inversion that knows the depth
 NETWORK = "network"
 
 
@@ -56,10 +57,28 @@ def _weight(sigma: float) -> Settings:
     return {"weight": 3e-3 * (sigma / 0.002) ** 1.3}
 
 
+def _tikhonov_by_depth(capture: Capture, settings: Settings) -> Tensor:
+    """Tikhonov inversions with the PSFs of 11 depths, blended by the depth that the network estimates."""
+    system = capture.system
+    lo, hi = system.optics.camera.defocus_range
+    bank = system.optics.psf_bank(defocus=torch.linspace(lo, hi, LAYERS, dtype=torch.float64).tolist())
+    place = (LAYERS - 1) * _estimate(capture, 1.0)["depth"]
+    light = torch.zeros_like(capture.light)
+    for layer in range(LAYERS):
+        share = (1 - (place - layer).abs()).clamp(min=0)  # linear between two depths
+        if share.any():
+            veil = None if bank.veil is None else bank.veil[layer]
+            inverted = tikhonov(capture.light, bank.psfs[layer], settings["weight"], prior=capture.light, veil=veil)
+            light += share * inverted
+    return light
+
+
 CLOSED_FORMS = {
     "capture": ClosedForm(lambda capture, _: capture.light),
     "Tikhonov": ClosedForm(_tikhonov, {"weight": WEIGHTS}, _weight),
 }
+BY_DEPTH = "Tikhonov by estimated depth"
+CLOSED_FORMS_WITH_DEPTH = {BY_DEPTH: ClosedForm(_tikhonov_by_depth, {"weight": WEIGHTS}, _weight)}
 
 
 def bilateral(image: Tensor, color: float, space: float) -> Tensor:
@@ -75,7 +94,8 @@ def bilateral(image: Tensor, color: float, space: float) -> Tensor:
 def restorations_for(system: System) -> dict[str, Restoration]:
     """Return the restorations of a system's captures by name: closed forms, and its network where it has one."""
     found = {}
-    for name, form in CLOSED_FORMS.items():
+    estimates_both = system.task is not None and {"depth", "image"} <= MAPS[system.task].keys()
+    for name, form in (CLOSED_FORMS | (CLOSED_FORMS_WITH_DEPTH if estimates_both else {})).items():
         found[name] = _plain(name, form)
         found[f"{name} + bilateral"] = _with_bilateral(name, form)
     if system.head is not None:
@@ -115,15 +135,18 @@ def _with_bilateral(name: str, form: ClosedForm) -> Restoration:
 def _network(factor: float) -> Restoration:
     """The system's network, told the noise level times a factor where it takes one."""
 
-    def restore(capture: Capture, _: Settings) -> dict[str, Tensor]:
-        system = capture.system
-        assert system.head is not None
-        assert system.task is not None
+    return Restoration(lambda capture, _: _estimate(capture, factor))
+
+
+def _estimate(capture: Capture, factor: float) -> dict[str, Tensor]:
+    system = capture.system
+    assert system.head is not None
+    assert system.task is not None
+    if (NETWORK, factor) not in capture.estimates:
         told = {"noise": factor * capture.noise} if takes_noise(system) else {}
         maps = split_maps(system.task, system.head(capture.image, **told).float())
-        return {name: value.clamp(0, 1) for name, value in maps.items()}
-
-    return Restoration(restore)
+        capture.estimates[NETWORK, factor] = {name: value.clamp(0, 1) for name, value in maps.items()}
+    return capture.estimates[NETWORK, factor]
 
 
 def nearest(values: tuple[float, ...], wanted: float) -> int:
