@@ -74,7 +74,7 @@ def _tikhonov_by_depth(capture: Capture, settings: Settings) -> Tensor:
 
 
 CLOSED_FORMS = {
-    "capture": ClosedForm(lambda capture, _: capture.light),
+    "capture": ClosedForm(lambda capture, _: capture.light, start=lambda _: {"color": 0.05, "space": 1.0}),
     "Tikhonov": ClosedForm(_tikhonov, {"weight": WEIGHTS}, _weight),
 }
 BY_DEPTH = "Tikhonov by estimated depth"
@@ -127,7 +127,7 @@ def _with_bilateral(name: str, form: ClosedForm) -> Restoration:
         return {"image": bilateral(_inverted(name, form, capture, settings), settings["color"], settings["space"])}
 
     def start(sigma: float) -> Settings:
-        return {**form.start(sigma), "color": 0.2, "space": 2.0}
+        return {"color": 0.2, "space": 2.0, **form.start(sigma)}
 
     return Restoration(restore, {**form.grid, "color": COLORS, "space": SPACES}, start)
 
