@@ -309,6 +309,7 @@ class TestResults(BaseTester):
                 (noise, FIVE, TIKHONOV): scored(scenes, 25.0, 0.1),
                 (noise, FIVE, NETWORK): scored(scenes, 28.0),
                 (noise, ONE, NETWORK): scored(scenes, 27.5),
+                (noise, f"{FIVE} as trained", NETWORK): scored(scenes, 29.0),
                 (noise, FIVE, f"{NETWORK}, noise x 2"): scored(scenes, 28.0 - loss),
             }
         for noise, gain in zip(PHYSICAL, (2.0, 0.1, -1.0, -2.0), strict=True):
@@ -321,6 +322,8 @@ class TestResults(BaseTester):
         assert [met[f"{FIVE}, noise {noise}: network over {TIKHONOV}"] for noise in FIXED] == [True, True, False]
         assert found[f"{FIVE}: network ahead of its best closed form"].measured == "9 of 9 scenes and noises"
         assert met[f"noise 0.002: network of {FIVE} over that of {ONE}"] is False
+        stray = found[f"{FIVE}, noise 0.002: {NETWORK}, all light over the window as trained"]
+        assert (stray.measured, stray.met) == ("-1.00 ± 0.00 (0 of 3 scenes)", None)
         worst = found["largest loss of a network by half or twice the noise level"]
         assert (worst.measured, worst.met) == (f"+0.50 ± 0.00: {FIVE}, noise 0.01, noise level x 2", False)
         assert met[f"57,000 electrons, networks: {FIVE} over {FLAT}"] is True

@@ -34,7 +34,13 @@ class Verdict(NamedTuple):
 
 def verdicts(results: Results) -> list[Verdict]:
     """Return the targets in their order."""
-    return [*_networks(results), *_wrong_noise(results), *_coded_against_flat(results), *_joint(results)]
+    return [
+        *_networks(results),
+        *_stray_light(results),
+        *_wrong_noise(results),
+        *_coded_against_flat(results),
+        *_joint(results),
+    ]
 
 
 def _networks(results: Results) -> Iterator[Verdict]:
@@ -64,6 +70,18 @@ def _networks(results: Results) -> Iterator[Verdict]:
     both = [Key(REAL, FIXED[0], system, NETWORK) for system in (FIVE, ONE)]
     gain = results.difference(both[0], both[1]) if all(key in results.rows for key in both) else None
     yield _at_least(f"noise {FIXED[0]}: network of {FIVE} over that of {ONE}", gain, MASKS_GAIN)
+
+
+def _stray_light(results: Results) -> Iterator[Verdict]:
+    """Gain of captures with all their light over those in the small window that the network was trained with."""
+    closed = results.best(results.keys(REAL, FIXED[0], system=FIVE, network=False))
+    for row in (Key(REAL, FIXED[0], FIVE, NETWORK), closed):
+        if row is not None:
+            small = row._replace(system=f"{FIVE} as trained")
+            gain = results.difference(row, small)
+            yield _at_least(
+                f"{FIVE}, noise {FIXED[0]}: {row.restoration}, all light over the window as trained", gain, None
+            )
 
 
 def _wrong_noise(results: Results) -> Iterator[Verdict]:
