@@ -36,8 +36,9 @@ this page, and goes on where it was interrupted.
   half B. Its 17 real scenes are not all independent: five show one room (open3d-redwood) and two another (icl-nuim),
   so that the standard errors are too small.
 - **Captures.** PSFs of 129 pixels, the light outside them as an even background, gather, linear light. A fixed noise
-  is a standard deviation in parts of full scale. Electrons are those of a white pixel at f/17.6; other f-numbers have
-  the same exposure time, shot noise and 2.4 electrons of read noise. All systems get the same random numbers.
+  is a standard deviation in parts of full scale; at the same fixed noise a smaller aperture is exposed for longer.
+  Electrons are those of a white pixel at f/17.6; other f-numbers have the same exposure time, shot noise and 2.4
+  electrons of read noise. All systems get the same random numbers.
 - **Restorations** take the capture, the camera's PSFs and the noise level. *Capture* is the capture as it is.
   *Tikhonov* inverts the mean PSF of all depths with one weight for all frequencies, in linear light, towards the
   capture; *by estimated depth* it inverts the PSFs of 11 depths, blended by the depth that the network estimates.
