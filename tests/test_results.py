@@ -433,4 +433,6 @@ class TestCommand(BaseTester):
         text = page(synthetic({("0.01", FLAT, "capture"): scored(real_like(), 20.0)}, [real_like()]), [cell])
         assert "Measured 2026-11-22 at commit 0000000: a test." in text
         assert "LPIPS was not measured" in text
+        assert "Dead leaves: not measured yet." in text
+        assert "Real scenes: not measured yet." not in text
         assert "Not measured yet: noise 0.002, noise 0.03, 57,000 electrons" in text

@@ -161,6 +161,8 @@ def _missing(results: Results, cells: Sequence[Measured]) -> list[str]:
     noises = [noise for noise in (*FIXED, *PHYSICAL) if not any(key.noise == noise for key in results.rows)]
     if noises:
         lines.append(f"Not measured yet: {', '.join(map(_noise_in_words, noises))}.")
+    measured = {key.scenes for key in results.rows if key.system != NO_CAMERA}
+    lines += [f"{title}: not measured yet." for name, title in SET_NAMES.items() if name not in measured]
     incomplete = sorted({cell.cell.system for cell in cells} - {key.system for key in results.rows})
     if incomplete:
         lines.append(f"Interrupted before they were complete: {', '.join(incomplete)}.")
