@@ -2,6 +2,9 @@
 
 The score of an image without a valid pixel is NaN; :class:`MeanScores` can leave such images out. A NaN at a valid
 pixel also makes the score NaN.
+
+PSNR and SSIM are those of ``kornia.metrics``. torchmetrics gives the same PSNR, RMSE and relative error, but its
+SSIM counts windows that reach over the border, and its metrics take no masks. It comes with the extra ``train`` only.
 """
 
 from __future__ import annotations
@@ -101,6 +104,39 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
     masked = torch.nn.functional.max_pool2d((~mask).to(similarity), SSIM_WINDOW, stride=1)  # 1: a masked pixel
     whole = masked == 0
     return _mean(torch.where(whole, similarity, 0), whole)
+
+
+def chroma_psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return the PSNR of the colour differences Cb and Cr of RGB images, pooled over both.
+
+    .. math:: C_b = 0.564 \, (B - Y), \quad C_r = 0.713 \, (R - Y), \quad Y = 0.299 R + 0.587 G + 0.114 B
+
+    It is the error in colour alone: a change of brightness that is the same in all channels leaves it as it is.
+
+    Args:
+        prediction: (B, 3, H, W), RGB in [0, 1], encoded as sRGB.
+        target: as ``prediction``.
+        mask: as for :func:`rmse`.
+
+    Returns:
+        (B,) in decibels of the range 1, which Cb and Cr have; NaN for an image without a valid pixel.
+
+    Raises:
+        TypeError: as :func:`rmse`.
+        ValueError: as :func:`rmse`, or if the images do not have three channels.
+
+    Source: ITU-R BT.601, by :func:`kornia.color.rgb_to_ycbcr`.
+
+    Example:
+        >>> grey, blue = torch.full((1, 3, 2, 2), 0.5), torch.tensor([0.5, 0.5, 0.6]).view(1, 3, 1, 1)
+        >>> chroma_psnr(grey, blue.expand(1, 3, 2, 2)).round(decimals=2)
+        tensor([28.9200])
+    """
+    prediction, target, mask = valid_maps(prediction, target, mask)
+    if target.shape[1] != 3:
+        raise ValueError(f"chroma_psnr needs RGB images of three channels, got {target.shape[1]}")
+    ours, truth = (kornia.color.rgb_to_ycbcr(image)[:, 1:] for image in (prediction, target))
+    return psnr(ours, truth, mask[:, :2])
 
 
 def abs_rel(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -13,6 +13,7 @@ from scipy.ndimage import correlate1d
 from kornia_tidy.reconstruction.metrics import (
     MeanScores,
     abs_rel,
+    chroma_psnr,
     defocus_scores,
     delta_accuracy,
     depth_scores,
@@ -158,6 +159,59 @@ class TestKornia(BaseTester):
         small = torch.zeros(1, 1, 10, 30, device=device)
         with pytest.raises(ValueError, match=r"at least 11 pixels a side, got \(10, 30\)"):
             ssim(small, small)
+
+
+class TestTorchmetrics(BaseTester):
+    def test_feature_single_images_score_what_torchmetrics_gives(self, device, dtype):
+        functional = pytest.importorskip("torchmetrics.functional")
+        from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+        x, z = 0.5 + torch.rand(2, 2, 3, 32, 30, device=device, dtype=dtype)
+        options = {"data_range": 1.0, "reduction": "none"}
+        self.assert_close(psnr(x, z), peak_signal_noise_ratio(x, z, dim=(1, 2, 3), **options))
+        padded, maps = structural_similarity_index_measure(x, z, **options, return_full_image=True)
+        self.assert_close(ssim(x, z), maps[..., 5:-5, 5:-5].mean((1, 2, 3)))
+        assert (padded - ssim(x, z)).abs().max() > 1e-3  # the reason for ours: it counts reflected borders
+        for index in range(2):
+            flat = x[index].flatten(), z[index].flatten()
+            self.assert_close(rmse(x, z)[index], functional.mean_squared_error(*flat, squared=False))
+            self.assert_close(abs_rel(x, z)[index], functional.mean_absolute_percentage_error(*flat))
+
+
+class TestChroma(BaseTester):
+    def test_feature_equals_numpy_image_by_image(self, device, dtype):
+        prediction, target, mask = make_depths((3, 3, 24, 27), device, dtype)
+        expected = []
+        for x, z, seen in zip(prediction.double().cpu(), target.double().cpu(), mask.cpu(), strict=True):
+            red, green, blue = (x - z)[:, seen[0]].numpy()
+            luma = 0.299 * red + 0.587 * green + 0.114 * blue
+            errors = np.concatenate([0.564 * (blue - luma), 0.713 * (red - luma)])
+            expected.append(-10 * math.log10(np.mean(errors**2)))
+        self.assert_close(chroma_psnr(prediction, target, mask).double().cpu(), torch.tensor(expected).double())
+
+    def test_feature_brightness_does_not_count(self, device):
+        image = torch.rand(1, 3, 8, 8, device=device, dtype=torch.float64)
+        assert chroma_psnr(image, image + 0.1 * torch.rand(1, 1, 8, 8, device=device)).item() > 200
+        assert chroma_psnr(image, image + torch.tensor([0.1, 0.0, 0.0], device=device).view(1, 3, 1, 1)).item() < 30
+
+    def test_feature_masked_pixels_have_exactly_no_gradient(self, device):
+        prediction, target, mask = make_depths((1, 3, 24, 27), device)
+        prediction = prediction.requires_grad_()
+        chroma_psnr(prediction, target, mask).sum().backward()
+        assert not prediction.grad[~mask.expand_as(prediction)].any()
+        assert prediction.grad.isfinite().all()
+
+    def test_feature_an_image_without_a_valid_pixel_scores_nan(self, device):
+        image = torch.rand(2, 3, 4, 4, device=device)
+        mask = torch.tensor([True, False], device=device).view(2, 1, 1, 1).expand(2, 1, 4, 4)
+        assert chroma_psnr(image, image / 2, mask).isnan().tolist() == [False, True]
+
+    def test_exception_grey_images(self, device):
+        with pytest.raises(ValueError, match="needs RGB images of three channels, got 1"):
+            chroma_psnr(torch.rand(1, 1, 4, 4, device=device), torch.rand(1, 1, 4, 4, device=device))
+
+    def test_gradcheck(self, device):
+        self.gradcheck(chroma_psnr, tuple(torch.rand(2, 1, 3, 4, 4, device=device)))
 
 
 class TestDepth(BaseTester):

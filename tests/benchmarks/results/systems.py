@@ -1,0 +1,132 @@
+"""Optical systems of the benchmark: shipped cameras with their networks, flat lenses by f-number, published presets."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.inference.trained import TrainedSystem, load_trained
+from kornia_tidy.masks.fresnel import FresnelLens
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.systems.presets import SYSTEMS
+
+WINDOW = 129  # pixels; smaller windows that are scaled to sum one flatter coded apertures by 0.4 to 0.7 dB
+FIDELITY = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
+FLAT = (17.6, 22.0, 25.0, 30.0, 35.0, 42.0, 50.0, 60.0, 71.0, 100.0)  # f-numbers, a factor of about 2^(1/4) apart
+FOCAL_LENGTH = 50e-3  # m, of the flat lenses as of the shipped cameras
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A camera without sensor and, where it has one, the network that was trained with it."""
+
+    name: str
+    kind: str
+    """``"coded"``, ``"flat"``, ``"Fresnel"``, ``"published"`` or ``"as trained"``."""
+    optics: TiDyOptics
+    """From linear light to linear light."""
+    head: nn.Module | None
+    task: str | None
+    digest: str
+    """Of weights and settings: another one means another system under the same name."""
+
+    @property
+    def f_number(self) -> float:
+        """F-number of the lens."""
+        return self.optics.camera.f_number
+
+    @property
+    def title(self) -> str:
+        """The optics in words."""
+        masks = self.optics.masks
+        count = len(masks.phase)
+        words = {
+            "flat": "flat lens",
+            "Fresnel": "Fresnel element of 10 rad, as in the paper",
+            "published": f"{count} mask{'s' * (count > 1)} as before training",
+            "as trained": f"K = {count}, PSFs of {self.optics.window} px of sum one",
+            "coded": f"K = {count}",
+        }
+        return f"{words[self.kind]}, f/{self.f_number:.3g}"
+
+
+def available() -> dict[str, Callable[[], System]]:
+    """Return a function for each system that the benchmark knows by name."""
+    known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in PRETRAINED}
+    known |= {f"{name} as trained": _as_trained(name) for name in PRETRAINED if not name.endswith("-0")}
+    known |= {f"flat f/{number:g}": _flat(number) for number in FLAT}
+    return known | {f"preset {name}": _published(name) for name in SYSTEMS}
+
+
+def from_checkpoint(path: Path) -> System:
+    """Return the system in a checkpoint of ``kornia-tidy train``, named as its file, or its folder for best.ckpt."""
+    name = path.stem if path.stem not in ("best", "last") else path.parent.name
+    return of_trained(name, load_trained(path))
+
+
+def of_trained(name: str, trained: TrainedSystem) -> System:
+    """Return a trained system with the window of the benchmark; its network stays as it was trained."""
+    flat = not bool(trained.optics.masks.phase.detach().std() > 1e-6)
+    lens = isinstance(trained.optics.masks, FresnelLens)
+    kind = "Fresnel" if lens else "flat" if flat else "coded"
+    return _system(name, kind, trained.optics, trained.head, trained.settings.task)
+
+
+def _shipped(name: str) -> Callable[[], System]:
+    return lambda: of_trained(name, load_pretrained(name))
+
+
+def _as_trained(name: str) -> Callable[[], System]:
+    """A shipped system in the small window that it was trained with: captures without stray light."""
+
+    def make() -> System:
+        trained = load_pretrained(name)
+        fidelity = trained.optics.fidelity
+        return _system(
+            f"{name} as trained", "as trained", trained.optics, trained.head, trained.settings.task, fidelity
+        )
+
+    return make
+
+
+def _flat(f_number: float) -> Callable[[], System]:
+    def make() -> System:
+        camera = ThinLensCamera(FOCAL_LENGTH, FOCAL_LENGTH / f_number)
+        return _system(f"flat f/{f_number:g}", "flat", TiDyOptics(PixelwiseMask(1, initial="flat"), camera))
+
+    return make
+
+
+def _published(name: str) -> Callable[[], System]:
+    def make() -> System:
+        optics = TiDyOptics.from_preset(name, generator=torch.Generator().manual_seed(0))
+        return _system(f"preset {name}", "published", optics)
+
+    return make
+
+
+def _system(
+    name: str,
+    kind: str,
+    optics: TiDyOptics,
+    head: nn.Module | None = None,
+    task: str | None = None,
+    fidelity: Fidelity = FIDELITY,
+) -> System:
+    assert isinstance(optics.camera, ThinLensCamera)
+    optics.fidelity, optics.sensor, optics.color_space = fidelity, None, "linear"
+    optics.eval()
+    digest = hashlib.sha256()
+    for part in (optics, *([] if head is None else [head.eval()])):
+        for key, value in sorted(part.state_dict().items()):
+            digest.update(key.encode() + value.detach().contiguous().numpy().tobytes())
+    return System(name, kind, optics, head, task, digest.hexdigest()[:16])

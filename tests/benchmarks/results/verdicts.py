@@ -1,0 +1,154 @@
+"""Verdicts: measured gains against their targets, on half B of the real scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from tests.benchmarks.results.captures import FIXED, PHYSICAL
+from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
+from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK
+from tests.benchmarks.results.table import Difference, Key, Results
+
+REAL = "real"
+FIVE, ONE, JOINT = "edof-5", "edof-1", "joint-5"
+GAINS = {"0.002": 1.5, "0.01": 2.7, "0.03": 3.5}  # dB of five masks' network over their best closed form
+SHARE_AHEAD = 0.95  # of scenes and noises
+SSIM_GAIN, CHROMA_GAIN, MASKS_GAIN = 0.04, 1.5, 1.2
+WRONG_NOISE_LOSS = 0.3  # dB
+CODED_GAINS = {"57000e": 1.5, "10000e": 0.5}  # dB of coded over flat, both with networks
+TEXTURED_GAIN = 0.35  # of the RMSE of the best ramp
+LAYERED_GAIN = 2.0  # dB of the joint network over the inversion by its own depth
+
+
+class Verdict(NamedTuple):
+    """A target with the measurement."""
+
+    claim: str
+    measured: str
+    target: str
+    met: bool | None
+    """None where it was not measured, or there is no target."""
+
+
+def verdicts(results: Results) -> list[Verdict]:
+    """Return the targets in their order."""
+    return [
+        *_networks(results),
+        *_stray_light(results),
+        *_wrong_noise(results),
+        *_coded_against_flat(results),
+        *_joint(results),
+    ]
+
+
+def _networks(results: Results) -> Iterator[Verdict]:
+    """Five masks: network against the best closed form of the same captures."""
+    pairs = {}
+    for noise in FIXED:
+        closed = results.best(results.keys(REAL, noise, system=FIVE, network=False))
+        ours = Key(REAL, noise, FIVE, NETWORK)
+        if closed is not None and ours in results.rows:
+            pairs[noise] = ours, closed
+    for noise, target in GAINS.items():
+        name = pairs[noise][1].restoration if noise in pairs else "its best closed form"
+        gain = results.difference(*pairs[noise]) if noise in pairs else None
+        yield _at_least(f"{FIVE}, noise {noise}: network over {name}", gain, target)
+    gains = [results.difference(*pair) for pair in pairs.values()]
+    count, ahead = sum(gain.pairs for gain in gains), sum(gain.ahead for gain in gains)
+    yield Verdict(
+        f"{FIVE}: network ahead of its best closed form",
+        f"{ahead} of {count} scenes and noises",
+        f"{100 * SHARE_AHEAD:.0f} of 100",
+        ahead >= SHARE_AHEAD * count if len(gains) == len(FIXED) else None,
+    )
+    for score, name, target in (("ssim", "SSIM", SSIM_GAIN), ("chroma", "chroma PSNR", CHROMA_GAIN)):
+        for noise in FIXED:
+            gain = results.difference(*pairs[noise], score) if noise in pairs else None
+            yield _at_least(f"{FIVE}, noise {noise}: {name} of the network over its best closed form", gain, target)
+    both = [Key(REAL, FIXED[0], system, NETWORK) for system in (FIVE, ONE)]
+    gain = results.difference(both[0], both[1]) if all(key in results.rows for key in both) else None
+    yield _at_least(f"noise {FIXED[0]}: network of {FIVE} over that of {ONE}", gain, MASKS_GAIN)
+
+
+def _stray_light(results: Results) -> Iterator[Verdict]:
+    """Gain of captures with all their light over those in the small window that the network was trained with."""
+    closed = results.best(results.keys(REAL, FIXED[0], system=FIVE, network=False))
+    for row in (Key(REAL, FIXED[0], FIVE, NETWORK), closed):
+        if row is not None:
+            small = row._replace(system=f"{FIVE} as trained")
+            gain = results.difference(row, small)
+            yield _at_least(
+                f"{FIVE}, noise {FIXED[0]}: {row.restoration}, all light over the window as trained", gain, None
+            )
+
+
+def _wrong_noise(results: Results) -> Iterator[Verdict]:
+    """What half or twice the true noise level costs the network."""
+    losses = {}
+    for key in results.rows:
+        true = key._replace(restoration=NETWORK)
+        if key.scenes == REAL and key.restoration.startswith(f"{NETWORK}, ") and true in results.rows:
+            losses[key] = results.difference(true, key)
+    worst = max(losses, key=lambda key: losses[key].mean, default=None)
+    claim, target = "largest loss of a network by half or twice the noise level", f"at most {WRONG_NOISE_LOSS:g}"
+    if worst is None:
+        yield Verdict(claim, "no network takes a noise level", target, None)
+    else:
+        loss = losses[worst]
+        level = worst.restoration.removeprefix(f"{NETWORK}, noise ")
+        words = f"{loss}: {worst.system}, noise {worst.noise}, noise level {level}"
+        yield Verdict(claim, words, target, loss.mean <= WRONG_NOISE_LOSS)
+
+
+def _coded_against_flat(results: Results) -> Iterator[Verdict]:
+    """Coded against flat at equal exposure time: of each kind the best on half A, networks and closed forms apart."""
+    for noise in PHYSICAL:
+        for network, kind in ((True, "networks"), (False, "closed forms")):
+            keys = results.keys(REAL, noise, network=network)
+            coded, flat = (
+                results.best([key for key in keys if results.systems[key.system].kind == wanted])
+                for wanted in ("coded", "flat")
+            )
+            both = (coded, flat) if coded is not None and flat is not None else None
+            names = "coded over flat" if both is None else f"{both[0].system} over {both[1].system}"
+            gain = None if both is None else results.difference(*both)
+            target = CODED_GAINS.get(noise) if network else None
+            yield _at_least(f"{int(noise[:-1]):,} electrons, {kind}: {names}", gain, target)
+
+
+def _joint(results: Results) -> Iterator[Verdict]:
+    """Joint estimates: the image against the inversion by estimated depth, the depth against the best ramp."""
+    ours, layered = (Key(REAL, FIXED[0], JOINT, name) for name in (NETWORK, BY_DEPTH))
+    gain = results.difference(ours, layered) if {ours, layered} <= results.rows.keys() else None
+    yield _at_least(f"{JOINT}, noise {FIXED[0]}: network over {BY_DEPTH}", gain, LAYERED_GAIN)
+    score = "depth_textured"
+    error = results.mean(ours, score)
+    of_ramp = results.mean(Key(REAL, NO_NOISE, NO_CAMERA, BEST_RAMP), score)
+    known = math.isfinite(error) and math.isfinite(of_ramp)
+    below = 1 - error / of_ramp if known else math.nan
+    yield Verdict(
+        f"{JOINT}, noise {FIXED[0]}: depth RMSE over textured pixels below the best ramp of each scene",
+        f"{100 * below:.0f} % ({error:.3f}, {of_ramp:.3f})" if known else "not measured",
+        f"at least {100 * TEXTURED_GAIN:.0f} %",
+        below >= TEXTURED_GAIN if known else None,
+    )
+
+
+def _at_least(claim: str, gain: Difference | None, target: float | None) -> Verdict:
+    wanted = "" if target is None else f"at least {target:g}"
+    if gain is None or not gain.pairs:
+        return Verdict(claim, "not measured", wanted, None)
+    digits = 3 if target == SSIM_GAIN else 2
+    measured = f"{gain.rounded(digits)} ({gain.ahead} of {gain.pairs} scenes)"
+    return Verdict(claim, measured, wanted, None if target is None else gain.mean >= target)
+
+
+def in_words(rows: Sequence[Verdict]) -> list[str]:
+    """Return the lines of a Markdown table of verdicts."""
+    lines = ["| | measured | target | |", "|---|---|---|---|"]
+    for row in rows:
+        word = {True: "met", False: "short", None: ""}[row.met]
+        lines.append(f"| {row.claim} | {row.measured} | {row.target} | {word} |")
+    return lines

@@ -1,0 +1,438 @@
+"""Tests of the benchmark of results: halves, noise, search, choice on half A, and a short run."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import nn
+
+from kornia_tidy.inference.pretrained import load_pretrained
+from tests.base import BaseTester
+from tests.benchmarks.results import __main__ as command
+from tests.benchmarks.results import measure
+from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
+from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
+from tests.benchmarks.results.report import page
+from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK, bilateral, restorations_for
+from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
+from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, perceptual_distance, ramp
+from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
+from tests.benchmarks.results.systems import WINDOW, System, available, from_checkpoint, of_trained
+from tests.benchmarks.results.table import Key, Results, paired
+from tests.benchmarks.results.verdicts import FIVE, ONE, REAL, verdicts
+from tests.scenes import halves
+
+HERE = Provenance("2026-11-22", "0000000", "a test")
+FLAT, TIKHONOV = "flat f/50", "Tikhonov"
+
+
+def synthetic(scores: dict[tuple[str, str, str], dict[str, dict[str, float]]], sets: list[SceneSet]) -> Results:
+    """Results of made-up scores by noise, system and restoration, then scene; settings follow a colon."""
+    cells = [
+        Measured(Cell(sets[0].name, scene, system, "", noise, *(restoration + ":").split(":")[:2]), values, HERE)
+        for (noise, system, restoration), by_scene in scores.items()
+        for scene, values in by_scene.items()
+    ]
+    names = {key[1] for key in scores}
+    systems = {name: SystemRow(name, "", "flat" if "flat" in name else "coded", name, 17.6) for name in names}
+    return Results(cells, systems, sets)
+
+
+def real_like(count: int = 7) -> SceneSet:
+    """Names in the halves of the real scenes, without pictures."""
+    return SceneSet(REAL, *halves(f"s{number}" for number in range(count)), load=lambda _: pytest.fail("not needed"))
+
+
+def scored(scenes: SceneSet, value: float, spread: float = 0.0) -> dict[str, dict[str, float]]:
+    return {
+        name: {"psnr": value + spread * (-1) ** number, "ssim": value / 40, "chroma": value + 8}
+        for number, name in enumerate(scenes.names)
+    }
+
+
+class TestHalves(BaseTester):
+    def test_feature_the_rule_is_fixed(self):
+        names = [f"s{number:02d}" for number in range(35)]
+        first, second = halves(reversed(names))
+        order = torch.randperm(35, generator=torch.Generator().manual_seed(0)).tolist()
+        assert (len(first), len(second)) == (18, 17)
+        assert first == sorted(names[index] for index in order[:18])
+        assert sorted(first + second) == names
+
+    def test_feature_one_scene_is_of_half_a(self):
+        assert halves(["only"]) == (["only"], [])
+
+
+class TestNoise(BaseTester):
+    def test_feature_electrons_fall_with_the_square_of_the_f_number(self):
+        variances = {}
+        for number in (17.6, 35.2):
+            sensor = sensor_of("10000e", number)
+            white = torch.full((1, 1, 200, 200), 0.5)
+            variances[number] = sensor(white, generator=torch.Generator().manual_seed(0)).double().var().item()
+            electrons = 10000 * (17.6 / number) ** 2
+            expected = 0.5 / electrons + (2.4 / electrons) ** 2
+            assert variances[number] == pytest.approx(expected, rel=5 * math.sqrt(2 / 40000))  # five standard errors
+
+    def test_feature_systems_get_the_same_random_numbers(self):
+        scene = dead_leaves(1, 32).load("leaves 00")
+        taken = [capture(available()[name](), scene, scene.image, "0.01") for name in (FLAT, "flat f/25")]
+        assert torch.equal(taken[0].light, taken[1].light)
+        assert not torch.equal(taken[0].light, capture(taken[0].system, scene, scene.image, "0.002").light)
+
+    def test_exception_no_noise_of_this_name(self):
+        with pytest.raises(ValueError, match="could not convert"):
+            sensor_of("bright", 17.6)
+
+
+class TestSystems(BaseTester):
+    def test_feature_kinds_are_told_from_the_masks(self):
+        makers = available()
+        kinds = {
+            name: makers[name]().kind for name in ("edof-5", "edof-0", FLAT, "preset chang2019", "edof-1 as trained")
+        }
+        assert list(kinds.values()) == ["coded", "Fresnel", "flat", "published", "as trained"]
+
+    def test_feature_psfs_of_129_pixels_and_stray_light_hold_all_light(self):
+        bank = available()["edof-1"]().optics.psf_bank(defocus=[-20.0, 0.0])
+        assert bank.window == WINDOW == 129
+        self.assert_close(bank.psfs.sum((-2, -1)) + bank.veil, torch.ones(2, 3))
+
+    def test_feature_a_system_as_trained_has_its_window_and_no_stray_light(self):
+        system = available()["edof-1 as trained"]()
+        assert system.optics.window == load_pretrained("edof-1").optics.window < WINDOW
+        assert f"PSFs of {system.optics.window} px" in system.title
+        assert system.optics.psf_bank(defocus=[0.0]).veil is None
+
+    def test_feature_flat_lenses_have_their_f_number(self):
+        assert available()["flat f/22"]().f_number == pytest.approx(22.0)
+
+    def test_feature_other_weights_are_another_system(self):
+        makers = available()
+        assert makers[FLAT]().digest == makers[FLAT]().digest != makers["flat f/60"]().digest
+        trained = load_pretrained("edof-1")
+        before = of_trained("a", trained).digest
+        with torch.no_grad():
+            next(trained.head.parameters()).add_(1.0)
+        assert of_trained("a", trained).digest != before
+
+    def test_feature_a_checkpoint_is_named_as_its_folder(self, tmp_path):
+        from kornia_tidy.inference.pretrained import FOLDER
+
+        (tmp_path / "mine").mkdir()
+        shutil.copy(FOLDER / "edof-0.safetensors", tmp_path / "mine" / "best.ckpt")
+        assert from_checkpoint(tmp_path / "mine" / "best.ckpt").name == "mine"
+
+
+GRID = {"a": tuple(2.0**power for power in range(9)), "b": (1.0, 3.0, 9.0)}
+
+
+class TestSearch(BaseTester):
+    def test_feature_finds_the_best_settings_of_a_tilted_hill(self):
+        asked = []
+
+        def value(settings):
+            asked.append(tuple(settings.values()))
+            a, b = math.log2(settings["a"]), math.log(settings["b"], 3)
+            return -((a - 6) ** 2) - 2 * (b - 2) ** 2 + (a - 6) * (b - 2)
+
+        assert search(value, GRID, {"a": 1.5, "b": 1.0}) == {"a": 64.0, "b": 9.0}
+        assert len(asked) == len(set(asked)) < len(GRID["a"]) * len(GRID["b"])
+
+    def test_feature_ends_at_an_edge(self):
+        assert search(lambda s: -s["a"] - s["b"], GRID, {"a": 100.0, "b": 5.0}) == {"a": 1.0, "b": 1.0}
+
+
+class TestRestorations(BaseTester):
+    def test_feature_a_network_is_told_the_noise_and_wrong_levels_of_it(self):
+        told = []
+
+        class Head(nn.Module):
+            def forward(self, image, noise=None):
+                told.append(noise)
+                return image
+
+        flat = available()[FLAT]()
+        system = System("mine", "coded", flat.optics, Head(), "edof", "")
+        found = restorations_for(system)
+        light = torch.rand(1, 3, 16, 16)
+        for noise in ("0.01", "10000e"):
+            taken = capture(system, dead_leaves(1, 16).load("leaves 00"), light, noise)
+            for name in (NETWORK, f"{NETWORK}, noise x 0.5", f"{NETWORK}, noise x 2"):
+                self.assert_close(found[name].restore(taken, {})["image"], taken.image)
+        assert [noise.shape for noise in told[:3]] == [(1, 1, 1, 1)] * 3
+        self.assert_close(torch.stack(told[:3]).flatten(), torch.tensor([0.01, 0.005, 0.02]))
+        electrons = 10000 * (17.6 / 50) ** 2
+        self.assert_close(told[3].square(), taken.light / electrons + (2.4 / electrons) ** 2)
+        self.assert_close(told[4], told[3] / 2)
+
+    def test_feature_networks_without_noise_have_no_wrong_levels(self):
+        assert [name for name in restorations_for(available()["edof-1"]()) if NETWORK in name] == [NETWORK]
+        assert not any(NETWORK in name for name in restorations_for(available()[FLAT]()))
+
+    def test_feature_tikhonov_undoes_a_flat_lens(self):
+        system, scene = available()[FLAT](), dead_leaves(1, 72).load("leaves 00")
+        light = measure.irradiance(system, scene)
+        restored = restorations_for(system)[TIKHONOV].restore(
+            Capture(light, system, torch.zeros(1, 1, 1, 1)), {"weight": 1e-3}
+        )
+        before, after = (
+            (image - scene.image).square().mean() for image in (Capture(light, system, light).image, restored["image"])
+        )
+        assert after < 0.7 * before
+
+    def test_feature_the_inversion_by_depth_takes_the_psf_of_the_depth(self):
+        """A scene at one depth that the network knows: better than the mean PSF, and than a wrong depth."""
+        flat = available()["flat f/25"]()
+        scene = dead_leaves(1, 96).load("leaves 00")._replace(inverse_depth=torch.full((1, 1, 96, 96), 0.82))
+        light, errors = measure.irradiance(flat, scene), []
+        for guess in (0.82, 0.5, None):
+            head = nn.Conv2d(3, 4, 1, bias=True)
+            nn.init.zeros_(head.weight)
+            nn.init.constant_(head.bias, guess or 0.0)
+            taken = Capture(light, System("mine", "coded", flat.optics, head, "joint", ""), torch.zeros(1, 1, 1, 1))
+            found = restorations_for(taken.system)[TIKHONOV if guess is None else BY_DEPTH]
+            with torch.inference_mode():
+                errors.append((found.restore(taken, {"weight": 1e-3})["image"] - scene.image).square().mean().item())
+        assert errors[0] < 0.8 * min(errors[1:])
+        assert BY_DEPTH not in restorations_for(flat)
+
+    def test_feature_bilateral_smooths_noise_and_keeps_edges(self):
+        noise = 0.02 * torch.randn(1, 3, 40, 40)
+        step = (0.25 + 0.5 * (torch.arange(40) >= 20).float()).expand(1, 3, 40, 40)
+        smooth = bilateral(step + noise, 0.2, 2.0)
+        assert (smooth - step).std() < 0.5 * noise.std()
+        assert (smooth[..., 20] - smooth[..., 19]).mean() > 0.45
+
+
+class TestScores(BaseTester):
+    @staticmethod
+    def scene(depth, image=None, known=None):
+        image = torch.rand(1, 3, *depth.shape[-2:]) if image is None else image
+        known = torch.ones_like(depth, dtype=torch.bool) if known is None else known
+        return BenchScene("made", image, depth, known)
+
+    def test_feature_local_contrast_is_the_standard_deviation(self):
+        image = torch.rand(1, 3, 21, 23)
+        luma = (torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1) * image.double()).sum(1)
+        expected = np.std(luma[0, 6:15, 3:12].numpy())
+        assert local_contrast(image)[0, 0, 10, 7].item() == pytest.approx(expected, rel=1e-6)
+        assert local_contrast(torch.full((1, 3, 16, 16), 0.7)).max() < 1e-6
+
+    def test_feature_textured_and_textureless_pixels_apart(self):
+        image = torch.full((1, 3, 40, 40), 0.5)
+        image[..., 20:] += 0.2 * (torch.arange(20) % 2)  # the right half has stripes
+        depth, known = torch.zeros(1, 1, 40, 40), torch.ones(1, 1, 40, 40, dtype=torch.bool)
+        estimate = depth + 0.1
+        estimate[..., 20:] = 0.3
+        estimate[..., :4, :], known[..., :4, :] = 9.0, False
+        scores = depth_scores(self.scene(depth, image, known), estimate)
+        blank = (local_contrast(image) < 0.01)[0, 0, 4:].double().mean().item()
+        assert scores["depth_bias_textureless"] == pytest.approx(0.1)
+        assert scores["depth_textureless"] == pytest.approx(0.1)
+        assert 0.25 < scores["depth_textured"] < 0.3
+        whole = blank * scores["depth_textureless"] ** 2 + (1 - blank) * scores["depth_textured"] ** 2
+        assert scores["depth"] == pytest.approx(math.sqrt(whole))
+
+    def test_feature_a_ramp_is_found_behind_holes(self):
+        rows = torch.linspace(0, 1, 30)[:, None].expand(30, 20)
+        known = torch.rand(1, 1, 30, 20) > 0.5
+        depth = (0.2 + 0.5 * rows)[None, None]
+        holes = depth.masked_fill(~known, 7.0)
+        top, bottom = best_ramp([self.scene(holes, known=known)])
+        assert (top, bottom) == (pytest.approx(0.2), pytest.approx(0.7))
+        self.assert_close(ramp(self.scene(holes, known=known), top, bottom), depth)
+
+    def test_feature_scenes_of_a_common_ramp_weigh_the_same(self):
+        low, high = torch.zeros(1, 1, 8, 4), torch.ones(1, 1, 8, 400)
+        assert best_ramp([self.scene(low), self.scene(high)]) == (pytest.approx(0.5), pytest.approx(0.5))
+
+    def test_feature_lpips_is_left_out_where_its_weights_are_missing(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)  # as if torchvision were installed
+        perceptual_distance.cache_clear()
+        assert perceptual_distance() is None
+        perceptual_distance.cache_clear()
+
+
+class TestPaired(BaseTester):
+    def test_feature_mean_and_standard_error_of_the_differences(self):
+        ours, theirs = (dict(zip("abcdef", torch.rand(6).double().tolist(), strict=True)) for _ in range(2))
+        found, differences = paired(ours, theirs), [ours[name] - theirs[name] for name in ours]
+        assert found.mean == pytest.approx(np.mean(differences))
+        assert found.error == pytest.approx(stats.sem(differences))
+        assert (found.ahead, found.pairs) == (sum(value > 0 for value in differences), 6)
+
+    def test_feature_what_is_not_a_number_does_not_count(self):
+        assert paired({"a": math.nan, "b": 2.0, "c": 1.0}, {"a": 1.0, "b": 1.0}).pairs == 1
+        assert math.isnan(paired({}, {}).mean)
+
+
+class TestResults(BaseTester):
+    def test_feature_half_a_chooses_and_half_b_scores(self):
+        scenes = real_like()
+        on_a = {name: name in scenes.half_a for name in scenes.names}
+        strong, weak = (
+            {name: {"psnr": 30.0 if (of_a == best) else 20.0, "ssim": 0.9} for name, of_a in on_a.items()}
+            for best in (True, False)
+        )
+        key = ("0.01", FIVE, TIKHONOV)
+        results = synthetic(
+            {(*key[:2], f"{TIKHONOV}:weight 1"): strong, (*key[:2], f"{TIKHONOV}:weight 2"): weak}, [scenes]
+        )
+        row = Key(REAL, *key)
+        assert results.settings[row] == "weight 1"
+        assert results.mean(row, "psnr") == 20.0
+        assert results.mean(row, "psnr", "A") == 30.0
+
+    def test_feature_rows_that_are_not_complete_are_left_out(self):
+        scenes = real_like()
+        whole, candidates = scored(scenes, 30.0), {name: {"psnr": 31.0} for name in scenes.half_a}
+        missing = {name: values for name, values in scored(scenes, 30.0).items() if name != scenes.half_b[0]}
+        scores = {("0.01", FIVE, "capture"): whole, ("0.01", FIVE, TIKHONOV): missing}
+        assert {key.restoration for key in synthetic(scores, [scenes]).rows} == {"capture"}
+        scores[("0.01", FIVE, "capture:weight 2")] = candidates  # better on half A, not scored yet
+        assert not synthetic(scores, [scenes]).rows
+
+    def test_feature_verdicts_follow_from_the_scores(self):
+        scenes = real_like()
+        scores = {}
+        for noise, loss in zip(FIXED, (0.2, 0.5, 0.1), strict=True):
+            scores |= {
+                (noise, FIVE, TIKHONOV): scored(scenes, 25.0, 0.1),
+                (noise, FIVE, NETWORK): scored(scenes, 28.0),
+                (noise, ONE, NETWORK): scored(scenes, 27.5),
+                (noise, f"{FIVE} as trained", NETWORK): scored(scenes, 29.0),
+                (noise, FIVE, f"{NETWORK}, noise x 2"): scored(scenes, 28.0 - loss),
+            }
+        for noise, gain in zip(PHYSICAL, (2.0, 0.1, -1.0, -2.0), strict=True):
+            scores |= {
+                (noise, FLAT, NETWORK): scored(scenes, 26.0),
+                (noise, FIVE, NETWORK): scored(scenes, 26.0 + gain),
+            }
+        found = {row.claim: row for row in verdicts(synthetic(scores, [scenes]))}
+        met = {claim: row.met for claim, row in found.items()}
+        assert [met[f"{FIVE}, noise {noise}: network over {TIKHONOV}"] for noise in FIXED] == [True, True, False]
+        assert found[f"{FIVE}: network ahead of its best closed form"].measured == "9 of 9 scenes and noises"
+        assert met[f"noise 0.002: network of {FIVE} over that of {ONE}"] is False
+        stray = found[f"{FIVE}, noise 0.002: {NETWORK}, all light over the window as trained"]
+        assert (stray.measured, stray.met) == ("-1.00 ± 0.00 (0 of 3 scenes)", None)
+        worst = found["largest loss of a network by half or twice the noise level"]
+        assert (worst.measured, worst.met) == (f"+0.50 ± 0.00: {FIVE}, noise 0.01, noise level x 2", False)
+        assert met[f"57,000 electrons, networks: {FIVE} over {FLAT}"] is True
+        assert met[f"10,000 electrons, networks: {FIVE} over {FLAT}"] is False
+        assert found[f"500 electrons, networks: {FIVE} over {FLAT}"].measured.startswith("-2.00 ± 0.00 (0 of 3")
+        assert met["57,000 electrons, closed forms: coded over flat"] is None
+
+    def test_feature_without_results_nothing_is_met(self):
+        assert {row.met for row in verdicts(synthetic({}, [real_like()]))} == {None}
+
+
+class TestStore(BaseTester):
+    CELL = Cell("real", "a", "flat", "00ff", "0.01", "capture", "")
+
+    def test_feature_cells_outlive_the_process(self, tmp_path):
+        with Store(tmp_path / "s.sqlite", HERE) as store:
+            store.put_system(SystemRow("flat", "00ff", "flat", "a lens", 50.0))
+            store.put(self.CELL, {"psnr": 20.5, "depth": math.nan})
+        with Store(tmp_path / "s.sqlite", HERE._replace(day="2026-11-23")) as store:
+            (found,) = store.cells()
+            assert store.get(self.CELL)["psnr"] == 20.5
+            assert store.get(self.CELL._replace(noise="0.002")) == {}
+        assert (found.cell, found.provenance) == (self.CELL, HERE)
+
+    def test_feature_values_of_other_weights_are_left_out(self, tmp_path):
+        with Store(tmp_path / "s.sqlite", HERE) as store:
+            store.put(self.CELL, {"psnr": 20.5})
+            store.put_system(SystemRow("flat", "1234", "flat", "another lens", 50.0))
+            assert store.cells() == []
+
+
+class TestMeasurement(BaseTester):
+    def test_feature_an_interrupted_run_goes_on_to_the_same_results(self, tmp_path, monkeypatch):
+        scenes, make = dead_leaves(3, 66), available()[FLAT]
+
+        class Progress:
+            set_postfix_str = staticmethod(lambda _: None)
+            update = staticmethod(lambda: None)
+
+        def run(name):
+            with Store(tmp_path / name, HERE) as store:
+                Measurement(store, scenes).measure(make(), ["0.01"], Progress())
+                return {row.cell: row.scores for row in store.cells()}
+
+        whole = run("whole")
+        put, calls = Store.put, []
+
+        def interrupted(store, cell, scores):
+            if len(calls) == len(whole) // 2:
+                raise KeyboardInterrupt
+            calls.append(cell)
+            put(store, cell, scores)
+
+        monkeypatch.setattr(Store, "put", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run("parts")
+        monkeypatch.setattr(Store, "put", lambda store, cell, scores: (calls.append(cell), put(store, cell, scores)))
+        assert run("parts") == whole
+        candidates = sum(set(scores) == {"psnr"} for scores in whole.values())
+        assert len(calls) <= len(whole) + len(scenes.half_a) * len(restorations_for(make()))  # those are scored in full
+        assert candidates > 0
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    command.main([str(folder), "--quick"])
+    return folder
+
+
+class TestCommand(BaseTester):
+    def test_smoke_quick_writes_page_table_and_picture(self, quick):
+        text = (quick / "results.md").read_text()
+        assert "## Dead leaves, noise 0.002" in text
+        for system in command.QUICK_SYSTEMS:
+            assert f"| `{system}` |" in text
+        with (quick / "results.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert {row["half"] for row in rows} == {"A", "B"}
+        assert all(10 < float(row["psnr"]) < 60 for row in rows if row["system"] != NO_CAMERA)
+        assert (quick / "images" / "results.png").read_bytes().startswith(b"\x89PNG")
+
+    def test_feature_a_second_run_measures_nothing(self, quick, monkeypatch):
+        monkeypatch.setattr(measure, "irradiance", lambda *_: pytest.fail("measured again"))
+        before = (quick / "results.csv").read_bytes()
+        command.main([str(quick), "--quick"])
+        assert (quick / "results.csv").read_bytes() == before
+
+    def test_feature_the_page_goes_to_another_place(self, quick, tmp_path):
+        command.main([str(quick), "--quick", "--report", "--page", str(tmp_path / "page.md")])
+        assert (tmp_path / "page.md").read_text() == (quick / "results.md").read_text()
+        assert (tmp_path / "images" / "results.png").is_file()
+
+    @pytest.mark.parametrize(
+        ("arguments", "match"),
+        [
+            (["--systems", "flat f/1"], "there is no system 'flat f/1': choose among joint-5"),
+            (["--quick", "--report"], "holds no complete results yet"),
+        ],
+    )
+    def test_exception_one_sentence(self, arguments, match, tmp_path):
+        with pytest.raises(SystemExit, match=match):
+            command.main([str(tmp_path), *arguments])
+
+    def test_feature_the_page_says_what_is_missing(self):
+        cell = Measured(Cell(REAL, "s0", FLAT, "", "0.01", "capture", ""), {"psnr": 20.0}, HERE)
+        text = page(synthetic({("0.01", FLAT, "capture"): scored(real_like(), 20.0)}, [real_like()]), [cell])
+        assert "Measured 2026-11-22 at commit 0000000: a test." in text
+        assert "LPIPS was not measured" in text
+        assert "Dead leaves: not measured yet." in text
+        assert "Real scenes: not measured yet." not in text
+        assert "Not measured yet: noise 0.002, noise 0.03, 57,000 electrons" in text
