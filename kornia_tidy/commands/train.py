@@ -12,7 +12,7 @@ from typing import Any
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.inference.heads import HEADS
+from kornia_tidy.inference.heads import CLOSED_FORMS, HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.render.compositing import COMPOSITING
@@ -83,14 +83,22 @@ def add_parser(subparsers: Any) -> None:
     _setting(
         system,
         "head",
-        choices=tuple(HEADS),
-        help="network; without a GPU take plain, or a small --width: the paper's has 34.9 million weights",
+        metavar="NAME",
+        help=f"{', '.join(HEADS)}: networks (without a GPU take nafnet, plain or a small --width: the paper's "
+        f"attention-unet has 34.9 million weights); {', '.join(CLOSED_FORMS)}: no network, only masks are learnt; or "
+        f"module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
     )
     _setting(
         system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
     )
     _setting(
         system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
+    )
+    _setting(
+        system,
+        "closed_form",
+        action=argparse.BooleanOptionalAction,
+        help="the network takes deconvolved captures and the level of the noise, and adds to the best of them",
     )
     _setting(system, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
     _setting(

@@ -64,6 +64,6 @@ class MovingAverage(nn.Module):
                 own.copy_(new)
         self.steps += 1
 
-    def forward(self, *inputs: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor, **named: Tensor) -> Tensor:
         """Return the output of the averaged network."""
-        return self.network(*inputs)
+        return self.network(*inputs, **named)
