@@ -146,7 +146,7 @@ class ClosedForm(nn.Module):
             light = self._light(capture.clamp(0, 1))
             dark, rise = self.noise_model.to(light.dtype)
             return (dark + rise * light).sqrt()
-        noise = torch.as_tensor(noise).to(capture)
+        noise = noise.to(capture) if isinstance(noise, Tensor) else capture.new_tensor(noise)
         fits = all(side in {1, whole} for side, whole in zip(noise.shape, capture.shape, strict=False))
         if noise.ndim not in {0, 4} or not fits:
             raise ValueError(
