@@ -12,7 +12,7 @@ from typing import Any
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.inference.heads import CLOSED_FORMS, HEADS
+from kornia_tidy.inference.heads import HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.render.compositing import COMPOSITING
@@ -85,8 +85,8 @@ def add_parser(subparsers: Any) -> None:
         "head",
         metavar="NAME",
         help=f"{', '.join(HEADS)}: networks (without a GPU take nafnet, plain or a small --width: the paper's "
-        f"attention-unet has 34.9 million weights); {', '.join(CLOSED_FORMS)}: no network, only masks are learnt; or "
-        f"module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
+        f"attention-unet has 34.9 million weights); tikhonov, tikhonov-bilateral: no network, only masks are learnt; "
+        f"or module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
     )
     _setting(
         system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"

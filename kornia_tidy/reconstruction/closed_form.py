@@ -101,7 +101,7 @@ class ClosedForm(nn.Module):
         self.register_buffer("filters", torch.zeros(0), persistent=False)
         self.register_buffer("noise_model", torch.tensor([NOISE**2, 0.0]))  # variance in the dark, and per light
         self.register_load_state_dict_pre_hook(_take_window)
-        self.register_load_state_dict_post_hook(lambda module, _: module.set_kernels(module.psfs))
+        self.register_load_state_dict_post_hook(_renew_kernels)
 
     def set_psfs(self, bank: PSFBank, *, correlate: bool = False) -> None:
         """Compute the kernels from a camera's PSFs; gradients reach them.
@@ -117,14 +117,13 @@ class ClosedForm(nn.Module):
         if psfs.shape[1] != 3 or (self.layers and len(psfs) != self.layers):
             wanted = f"{self.layers or 'D'}, 3, P, P"
             raise ValueError(f"the closed form needs PSFs of shape ({wanted}), got {tuple(psfs.shape)}")
-        self.set_kernels(psfs if self.layers else psfs.mean(0, keepdim=True))
+        psfs = psfs if self.layers else psfs.mean(0, keepdim=True)
+        if psfs.requires_grad or self.kernels.requires_grad or not torch.equal(psfs, self.psfs):
+            self.psfs = psfs.detach()
+            self._set_kernels(psfs)
 
-    def set_kernels(self, psfs: Tensor) -> None:
+    def _set_kernels(self, psfs: Tensor) -> None:
         """Compute the kernels from PSFs, (layers or 1, 3, P, P)."""
-        known = not (psfs.requires_grad or self.kernels.requires_grad) and torch.equal(psfs, self.psfs)
-        if not psfs.numel() or (known and self.kernels.numel()):
-            return
-        self.psfs = psfs.detach()
         wide = psfs.to(torch.promote_types(psfs.dtype, torch.float32))
         self.kernels = tikhonov_kernels(wide.mean(0), WEIGHTS)
         if self.layers:
@@ -193,6 +192,12 @@ def _at_noise(estimates: Tensor, level: Tensor) -> Tensor:
     steps = torch.arange(len(WEIGHTS), device=level.device)[:, None, None, None]
     shares = (1 - (place.unsqueeze(1) - steps).abs()).clamp(min=0)
     return (shares * estimates).sum(1)
+
+
+def _renew_kernels(module: nn.Module, _: Any) -> None:
+    """Compute the kernels from the PSFs of a state that was loaded."""
+    if isinstance(module, ClosedForm) and module.psfs.numel():
+        module._set_kernels(module.psfs)
 
 
 def _take_window(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:

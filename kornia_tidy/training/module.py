@@ -14,7 +14,6 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.inference.tasks import MAPS, centre_crop, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
-from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.training.average import MovingAverage
@@ -59,8 +58,8 @@ class TidyTraining(pl.LightningModule):
     """Trains a camera's masks together with the network that reads its captures, by one Adam optimiser.
 
     Batches are mappings of ``"image"`` (B, 3, H, W), ``"depth"`` (B, 1, H, W) and, optionally, ``"mask"`` (bool, True
-    where depth is known), ``"noise_seed"`` (int, the seed of the sensor's noise; without it noise is drawn from the
-    global generator) and ``"noise"`` (the standard deviation of the noise, for a network that is conditioned on it).
+    where depth is known) and ``"noise_seed"`` (int, the seed of the sensor's noise; without it noise is drawn from the
+    global generator).
 
     Args:
         optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
@@ -111,8 +110,6 @@ class TidyTraining(pl.LightningModule):
         check_positive("lr_metres", lr_metres, "metres")
         self.optics = optics
         self.head = head
-        with torch.no_grad():
-            update_psfs(head, optics)  # the average has buffers of the same size
         self.average = MovingAverage(head, ema) if ema else None
         self.task, self.loss, self.settings = task, loss, settings
         self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
@@ -146,15 +143,11 @@ class TidyTraining(pl.LightningModule):
             settings=settings.replace(window=optics.window),
         )
 
-    def forward(self, coded: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Return the network's estimates from captures; in eval mode those of its moving average.
-
-        A network that is conditioned on the noise gets its standard deviation, (B, 1, 1, 1) or as the capture; None is
-        that of the camera's sensor.
-        """
+    def forward(self, coded: Tensor) -> Tensor:
+        """Return the network's estimates from captures; in eval mode those of its moving average."""
         network = self.head if self.training or self.average is None else self.average
         update_psfs(network, self.optics)
-        return network(coded, noise=noise) if takes_noise(self.head) else network(coded)
+        return network(coded)
 
     def reconstruct(self, batch: dict[str, Any]) -> BatchResult:
         """Photograph the scenes of a batch and estimate their maps.
@@ -168,7 +161,7 @@ class TidyTraining(pl.LightningModule):
         noise = None if seed is None else torch.Generator(self.device).manual_seed(seed)
         sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
         coded = sample["image"]
-        estimate = {name: maps.float() for name, maps in split_maps(self.task, self(coded, batch.get("noise"))).items()}
+        estimate = {name: maps.float() for name, maps in split_maps(self.task, self(coded)).items()}
         truth = {
             "image": sample["all_in_focus"],
             "depth": normalised_inverse_depth(self.optics.camera, sample["depth"].float()),

@@ -9,10 +9,10 @@ import torch
 
 
 def check_onnx(head, image, another=None) -> list[str]:
-    """Export with one image, or a tuple of all inputs, run with ``another`` image, compare with PyTorch to 1e-4. Return the output names.
+    """Export with one image, run with ``another``, compare with PyTorch to 1e-4. Return the output names.
 
-    The batch is dynamic where ``another`` is given, and fixed otherwise: symbolic shapes take the exporter twice as
-    long.
+    ``image`` may be a tuple of all inputs. The batch is dynamic where ``another`` is given, and fixed otherwise:
+    symbolic shapes take the exporter twice as long.
     """
     head, given = head.eval(), image if isinstance(image, tuple) else (image,)
     shapes = None if another is None else {"image": {0: torch.export.Dim("batch")}}

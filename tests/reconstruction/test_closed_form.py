@@ -148,9 +148,7 @@ class TestClosedForm(BaseTester):
     def test_feature_flipped_psfs_for_correlations(self):
         straight, flipped = closed_form(), ClosedForm().double()
         turned = bank()
-        flipped.set_psfs(
-            PSFBank(turned.psfs.flip((-2, -1)), turned.defocus, turned.energy), correlate=True
-        )
+        flipped.set_psfs(PSFBank(turned.psfs.flip((-2, -1)), turned.defocus, turned.energy), correlate=True)
         self.assert_close(flipped.kernels, straight.kernels)
 
     def test_feature_a_state_holds_psfs_and_noise(self):
@@ -160,6 +158,10 @@ class TestClosedForm(BaseTester):
         loaded.load_state_dict(restore.state_dict())
         assert torch.equal(loaded(capture).maps, restore(capture).maps)
         assert torch.equal(copy.deepcopy(loaded)(capture).maps, restore(capture).maps)
+        known = closed_form(layers=3)  # of a state of the same size
+        known.set_psfs(PSFBank(bank(3).psfs.flip(-1), torch.arange(3.0), torch.ones(3, 3)))
+        known.load_state_dict(restore.state_dict())
+        assert torch.equal(known(capture).maps, restore(capture).maps)
 
     def test_feature_gradients_reach_the_psfs(self):
         psfs = bank().psfs.requires_grad_()
