@@ -73,6 +73,9 @@ class ClosedForm(nn.Module):
 
     Convention:
         - Computed in float32 or better, also under autocast, and returned in the capture's dtype.
+        - Stray light, the veil of the bank, is taken for even over the picture, and its mean light for that of the
+          capture. For parts of a picture, such as tiles, set ``mean_light`` to the mean linear light of the whole, (B,
+          3, 1, 1).
         - PSFs and noise are part of the state: a network that was loaded needs no camera. Kernels follow from the PSFs.
         - Borders are padded by reflection; no output depends on pixels farther away than kernel and filter reach.
 
@@ -88,6 +91,7 @@ class ClosedForm(nn.Module):
     """
 
     psfs: Tensor
+    veil: Tensor
     kernels: Tensor
     filters: Tensor
     noise_model: Tensor
@@ -96,7 +100,10 @@ class ClosedForm(nn.Module):
         super().__init__()
         check_count("layers", layers, 0)
         self.layers, self.bilateral, self.encoded = layers, bilateral, encoded
+        self.mean_light: Tensor | None = None
+        self.has_stray_light = False
         self.register_buffer("psfs", torch.zeros(max(1, layers), 3, 0, 0))
+        self.register_buffer("veil", torch.zeros(3))  # share of stray light, mean over depth
         self.register_buffer("kernels", torch.zeros(0), persistent=False)
         self.register_buffer("filters", torch.zeros(0), persistent=False)
         self.register_buffer("noise_model", torch.tensor([NOISE**2, 0.0]))  # variance in the dark, and per light
@@ -117,6 +124,8 @@ class ClosedForm(nn.Module):
         if psfs.shape[1] != 3 or (self.layers and len(psfs) != self.layers):
             wanted = f"{self.layers or 'D'}, 3, P, P"
             raise ValueError(f"the closed form needs PSFs of shape ({wanted}), got {tuple(psfs.shape)}")
+        self.veil = psfs.new_zeros(3) if bank.veil is None else bank.veil.mean(0).detach()
+        self.has_stray_light = bool(self.veil.any())
         psfs = psfs if self.layers else psfs.mean(0, keepdim=True)
         if psfs.requires_grad or self.kernels.requires_grad or not torch.equal(psfs, self.psfs):
             self.psfs = psfs.detach()
@@ -164,7 +173,7 @@ class ClosedForm(nn.Module):
         return Restoration(*(part.to(capture.dtype) for part in restored))
 
     def _restore(self, capture: Tensor, noise: Tensor) -> Restoration:
-        light = self._light(capture)
+        light = self._without_stray_light(self._light(capture))
         estimates = convolve_kernels(light, self.kernels.to(light.dtype))
         level = noise.clamp(min=LEAST_NOISE).log10()
         image = self._encode(_at_noise(estimates, level))
@@ -179,6 +188,14 @@ class ClosedForm(nn.Module):
 
     def _light(self, colors: Tensor) -> Tensor:
         return rgb_to_linear_rgb(colors) if self.encoded else colors
+
+    def _without_stray_light(self, light: Tensor) -> Tensor:
+        if not self.has_stray_light:
+            return light
+        mean = light.nan_to_num().mean((-2, -1), keepdim=True) if self.mean_light is None else self.mean_light.to(light)
+        energy = self.psfs.mean(0).sum((-2, -1))
+        share = (self.veil / (energy + self.veil)).to(light.dtype)
+        return light - share[:, None, None] * mean
 
     def _encode(self, light: Tensor) -> Tensor:
         light = light.clamp(0, 1)
@@ -195,8 +212,9 @@ def _at_noise(estimates: Tensor, level: Tensor) -> Tensor:
 
 
 def _renew_kernels(module: nn.Module, _: Any) -> None:
-    """Compute the kernels from the PSFs of a state that was loaded."""
+    """Compute from a state that was loaded what follows from its PSFs."""
     if isinstance(module, ClosedForm) and module.psfs.numel():
+        module.has_stray_light = bool(module.veil.any())
         module._set_kernels(module.psfs)
 
 

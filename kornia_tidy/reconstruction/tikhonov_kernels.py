@@ -14,14 +14,14 @@ MARGIN = 8  # px by which kernels extend beyond the PSF on each side
 def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:
     r"""Return the kernels of Tikhonov deconvolution with the capture as prior, truncated to a window.
 
-    .. math:: k = \mathcal{F}^{-1} \left[ \frac{\bar{H} + \gamma}{|H|^2 + \gamma} \right]
+    .. math:: k = \mathcal{F}^{-1} \left[ \frac{\bar{H} + \gamma / e}{|H|^2 + \gamma} \right]
 
-    Convolution with them is :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with ``prior=capture`` up to the
-    truncation. Truncation bounds the receptive field, so that a picture can be reconstructed in tiles. A constant is
-    added to each kernel so that its sum is one: white stays white.
+    with the energy e of the PSF. Convolution with them is :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with
+    the capture over e as prior, up to the truncation. Truncation bounds the receptive field, so that a picture can be
+    reconstructed in tiles. A constant is added to each kernel so that its sum is 1/e: white becomes white.
 
     Args:
-        psf: (C, P, P) with P odd.
+        psf: (C, P, P) with P odd, and a positive sum.
         weights: :math:`\gamma` of each kernel, in units of the square of a PSF's energy.
 
     Returns:
@@ -38,7 +38,7 @@ def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:
         >>> point[0, 1, 1] = 0.5
         >>> kernel = tikhonov_kernels(point, (0.25,))
         >>> kernel.shape, round(kernel.sum().item(), 5)
-        (torch.Size([1, 1, 19, 19]), 1.0)
+        (torch.Size([1, 1, 19, 19]), 2.0)
     """
     check_float_tensor("psf", psf, 3, "(C, P, P)")
     side = psf.shape[-1]
@@ -51,11 +51,12 @@ def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:
     transfer = torch.fft.rfft2(psf, s=(size, size))
     power = transfer.real.square() + transfer.imag.square()
     centred = torch.fft.rfft2(_point(psf), s=(size, size))  # of a PSF that is a point at its centre
+    energy = psf.sum((-2, -1))[:, None, None]
     gammas = psf.new_tensor(weights)[:, None, None, None]
     # PSFs begin at the corner of the plane, so their inverses end there.
-    inverse = torch.fft.irfft2((transfer.conj() + gammas * centred.conj()) / (power + gammas), s=(size, size))
+    inverse = torch.fft.irfft2((transfer.conj() + gammas * centred.conj() / energy) / (power + gammas), s=(size, size))
     kernels = inverse.roll((window - 1 - MARGIN, window - 1 - MARGIN), (-2, -1))[..., :window, :window]
-    return kernels + (1 - kernels.sum((-2, -1), keepdim=True)) / window**2
+    return kernels + (1 / energy - kernels.sum((-2, -1), keepdim=True)) / window**2
 
 
 def _point(psf: Tensor) -> Tensor:

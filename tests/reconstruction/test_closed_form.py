@@ -163,6 +163,24 @@ class TestClosedForm(BaseTester):
         known.load_state_dict(restore.state_dict())
         assert torch.equal(known(capture).maps, restore(capture).maps)
 
+    def test_feature_stray_light_is_taken_away(self):
+        """The capture of a scene with a fifth of its light spread evenly, against that of its PSFs alone."""
+        scene, lens = photo(20, 24), bank()
+        sharp = PSFBank(0.8 * lens.psfs, lens.defocus, 0.8 * lens.energy, 1 - 0.8 * lens.energy)
+        plain, stray = ClosedForm(encoded=False).double(), ClosedForm(encoded=False).double()
+        plain.set_psfs(PSFBank(sharp.psfs, lens.defocus, sharp.energy))
+        stray.set_psfs(sharp)
+        capture = convolve_kernels(scene, sharp.psfs.mean(0, keepdim=True))[:, 0]
+        mean = capture.mean((-2, -1), keepdim=True) / 0.8  # of the scene that the borders continue
+        found = stray(capture + 0.2 * mean, 0.01)
+        self.assert_close(found.image, plain(capture, 0.01).image)
+        assert (plain(capture + 0.2 * mean, 0.01).image - found.image).abs().max() > 0.1
+        stray.mean_light = mean
+        self.assert_close(stray((capture + 0.2 * mean)[..., :12], 0.01).image[..., :1], found.image[..., :1], atol=1e-2)
+        loaded = ClosedForm(encoded=False).double()
+        loaded.load_state_dict(stray.state_dict())
+        self.assert_close(loaded(capture + 0.2 * mean, 0.01).image, found.image)
+
     def test_feature_gradients_reach_the_psfs(self):
         psfs = bank().psfs.requires_grad_()
         restore = ClosedForm().double()

@@ -46,10 +46,10 @@ class TestTikhonovKernels(BaseTester):
         difference = (found - whole)[..., 25:-25, 25:-25]
         assert difference.square().mean().sqrt() < 1e-3 * whole.std()
 
-    def test_feature_white_stays_white(self):
-        self.assert_close(
-            tikhonov_kernels(0.8 * blurs(), (1e-3, 0.1)).sum((-2, -1)), torch.ones(2, 2, dtype=torch.float64)
-        )
+    def test_feature_white_becomes_white(self):
+        """A window that holds 80 % of the light makes white 0.8."""
+        expected = torch.full((2, 2), 1 / 0.8, dtype=torch.float64)
+        self.assert_close(tikhonov_kernels(0.8 * blurs(), (1e-3, 0.1)).sum((-2, -1)), expected)
 
     def test_gradcheck(self, device):
         self.gradcheck(lambda psf: tikhonov_kernels(psf, (0.05,)), (blurs(5)[:1].to(device),))
