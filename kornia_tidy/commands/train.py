@@ -15,6 +15,7 @@ from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.inference.heads import HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.lightning_extra import require_lightning
@@ -162,6 +163,10 @@ def add_camera_settings(group: Any) -> None:
     _setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
     _setting(group, "sigma", type=float, metavar="S", help="read noise, of full scale")
     _setting(group, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
+    _setting(group, "window", type=int, metavar="PX", help="side of the PSFs, odd; default: measured on the masks")
+    _setting(
+        group, "stray_light", choices=STRAY_LIGHT, help="light outside the window; default: as the fidelity has it"
+    )
     _setting(group, "compositing", choices=tuple(COMPOSITING), help="of depths")
     _setting(group, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.reconstruction.head import ReconstructionHead
 
 # Each takes in_channels, out_channels and, unless it is in FIXED, width, and maps (B, in_channels, H, W) to
 # (B, out_channels, H, W).
@@ -96,7 +96,7 @@ class OutsideHead(ReconstructionHead):
 
     Args:
         kind: class that is called with ``in_channels``, ``out_channels`` and, if given, ``width``. Its attribute
-            ``stride``, 1 without it, tells of which number the sides of its images are multiples.
+            ``stride``, if it is a number, tells of which number the sides of its images are multiples.
         in_channels: channels of the image.
         out_channels: maps to estimate.
         width: channels of its first level, if it takes it.
@@ -116,8 +116,8 @@ class OutsideHead(ReconstructionHead):
         except TypeError as error:
             arguments = ", ".join([str(in_channels), str(out_channels), *(f"{k}={v}" for k, v in width.items())])
             raise ValueError(f"the head {kind.__name__}({arguments}) cannot be made: {error}") from error
-        self.stride = getattr(self.network, "stride", 1)
-        check_count("stride", self.stride)
+        stride = getattr(self.network, "stride", 1)
+        self.stride = stride if isinstance(stride, int) else 1  # a convolution's is a tuple
 
     def predict(self, image: Tensor) -> Tensor:
         """Return the network's maps."""

@@ -15,6 +15,7 @@ from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.inference.tasks import MAPS, metres, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.closed_form import whole_picture
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.tiled import reconstruct_tiled
 
@@ -98,7 +99,8 @@ def reconstruct_light(
     if light.shape[0] not in {1, 3} or 0 in light.shape:
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
     colours = light.expand(3, -1, -1)[None]
-    maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
+    with whole_picture(head, colours):
+        maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
     named = {name: part[0].float() for name, part in zip(MAPS[head.task], maps, strict=True)}
     image, near = named.get("image"), named.get("depth")
     if image is not None:

@@ -17,6 +17,7 @@ from kornia_tidy.inference.heads import CLOSED_FORMS, check_head
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
@@ -42,6 +43,8 @@ class SystemSettings:
         sigma: read noise of the sensor, in units of full scale.
         fidelity: name of the preset by which PSFs are computed.
         window: side of the PSFs in pixels. None: measured on the initial masks, then fixed.
+        stray_light: what becomes of the light outside the window, see :class:`~kornia_tidy.fidelity.Fidelity`. None: as
+            the preset has it.
         compositing: see :class:`~kornia_tidy.TiDyOptics`.
         color_space: as for :class:`~kornia_tidy.TiDyOptics`. None: its default.
         border: as for :class:`~kornia_tidy.TiDyOptics`.
@@ -72,6 +75,7 @@ class SystemSettings:
     sigma: float = 0.01
     fidelity: str = "balanced"
     window: int | None = None
+    stray_light: str | None = None
     compositing: str = "gather"
     color_space: str | None = None
     border: str = "reflect"
@@ -88,6 +92,8 @@ class SystemSettings:
         check_choice("compositing", self.compositing, tuple(COMPOSITING))
         check_choice("border", self.border, BORDERS)
         Fidelity.preset(self.fidelity)
+        if self.stray_light is not None:
+            check_choice("stray_light", self.stray_light, STRAY_LIGHT)
         for name in ("focal_length", "pixel_pitch"):
             check_positive(name, getattr(self, name))
         for name in ("masks", "refocus", "seed"):

@@ -46,11 +46,14 @@ def build_optics(settings: SystemSettings) -> TiDyOptics:
         >>> build_optics(SystemSettings(masks=2, window=23)).window
         23
     """
+    fidelity = Fidelity.preset(settings.fidelity).replace(window=settings.window)
+    if settings.stray_light is not None:
+        fidelity = fidelity.replace(stray_light=settings.stray_light)
     optics = TiDyOptics(
         _masks(settings),
         settings.camera(),
         sensor=SensorNoise(settings.sigma),
-        fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
+        fidelity=fidelity,
         compositing=settings.compositing,
         color_space=settings.color_space,
         border=settings.border,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -73,9 +75,8 @@ class ClosedForm(nn.Module):
 
     Convention:
         - Computed in float32 or better, also under autocast, and returned in the capture's dtype.
-        - Stray light, the veil of the bank, is taken for even over the picture, and its mean light for that of the
-          capture. For parts of a picture, such as tiles, set ``mean_light`` to the mean linear light of the whole, (B,
-          3, 1, 1).
+        - Stray light, the veil of the bank, is taken for even over the picture. It follows from the mean light of the
+          capture; for tiles from that of the whole picture, see :func:`whole_picture`.
         - PSFs and noise are part of the state: a network that was loaded needs no camera. Kernels follow from the PSFs.
         - Borders are padded by reflection; no output depends on pixels farther away than kernel and filter reach.
 
@@ -200,6 +201,39 @@ class ClosedForm(nn.Module):
     def _encode(self, light: Tensor) -> Tensor:
         light = light.clamp(0, 1)
         return linear_rgb_to_rgb(light) if self.encoded else light
+
+
+@contextmanager
+def whole_picture(head: nn.Module, light: Tensor) -> Generator[None]:
+    """Let the closed forms in a network take away the stray light of a whole picture while they see parts of it.
+
+    Without it a network whose camera has stray light is refused by
+    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+
+    Args:
+        head: a network.
+        light: (B, 3, H, W), the picture in linear light, clipped to [0, 1] by the network.
+
+    Example:
+        >>> restore = ClosedForm()
+        >>> bank = PSFBank(torch.rand(4, 3, 5, 5), torch.arange(4.0), torch.ones(4, 3), torch.full((4, 3), 0.1))
+        >>> restore.set_psfs(bank)
+        >>> with whole_picture(restore, torch.full((1, 3, 8, 8), 0.25)):
+        ...     restore.mean_light.flatten()
+        tensor([0.2500, 0.2500, 0.2500])
+    """
+    parts = [module for module in head.modules() if isinstance(module, ClosedForm) and module.has_stray_light]
+    if parts:
+        strips = light.split(256, -2)  # a copy of a large picture would take its memory again
+        total = torch.stack([strip.clamp(0, 1).double().sum((-2, -1)) for strip in strips]).sum(0)
+        mean = total[..., None, None] / (light.shape[-2] * light.shape[-1])
+    try:
+        for part in parts:
+            part.mean_light = mean.to(part.psfs)
+        yield
+    finally:
+        for part in parts:
+            part.mean_light = None
 
 
 def _at_noise(estimates: Tensor, level: Tensor) -> Tensor:
