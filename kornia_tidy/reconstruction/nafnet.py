@@ -15,7 +15,7 @@ ATTENTION = 3  # side of the window of the channel attention, in pixels of its l
 
 
 class NAFNet(ReconstructionHead):
-    r"""U-Net of residual blocks whose only nonlinearity is a product of channels.
+    r"""U-Net of residual blocks that multiply channels where other networks have activation functions.
 
     A block normalises its input over channels, and adds to it
 

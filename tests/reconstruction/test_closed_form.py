@@ -206,6 +206,9 @@ class TestClosedForm(BaseTester):
         restore, capture = closed_form().to(device), photo(13, 16).to(device)
         traced = torch.compile(lambda image: restore(image, 0.01).image, backend="eager", fullgraph=True)
         self.assert_close(traced(capture), restore(capture, 0.01).image)
+        restore, capture = closed_form(torch.float32).to(device), capture.float()
+        with torch.autocast(device.type, dtype=torch.bfloat16):  # convolutions keep their precision
+            self.assert_close(traced(capture), restore(capture, 0.01).image)
 
     def test_exception(self):
         restore = ClosedForm()
