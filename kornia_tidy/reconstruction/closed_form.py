@@ -181,7 +181,7 @@ class ClosedForm(nn.Module):
         if self.bilateral:
             border = "reflect" if min(image.shape[-2:]) > WINDOW // 2 else "replicate"
             image = bilateral_blur(image, WINDOW, COLOR, (SPACE, SPACE), border)
-        maps = [capture, self._encode(estimates).flatten(1, 2), image, 0 * level.mean(1, keepdim=True)]
+        maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True)]
         if self.layers:
             brightness = light.mean(1, keepdim=True)
             maps.append(convolve_kernels(brightness, self.filters[:, None].to(light.dtype)).flatten(1, 2))
