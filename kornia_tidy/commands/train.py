@@ -15,6 +15,7 @@ from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.inference.heads import HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.lightning_extra import require_lightning
@@ -83,14 +84,22 @@ def add_parser(subparsers: Any) -> None:
     _setting(
         system,
         "head",
-        choices=tuple(HEADS),
-        help="network; without a GPU take plain, or a small --width: the paper's has 34.9 million weights",
+        metavar="NAME",
+        help=f"{', '.join(HEADS)}: networks (without a GPU take nafnet, plain or a small --width: the paper's "
+        f"attention-unet has 34.9 million weights); tikhonov, tikhonov-bilateral: no network, only masks are learnt; "
+        f"or module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
     )
     _setting(
         system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
     )
     _setting(
         system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
+    )
+    _setting(
+        system,
+        "closed_form",
+        action=argparse.BooleanOptionalAction,
+        help="the network takes deconvolved captures and the level of the noise, and adds to the best of them",
     )
     _setting(system, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
     _setting(
@@ -154,6 +163,10 @@ def add_camera_settings(group: Any) -> None:
     _setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
     _setting(group, "sigma", type=float, metavar="S", help="read noise, of full scale")
     _setting(group, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
+    _setting(group, "window", type=int, metavar="PX", help="side of the PSFs, odd; default: measured on the masks")
+    _setting(
+        group, "stray_light", choices=STRAY_LIGHT, help="light outside the window; default: as the fidelity has it"
+    )
     _setting(group, "compositing", choices=tuple(COMPOSITING), help="of depths")
     _setting(group, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
 

@@ -7,38 +7,126 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice
 from kornia_tidy.reconstruction.head import ReconstructionHead
 
-# Each takes in_channels, out_channels and width, and maps (B, in_channels, H, W) to (B, out_channels, H, W).
+# Each takes in_channels, out_channels and, unless it is in FIXED, width, and maps (B, in_channels, H, W) to
+# (B, out_channels, H, W).
 HEADS = {
     "attention-unet": "kornia_tidy.reconstruction:AttentionUNet",
     "depth-anything-v2": "kornia_tidy.inference.baselines:depth_anything_v2",
+    "nafnet": "kornia_tidy.reconstruction:NAFNet",
     "phasecam3d": "kornia_tidy.reconstruction:PhaseCam3DUNet",
+    "midas-small": "kornia_tidy.reconstruction:MiDaSSmall",
     "plain": "kornia_tidy.inference.heads:PlainHead",
     "zoedepth": "kornia_tidy.inference.baselines:zoedepth",
 }
+CLOSED_FORMS = ("tikhonov", "tikhonov-bilateral")
+"""Heads without a network, whose result is :class:`~kornia_tidy.reconstruction.closed_form_head.ClosedFormHead`'s."""
+FIXED = ("midas-small",)  # three input channels, and one width
+
+
+def check_head(name: str) -> None:
+    """Raise ``ValueError`` unless a head is known by name or is written as an import path, ``module:Class``.
+
+    Example:
+        >>> check_head("nafnett")
+        Traceback (most recent call last):
+        ...
+        ValueError: head must be one of 'attention-unet', 'depth-anything-v2', 'nafnet', 'phasecam3d', 'midas-small', \
+'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', or the path of a class such as my_package.networks:Network, got 'nafnett'
+    """
+    known = (*HEADS, *CLOSED_FORMS)
+    module, colon, attribute = name.partition(":")
+    is_path = bool(colon) and attribute.isidentifier() and all(part.isidentifier() for part in module.split("."))
+    if name not in known and not is_path:
+        raise ValueError(
+            f"head must be one of {', '.join(map(repr, known))}, or the path of a class such as "
+            f"my_package.networks:Network, got {name!r:.80}"
+        )
 
 
 def make_head(name: str, out_channels: int, width: int | None = None, in_channels: int = 3) -> ReconstructionHead:
-    """Return a network by name.
+    """Return a network by name or import path.
 
     Args:
-        name: a key of :data:`HEADS`.
+        name: a key of :data:`HEADS`, or ``module:Class``, a class that is called with ``in_channels``,
+            ``out_channels`` and, if given, ``width``. Importing the module runs its code.
         out_channels: maps to estimate.
         width: channels of its first level. None: its default.
         in_channels: channels of its input.
+
+    Raises:
+        ValueError: if the name is unknown, the class cannot be imported or is no ``torch.nn.Module``, or the network
+            cannot have these channels or this width.
 
     Example:
         >>> import torch
         >>> make_head("plain", 3, width=4)(torch.rand(1, 3, 20, 30)).shape
         torch.Size([1, 3, 20, 30])
     """
-    check_choice("head", name, tuple(HEADS))
-    module, _, attribute = HEADS[name].partition(":")
+    check_head(name)
+    if name in CLOSED_FORMS:
+        raise ValueError(f"the head {name!r} has no network: make it by ClosedFormHead")
+    if name in FIXED:
+        if in_channels != 3 or width is not None:
+            raise ValueError(f"the head {name!r} takes 3 channels and no width, got {in_channels} and width={width}")
+        return _attribute(HEADS[name])(out_channels)
     options: dict[str, Any] = {} if width is None else {"width": width}
-    network = getattr(importlib.import_module(module), attribute)
-    return network(in_channels, out_channels, **options)
+    if name in HEADS:
+        return _attribute(HEADS[name])(in_channels, out_channels, **options)
+    return OutsideHead(_imported(name), in_channels, out_channels, **options)
+
+
+def _attribute(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _imported(path: str) -> Any:
+    """Return a network class of the user by its import path."""
+    try:
+        network = _attribute(path)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"the head {path!r:.80} cannot be imported: {error}") from error
+    if not (isinstance(network, type) and issubclass(network, nn.Module)):
+        raise ValueError(f"the head {path!r:.80} must be a class of torch.nn.Module, got {network!r:.80}")
+    return network
+
+
+class OutsideHead(ReconstructionHead):
+    """A network of the user, with the checks, padding and cropping of :class:`ReconstructionHead`.
+
+    Args:
+        kind: class that is called with ``in_channels``, ``out_channels`` and, if given, ``width``. Its attribute
+            ``stride``, if it is a number, tells of which number the sides of its images are multiples.
+        in_channels: channels of the image.
+        out_channels: maps to estimate.
+        width: channels of its first level, if it takes it.
+
+    Shape:
+        - image: (B, in_channels, H, W), any size.
+        - output: (B, out_channels, H, W).
+
+    Raises:
+        ValueError: if the class does not take these arguments, or returns maps of another shape.
+    """
+
+    def __init__(self, kind: type[nn.Module], in_channels: int, out_channels: int, **width: int) -> None:
+        super().__init__(in_channels, out_channels)
+        try:
+            self.network = kind(in_channels, out_channels, **width)
+        except TypeError as error:
+            arguments = ", ".join([str(in_channels), str(out_channels), *(f"{k}={v}" for k, v in width.items())])
+            raise ValueError(f"the head {kind.__name__}({arguments}) cannot be made: {error}") from error
+        stride = getattr(self.network, "stride", 1)
+        self.stride = stride if isinstance(stride, int) else 1  # a convolution's is a tuple
+
+    def predict(self, image: Tensor) -> Tensor:
+        """Return the network's maps."""
+        maps = self.network(image)
+        if maps.shape != (wanted := (len(image), self.out_channels, *image.shape[-2:])):
+            raise ValueError(f"the head {type(self.network).__name__} must return {wanted}, got {tuple(maps.shape)}")
+        return maps
 
 
 class PlainHead(ReconstructionHead):

@@ -10,11 +10,13 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.inference.tasks import MAPS, metres, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.closed_form import whole_picture
+from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.tiled import reconstruct_tiled
 
 
@@ -35,6 +37,8 @@ class LightHead(nn.Module):
 
     Args:
         system: camera and network, see :func:`~kornia_tidy.inference.trained.load_trained`.
+        noise: standard deviation of the captures' noise in linear light, in units of full scale, for a network that is
+            conditioned on it. None: as the sensor of the system has it.
 
     Shape:
         - light: (B, 3, H, W) or (B, 1, H, W), linear; black is 0 and saturation 1; other values are clipped.
@@ -43,13 +47,19 @@ class LightHead(nn.Module):
 
     Raises:
         TypeError: if the camera has no metric scale.
+        ValueError: if a noise is given that is not positive, or the network is not conditioned on it.
     """
 
-    def __init__(self, system: TrainedSystem) -> None:
+    def __init__(self, system: TrainedSystem, noise: float | None = None) -> None:
         super().__init__()
+        if noise is not None:
+            check_positive("noise", noise, "in units of full scale")
+            if not takes_noise(system.head):
+                raise ValueError("noise is for a network that is conditioned on it, and this one is not")
         if not isinstance(system.optics.camera, ThinLensCamera):
             raise TypeError(f"depth in metres needs a ThinLensCamera, got {type(system.optics.camera).__name__}")
         self.head = system.head
+        self.noise = noise
         self.task = system.settings.task
         self.camera = system.optics.camera
         self.encoded = system.optics.color_space == "srgb"
@@ -58,7 +68,8 @@ class LightHead(nn.Module):
     def forward(self, light: Tensor) -> tuple[Tensor, ...]:
         """Return the maps."""
         light = light.clamp(0, 1).expand(-1, 3, -1, -1)
-        maps = split_maps(self.task, self.head(linear_rgb_to_rgb(light) if self.encoded else light))
+        capture = linear_rgb_to_rgb(light) if self.encoded else light
+        maps = split_maps(self.task, self.head(capture) if self.noise is None else self.head(capture, noise=self.noise))
         if "image" in maps and not self.encoded:
             maps["image"] = linear_rgb_to_rgb(maps["image"].clamp(0, 1))
         return tuple(maps.values())
@@ -88,7 +99,8 @@ def reconstruct_light(
     if light.shape[0] not in {1, 3} or 0 in light.shape:
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
     colours = light.expand(3, -1, -1)[None]
-    maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
+    with whole_picture(head, colours):
+        maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
     named = {name: part[0].float() for name, part in zip(MAPS[head.task], maps, strict=True)}
     image, near = named.get("image"), named.get("depth")
     if image is not None:

@@ -13,9 +13,11 @@ from typing import Any, Self
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.inference.heads import CLOSED_FORMS, check_head
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
@@ -41,14 +43,19 @@ class SystemSettings:
         sigma: read noise of the sensor, in units of full scale.
         fidelity: name of the preset by which PSFs are computed.
         window: side of the PSFs in pixels. None: measured on the initial masks, then fixed.
+        stray_light: what becomes of the light outside the window, see :class:`~kornia_tidy.fidelity.Fidelity`. None: as
+            the preset has it.
         compositing: see :class:`~kornia_tidy.TiDyOptics`.
         color_space: as for :class:`~kornia_tidy.TiDyOptics`. None: its default.
         border: as for :class:`~kornia_tidy.TiDyOptics`.
-        head: name of the network, see :data:`kornia_tidy.inference.heads.HEADS`.
+        head: name of the network, see :data:`kornia_tidy.inference.heads.HEADS`; of a closed form alone,
+            ``"tikhonov"`` or ``"tikhonov-bilateral"``; or the import path of a class, ``module:Class``.
         width: channels of the network's first level. None: its default; the paper's attention U-Net has 64.
         residual: the network estimates the difference between image and capture; for tasks with an image.
+        closed_form: the network takes restorations in closed form beside the capture, and its image is added to the
+            best of them, see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
         refocus: number of depths that the capture is refocused to before it enters the network, see
-            :class:`~kornia_tidy.reconstruction.Refocused`. 0: the capture alone enters the network.
+            :class:`~kornia_tidy.reconstruction.Refocused`. 0: none.
         seed: of the initial masks, and of everything random in a run.
 
     Raises:
@@ -68,12 +75,14 @@ class SystemSettings:
     sigma: float = 0.01
     fidelity: str = "balanced"
     window: int | None = None
+    stray_light: str | None = None
     compositing: str = "gather"
     color_space: str | None = None
     border: str = "reflect"
     head: str = "attention-unet"
     width: int | None = None
     residual: bool = False
+    closed_form: bool = False
     refocus: int = 0
     seed: int = 0
 
@@ -83,6 +92,8 @@ class SystemSettings:
         check_choice("compositing", self.compositing, tuple(COMPOSITING))
         check_choice("border", self.border, BORDERS)
         Fidelity.preset(self.fidelity)
+        if self.stray_light is not None:
+            check_choice("stray_light", self.stray_light, STRAY_LIGHT)
         for name in ("focal_length", "pixel_pitch"):
             check_positive(name, getattr(self, name))
         for name in ("masks", "refocus", "seed"):
@@ -95,6 +106,11 @@ class SystemSettings:
             raise ValueError(f"start {self.start!r} has five masks, got masks={self.masks}; 'noise' has any number")
         if self.residual and "image" not in MAPS[self.task]:
             raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
+        check_head(self.head)
+        if self.head in CLOSED_FORMS and self.task != "edof":
+            raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
+        if self.residual and (self.closed_form or self.head in CLOSED_FORMS):
+            raise ValueError("residual adds the capture and closed_form its restoration: choose one of them")
         if self.depth_range is not None:
             object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
 

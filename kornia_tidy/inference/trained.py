@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.inference.heads import make_head
+from kornia_tidy.inference.heads import CLOSED_FORMS, make_head
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.tasks import channels_of
@@ -20,6 +20,8 @@ from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
@@ -46,11 +48,14 @@ def build_optics(settings: SystemSettings) -> TiDyOptics:
         >>> build_optics(SystemSettings(masks=2, window=23)).window
         23
     """
+    fidelity = Fidelity.preset(settings.fidelity).replace(window=settings.window)
+    if settings.stray_light is not None:
+        fidelity = fidelity.replace(stray_light=settings.stray_light)
     optics = TiDyOptics(
         _masks(settings),
         settings.camera(),
         sensor=SensorNoise(settings.sigma),
-        fidelity=Fidelity.preset(settings.fidelity).replace(window=settings.window),
+        fidelity=fidelity,
         compositing=settings.compositing,
         color_space=settings.color_space,
         border=settings.border,
@@ -76,23 +81,39 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 
 def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
-    head = make_head(settings.head, channels_of(settings.task), settings.width, 3 + settings.refocus)
+    encoded = (settings.color_space or ("paper" if settings.fidelity == "paper" else "srgb")) == "srgb"
+    if settings.head in CLOSED_FORMS:
+        return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=encoded)
+    channels = closed_form_channels(settings.refocus) if settings.closed_form else 3 + settings.refocus
+    head = make_head(settings.head, channels_of(settings.task), settings.width, channels)
+    if settings.closed_form:
+        return ClosedFormHead(head, settings.refocus, encoded=encoded)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head
 
 
 def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
-    """Update the PSFs of a network that refocuses captures (:class:`~kornia_tidy.reconstruction.Refocused`).
+    """Update the PSFs of a network that refocuses or restores captures, from a camera as it is now.
 
-    They are the camera's present PSFs of green light, evenly spaced over the range of defocus. Other networks are
-    not changed.
+    :class:`~kornia_tidy.reconstruction.Refocused` takes the PSFs of green light,
+    :class:`~kornia_tidy.reconstruction.ClosedForm` those of three colours and the noise of the sensor; both evenly
+    spaced over the range of defocus. Other networks are not changed.
     """
     for module in head.modules():
         if isinstance(module, Refocused):
-            lo, hi = optics.camera.defocus_range
-            nodes = torch.linspace(lo, hi, module.layers, dtype=torch.float64).tolist()
-            module.set_psfs(optics.psf_bank(1, defocus=nodes))
+            module.set_psfs(optics.psf_bank(1, defocus=_nodes(optics, module.layers)))
+        elif isinstance(module, ClosedForm):
+            bank = optics.psf_bank(3, defocus=_nodes(optics, module.layers or NODES))
+            module.set_psfs(bank, correlate=optics.fidelity.correlate)
+            if isinstance(optics.sensor, SensorNoise):
+                module.set_noise(optics.sensor)
+
+
+def _nodes(optics: TiDyOptics, count: int) -> list[float]:
+    """Return evenly spaced defocus in radians, from one end of the camera's range to the other."""
+    lo, hi = optics.camera.defocus_range
+    return torch.linspace(lo, hi, count, dtype=torch.float64).tolist()
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
@@ -210,10 +231,13 @@ def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -
     )
     missing, unknown = [key for key in own if key not in weights], [key for key in weights if key not in own]
     faults = [f"{word} {_some(keys)}" for word, keys in (("missing", missing), ("unknown", unknown)) if keys]
+    # PSFs of a closed form take the window that is stored.
+    free = {f"{name}.psfs".lstrip(".") for name, part in module.named_modules() if isinstance(part, ClosedForm)}
     faults += [
         f"{key} is {tuple(weights[key].shape)}, wanted {tuple(value.shape)}"
         for key, value in own.items()
         if key in weights and weights[key].shape != value.shape
+        if key not in free or weights[key].shape[:2] != value.shape[:2]
     ]
     faults += [
         f"{key} holds NaN or infinity"

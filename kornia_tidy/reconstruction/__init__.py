@@ -4,9 +4,12 @@ Captures come in, maps of the same size go out. Read ``head.py``, the base class
 """
 
 from kornia_tidy.reconstruction.attention_unet import AttentionUNet
+from kornia_tidy.reconstruction.closed_form import ClosedForm, Restoration, closed_form_channels
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
+from kornia_tidy.reconstruction.nafnet import NAFNet
 from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
 from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.refocused import Refocused
@@ -17,17 +20,22 @@ from kornia_tidy.reconstruction.wiener import Wiener
 
 __all__ = [
     "AttentionUNet",
+    "ClosedForm",
+    "ClosedFormHead",
     "JointEstimate",
     "JointHead",
     "MiDaSSmall",
+    "NAFNet",
     "PhaseCam3DUNet",
     "Preconditioned",
     "ReconstructionHead",
     "Refocused",
     "Residual",
+    "Restoration",
     "Tikhonov",
     "TikhonovLayers",
     "Wiener",
+    "closed_form_channels",
     "load_midas_small",
     "receptive_field",
     "reconstruct_tiled",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from abc import ABC, abstractmethod
 
@@ -50,6 +51,11 @@ class ReconstructionHead(nn.Module, ABC):
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the estimated maps, (B, out_channels, H, W)."""
+        self.check_image(image)
+        return self.on_grid(image)
+
+    def check_image(self, image: Tensor) -> None:
+        """Raise an error for an image of another type, rank or number of channels; warn of the range of the first."""
         check_float_tensor("image", image, 4, "(B, C, H, W)")
         if image.shape[1] != self.in_channels:
             remedy = layout_remedy(tuple(image.shape), self.in_channels)
@@ -57,7 +63,10 @@ class ReconstructionHead(nn.Module, ABC):
         if not self.looked and not is_value_unknown():
             self.looked = True  # for the first image only, as the check waits for the device
             if (said := check_head_image(image)) is not None:
-                warnings.warn(said, stacklevel=4)
+                warnings.warn(said, stacklevel=5)
+
+    def on_grid(self, image: Tensor) -> Tensor:
+        """Return the maps of an image that is padded to multiples of ``stride``, cropped to its size."""
         height, width = image.shape[-2:]
         (left, right, top, bottom), mode = border_padding((height, width), self.stride)
         if bottom or right:
@@ -83,6 +92,17 @@ class ReconstructionHead(nn.Module, ABC):
                     nn.init.zeros_(module.bias)
             elif isinstance(module, nn.BatchNorm2d):
                 module.reset_parameters()
+
+
+def takes_noise(head: nn.Module) -> bool:
+    """Return whether a network is conditioned on the noise: it takes ``noise`` beside the capture.
+
+    Example:
+        >>> from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+        >>> takes_noise(ClosedFormHead()), takes_noise(nn.Conv2d(3, 3, 1))
+        (True, False)
+    """
+    return "noise" in inspect.signature(head.forward).parameters
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:

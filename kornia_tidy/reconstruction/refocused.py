@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
-from kornia_tidy.render.borders import from_spectrum, next_fast_size, pad_border, to_spectrum
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.render.borders import next_fast_size
 
 WEIGHT = 0.3  # of the prior in inverse filters, in units of the square of a PSF's energy
 
@@ -103,24 +103,5 @@ class Refocused(ReconstructionHead):
         if not self.filters.numel():
             raise ValueError("the network does not know its camera: call set_psfs(optics.psf_bank(...)) first")
         brightness = image.to(torch.promote_types(image.dtype, self.filters.dtype)).mean(1, keepdim=True)
-        return self.network(torch.cat([image, _convolve(brightness, self.filters).to(image.dtype)], 1))
-
-
-def _convolve(image: Tensor, filters: Tensor) -> Tensor:
-    """Convolve (B, 1, H, W) with (D, P, P) to (B, D, H, W), with padded borders."""
-    window = filters.shape[-1]
-    padded = pad_border(image, window // 2, "reflect" if window // 2 < min(image.shape[-2:]) else "replicate")
-    if torch.compiler.is_compiling():  # exporters do not support complex numbers
-        return functional.conv2d(padded, filters.flip((-2, -1)).unsqueeze(1))
-    unknown = padded.isnan()
-    if marked := bool(unknown.any()):  # a transform would spread NaN over the whole picture
-        padded = padded.where(~unknown, 0)
-    size = padded.shape[-2], padded.shape[-1]
-    spectrum = to_spectrum(padded, size)
-    # Without gradients, as for large pictures, one filter at a time takes a fraction of the memory.
-    together = len(filters) if torch.is_grad_enabled() else 1
-    layers = [from_spectrum(spectrum * to_spectrum(some, size), size, window) for some in filters.split(together)]
-    convolved = torch.cat(layers, 1)
-    if marked:
-        convolved = convolved.masked_fill(functional.max_pool2d(unknown.to(padded.dtype), window, 1) > 0, torch.nan)
-    return convolved
+        refocused = convolve_kernels(brightness, self.filters.unsqueeze(1)).flatten(1, 2)
+        return self.network(torch.cat([image, refocused.to(image.dtype)], 1))

@@ -37,19 +37,28 @@ class Residual(nn.Module):
 
     def __init__(self, network: nn.Module, channels: int = 3) -> None:
         super().__init__()
-        last = list(network.modules())[-1]
-        if not isinstance(last, nn.Conv2d) or last.out_channels < channels:
-            raise ValueError(
-                f"a residual needs a network that ends in a convolution to {channels} maps or more, "
-                f"{type(network).__name__} ends in {last}"
-            )
+        zero_last_convolution(network, channels)
         self.network, self.channels = network, channels
-        with torch.no_grad():
-            for parameter in last.parameters():
-                parameter.zero_()
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the maps, with the capture added to the last ones."""
         maps = self.network(image)
         others = maps.shape[1] - self.channels
         return torch.cat([maps[:, :others], maps[:, others:] + image], 1)
+
+
+def zero_last_convolution(network: nn.Module, channels: int) -> None:
+    """Initialise the last convolution of a network with zeros.
+
+    Raises:
+        ValueError: if the network does not end in a convolution, or has fewer maps than ``channels``.
+    """
+    last = list(network.modules())[-1]
+    if not isinstance(last, nn.Conv2d) or last.out_channels < channels:
+        raise ValueError(
+            f"a residual needs a network that ends in a convolution to {channels} maps or more, "
+            f"{type(network).__name__} ends in {last}"
+        )
+    with torch.no_grad():
+        for parameter in last.parameters():
+            parameter.zero_()

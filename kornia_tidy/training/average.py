@@ -59,9 +59,12 @@ class MovingAverage(nn.Module):
         learnt = dict(network.named_parameters())
         if learnt:
             step(list(self.network.parameters()), list(learnt.values()), steps)
-        for (name, own), new in zip(self.network.state_dict().items(), network.state_dict().values(), strict=True):
-            if name not in learnt and not name.endswith(EXTRA_STATE):  # settings have no average
-                own.copy_(new)
+        others = {
+            name: value
+            for name, value in network.state_dict().items()
+            if name not in learnt and not name.endswith(EXTRA_STATE)  # settings have no average
+        }
+        self.network.load_state_dict(others, strict=False)  # modules may take buffers of another size
         self.steps += 1
 
     def forward(self, *inputs: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import nn
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light, reconstruct_opencv
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.tasks import channels_of
-from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
+from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics, update_psfs
 from kornia_tidy.reconstruction import receptive_field
 from tests.base import BaseTester
 
@@ -62,6 +62,25 @@ class TestLightHead(BaseTester):
         head(light)
         self.assert_close(seen[0], light)
 
+    def test_feature_the_noise_is_told_to_a_network_that_takes_it(self):
+        settings, light = SystemSettings(masks=1, window=23, head="tikhonov", sigma=0.002), torch.rand(1, 3, 40, 40)
+        optics, head = build_optics(settings), build_head(settings)
+        with torch.no_grad():
+            update_psfs(head, optics)
+        system = TrainedSystem(optics, head, settings, 0)
+        capture = optics.encode(light)
+        for noise, expected in ((None, 0.002), (0.03, 0.03)):
+            self.assert_close(LightHead(system, noise)(light)[0], head(capture, expected))
+        assert (head(capture, 0.03) - head(capture, 0.002)).abs().max() > 0.01
+
+    def test_exception_noise(self):
+        settings = SystemSettings(masks=1, window=23)
+        system = TrainedSystem(build_optics(settings), Passing("edof"), settings, 0)
+        with pytest.raises(ValueError, match="conditioned on it, and this one is not"):
+            LightHead(system, 0.01)
+        with pytest.raises(ValueError, match="noise must be positive and finite in units of full scale, got 0"):
+            LightHead(system, 0.0)
+
     def test_feature_looks_as_far_as_its_network(self):
         settings = SystemSettings(head="plain", width=2)
         assert receptive_field(light_head("edof", head=build_head(settings).eval())) == 31
@@ -81,6 +100,22 @@ class TestReconstructLight(BaseTester):
         depth = reconstruct_light(light_head("depth", "linear"), light).depth
         self.assert_close(depth.flatten()[1:], torch.tensor([0.595, 0.2975]))
         assert math.isinf(depth.flatten()[0])
+
+    def test_feature_stray_light_is_that_of_the_whole_picture(self):
+        """In tiles, of which some are darker than others."""
+        settings = SystemSettings(masks=1, window=9, stray_light="veil", head="tikhonov-bilateral")
+        optics, head = build_optics(settings), build_head(settings)
+        with torch.no_grad():
+            update_psfs(head, optics)
+        light = torch.rand(3, 30, 200, generator=torch.Generator().manual_seed(0)) * torch.linspace(0, 1, 200)
+        seen = []
+        light_head = LightHead(TrainedSystem(optics, head, settings, 0))
+        found = reconstruct_light(light_head, light, memory_budget=2 << 20, progress=lambda *n: seen.append(n))
+        whole = head(optics.encode(light[None]))[0]
+        assert len(seen) > 1
+        self.assert_close(found.image, whole, atol=1e-5, rtol=0)
+        dark = head(optics.encode(light[None, ..., :60]))[0]
+        assert (dark - whole[..., :60])[..., :30].abs().max() > 0.01
 
     def test_feature_the_light_is_left_alone(self):
         light = torch.rand(3, 12, 14) * 2

@@ -11,12 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.reconstruction import AttentionUNet, MiDaSSmall, PhaseCam3DUNet, ReconstructionHead
+from kornia_tidy.reconstruction import AttentionUNet, MiDaSSmall, NAFNet, PhaseCam3DUNet, ReconstructionHead
 from tests.base import BaseTester
 
 HEADS = {
     "attention": lambda: AttentionUNet(width=2),
     "midas": MiDaSSmall,
+    "nafnet": lambda: NAFNet(width=2),
     "phasecam3d": lambda: PhaseCam3DUNet(width=2),
 }
 every_head = pytest.mark.parametrize("name", HEADS)
@@ -50,6 +51,10 @@ def trained(name):
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_mean.normal_(0, 0.1, generator=generator)
             module.running_var.uniform_(0.5, 2.0, generator=generator)
+    if name == "nafnet":  # its blocks start as the identity
+        for label, parameter in head.named_parameters():
+            if label.endswith(("beta", "gamma")):
+                torch.nn.init.normal_(parameter, std=0.1, generator=generator)
     if name == "midas":
         torch.nn.init.normal_(head.scratch.output_conv[4].weight, std=0.2, generator=generator)
     return head.eval()
@@ -208,7 +213,7 @@ class TestEveryHead(BaseTester):
             head = head.to(memory_format=torch.channels_last)
             layouts = []
             for module in head.modules():
-                if isinstance(module, torch.nn.BatchNorm2d):
+                if isinstance(module, torch.nn.BatchNorm2d | torch.nn.LayerNorm):
                     module.register_forward_hook(
                         lambda _, i, o: layouts.append(o.is_contiguous(memory_format=torch.channels_last))
                     )

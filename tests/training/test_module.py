@@ -156,8 +156,9 @@ class TestCheckpoint(BaseTester):
         assert TrainingSettings.of(system) == module.settings
         assert system.step == 2
 
-    def test_feature_a_network_that_refocuses_looks_through_the_masks_as_they_were_learnt(self, tmp_path):
-        module, run = made(refocus=2), trainer(tmp_path)
+    @pytest.mark.parametrize("options", [{"refocus": 2}, {"closed_form": True}, {"closed_form": True, "refocus": 2}])
+    def test_feature_a_network_that_refocuses_looks_through_the_masks_as_they_were_learnt(self, options, tmp_path):
+        module, run = made(**options), trainer(tmp_path)
         before = module.optics.masks.phase.detach().clone()
         run.fit(module, SceneLoader(DeadLeaves(2, 48, 48), 1))
         run.save_checkpoint(tmp_path / "a.safetensors")

@@ -169,6 +169,9 @@ class TestSettings(BaseTester):
             ({"start": "fisher, noise", "masks": 6}, "start 'fisher, noise' has five masks, got masks=6; 'noise' has"),
             ({"design": -1}, "design must be a whole number of at least 0, got -1"),
             ({"design": 5, "task": "joint"}, "designed before training for the task 'edof' only, got 'joint'"),
+            ({"head": "nafnett"}, "head must be one of .*, got 'nafnett'"),
+            ({"head": "tikhonov", "task": "depth"}, "head 'tikhonov' restores images, .* 'edof' only, got 'depth'"),
+            ({"residual": True, "closed_form": True}, "residual adds the capture and closed_form its restoration"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
         ],
@@ -206,12 +209,12 @@ class TestPlainHead(BaseTester):
         seen = image.grad.abs().sum((0, 1)).nonzero()
         assert (seen.amin().item(), seen.amax().item()) == (48 - 31, 48 + 31)
 
-    @pytest.mark.parametrize("name", ["attention-unet", "phasecam3d"])
+    @pytest.mark.parametrize("name", ["attention-unet", "phasecam3d", "nafnet"])
     def test_smoke_the_networks_of_the_papers(self, name):
         assert make_head(name, 4, width=4)(torch.rand(1, 3, 40, 50)).shape == (1, 4, 40, 50)
 
     def test_exception_unknown_name(self):
-        with pytest.raises(ValueError, match=r"head must be one of 'attention-unet', 'depth-.*, got 'plane'"):
+        with pytest.raises(ValueError, match=r"one of 'attention-unet', .*, or the path of a class .*, got 'plane'"):
             make_head("plane", 3)
 
     def test_smoke_copies(self):

@@ -1,0 +1,259 @@
+"""Restoration of a capture in closed form as one module: Tikhonov deconvolution at several weights and a bilateral."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from kornia.filters import bilateral_blur
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.head import check_count
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.refocused import inverse_filters
+from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
+from kornia_tidy.sensor.noise import SensorNoise
+
+WEIGHTS = tuple(3e-3 * 10 ** (i / 2) for i in range(4))  # 0.003 to 0.095: the best for noise of 0.002 to 0.03
+NOISE, EXPONENT = 2e-3, 1.3  # the best weight is 0.003 (noise / 0.002) ** 1.3
+WINDOW, COLOR, SPACE = 7, 0.2, 2.0  # of the bilateral filter: px, difference of encoded colours, px
+LEAST_NOISE = 1e-5  # of full scale; its logarithm is finite
+NODES = 11  # depths over which PSFs are averaged
+
+
+def closed_form_channels(layers: int = 0) -> int:
+    """Return the number of maps that :class:`ClosedForm` gives to a network for images of three channels.
+
+    Example:
+        >>> closed_form_channels(), closed_form_channels(layers=5)
+        (19, 24)
+    """
+    return 3 * (2 + len(WEIGHTS)) + 1 + layers
+
+
+class Restoration(NamedTuple):
+    """A restored image and the maps that a network takes."""
+
+    image: Tensor
+    """All-in-focus image, (B, 3, H, W) in [0, 1], in the colours of the capture."""
+    maps: Tensor
+    """(B, N, H, W): capture, estimates by rising weight, ``image``, level of the noise, refocused brightness."""
+
+
+class ClosedForm(nn.Module):
+    r"""Tikhonov deconvolution of a capture in linear light, followed by a bilateral filter.
+
+    The PSF is the mean over depth. The weight of the deconvolution follows the noise in each pixel,
+
+    .. math:: \gamma = 0.003 \, (\sigma / 0.002)^{1.3},
+
+    by linear interpolation in :math:`\log \gamma` between the estimates of four fixed weights from 0.003 to 0.095, in
+    linear light. The bilateral filter works on the encoded image.
+
+    Args:
+        layers: number D of depths to which the brightness is refocused too, as input of a network that estimates depth;
+            see :func:`~kornia_tidy.reconstruction.refocused.inverse_filters`.
+        bilateral: False leaves out the bilateral filter.
+        encoded: captures are encoded as sRGB. False: they are linear light.
+
+    Shape:
+        - capture: (B, 3, H, W) in [0, 1].
+        - noise: standard deviation of the noise in linear light, in units of full scale: a number, one for each sample
+          (B, 1, 1, 1), a map (B, 3, H, W), or four axes that broadcast to it. None: by the sensor of
+          :meth:`set_noise`.
+        - output: :class:`Restoration`.
+
+    Raises:
+        TypeError: if the capture is not floating point.
+        ValueError: if shapes do not fit, or no PSFs were given before the first capture.
+
+    Convention:
+        - Computed in float32 or better, also under autocast, and returned in the capture's dtype.
+        - Stray light, the veil of the bank, is taken for even over the picture. It follows from the mean light of the
+          capture; for tiles from that of the whole picture, see :func:`whole_picture`.
+        - PSFs and noise are part of the state: a network that was loaded needs no camera. Kernels follow from the PSFs.
+        - Borders are padded by reflection; no output depends on pixels farther away than kernel and filter reach.
+
+    Source: Sitzmann et al., ACM Transactions on Graphics 37(4) 114 (2018); Tomasi and Manduchi, Bilateral Filtering
+    (ICCV 1998).
+
+    Example:
+        >>> restore = ClosedForm()
+        >>> restore.set_psfs(PSFBank.from_measured(torch.rand(4, 3, 5, 5), torch.arange(4.0)))
+        >>> restored = restore(torch.rand(2, 3, 16, 20), torch.tensor(0.01))
+        >>> restored.image.shape, restored.maps.shape
+        (torch.Size([2, 3, 16, 20]), torch.Size([2, 19, 16, 20]))
+    """
+
+    psfs: Tensor
+    veil: Tensor
+    kernels: Tensor
+    filters: Tensor
+    noise_model: Tensor
+
+    def __init__(self, layers: int = 0, *, bilateral: bool = True, encoded: bool = True) -> None:
+        super().__init__()
+        check_count("layers", layers, 0)
+        self.layers, self.bilateral, self.encoded = layers, bilateral, encoded
+        self.mean_light: Tensor | None = None
+        self.has_stray_light = False
+        self.register_buffer("psfs", torch.zeros(max(1, layers), 3, 0, 0))
+        self.register_buffer("veil", torch.zeros(3))  # share of stray light, mean over depth
+        self.register_buffer("kernels", torch.zeros(0), persistent=False)
+        self.register_buffer("filters", torch.zeros(0), persistent=False)
+        self.register_buffer("noise_model", torch.tensor([NOISE**2, 0.0]))  # variance in the dark, and per light
+        self.register_load_state_dict_pre_hook(_take_window)
+        self.register_load_state_dict_post_hook(_renew_kernels)
+
+    def set_psfs(self, bank: PSFBank, *, correlate: bool = False) -> None:
+        """Compute the kernels from a camera's PSFs; gradients reach them.
+
+        Args:
+            bank: PSFs of three channels. With ``layers`` a node for each of them; else of any number of depths.
+            correlate: captures are correlations, as with fidelity ``"paper"``: PSFs are flipped by 180 degrees.
+
+        Raises:
+            ValueError: if the bank has other channels or another number of layers.
+        """
+        psfs = bank.psfs.flip((-2, -1)) if correlate else bank.psfs
+        if psfs.shape[1] != 3 or (self.layers and len(psfs) != self.layers):
+            wanted = f"{self.layers or 'D'}, 3, P, P"
+            raise ValueError(f"the closed form needs PSFs of shape ({wanted}), got {tuple(psfs.shape)}")
+        self.veil = psfs.new_zeros(3) if bank.veil is None else bank.veil.mean(0).detach()
+        self.has_stray_light = bool(self.veil.any())
+        psfs = psfs if self.layers else psfs.mean(0, keepdim=True)
+        if psfs.requires_grad or self.kernels.requires_grad or not torch.equal(psfs, self.psfs):
+            self.psfs = psfs.detach()
+            self._set_kernels(psfs)
+
+    def _set_kernels(self, psfs: Tensor) -> None:
+        """Compute the kernels from PSFs, (layers or 1, 3, P, P)."""
+        wide = psfs.to(torch.promote_types(psfs.dtype, torch.float32))
+        self.kernels = tikhonov_kernels(wide.mean(0), WEIGHTS)
+        if self.layers:
+            self.filters = inverse_filters(wide.mean(1))
+
+    def set_noise(self, sensor: SensorNoise) -> None:
+        """Take the noise of a sensor, by which captures are restored if no noise is given with them."""
+        light = torch.tensor([0.0, 1.0], dtype=torch.float64)
+        dark, full = sensor.std(light).square().tolist()
+        self.noise_model = self.noise_model.new_tensor([dark, full - dark])
+
+    def noise_map(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
+        """Return the standard deviation of the noise in each pixel, (B, 3, H, W), in units of full scale.
+
+        Raises:
+            ValueError: if the noise does not broadcast to the capture.
+        """
+        if noise is None:
+            light = self._light(capture.clamp(0, 1))
+            dark, rise = self.noise_model.to(light.dtype)
+            return (dark + rise * light).sqrt()
+        noise = noise.to(capture) if isinstance(noise, Tensor) else capture.new_tensor(noise)
+        fits = all(side in {1, whole} for side, whole in zip(noise.shape, capture.shape, strict=False))
+        if noise.ndim not in {0, 4} or not fits:
+            raise ValueError(
+                f"noise must be a number, (B, 1, 1, 1) or broadcast to {tuple(capture.shape)}, got {tuple(noise.shape)}"
+            )
+        return noise.expand(capture.shape)
+
+    def forward(self, capture: Tensor, noise: Tensor | float | None = None) -> Restoration:
+        """Return the restored image, and the maps for a network."""
+        if not self.kernels.numel():
+            raise ValueError("the closed form does not know its camera: call set_psfs(optics.psf_bank()) first")
+        check_float_tensor("capture", capture, 4, "(B, 3, H, W)")
+        precise = torch.promote_types(capture.dtype, self.kernels.dtype)
+        with torch.autocast(capture.device.type, enabled=False):
+            restored = self._restore(capture.to(precise), self.noise_map(capture.to(precise), noise))
+        return Restoration(*(part.to(capture.dtype) for part in restored))
+
+    def _restore(self, capture: Tensor, noise: Tensor) -> Restoration:
+        light = self._without_stray_light(self._light(capture))
+        estimates = convolve_kernels(light, self.kernels.to(light.dtype))
+        level = noise.clamp(min=LEAST_NOISE).log10()
+        image = self._encode(_at_noise(estimates, level))
+        if self.bilateral:
+            border = "reflect" if min(image.shape[-2:]) > WINDOW // 2 else "replicate"
+            image = bilateral_blur(image, WINDOW, COLOR, (SPACE, SPACE), border)
+        maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True)]
+        if self.layers:
+            brightness = light.mean(1, keepdim=True)
+            maps.append(convolve_kernels(brightness, self.filters[:, None].to(light.dtype)).flatten(1, 2))
+        return Restoration(image, torch.cat(maps, 1))
+
+    def _light(self, colors: Tensor) -> Tensor:
+        return rgb_to_linear_rgb(colors) if self.encoded else colors
+
+    def _without_stray_light(self, light: Tensor) -> Tensor:
+        if not self.has_stray_light:
+            return light
+        mean = light.nan_to_num().mean((-2, -1), keepdim=True) if self.mean_light is None else self.mean_light.to(light)
+        energy = self.psfs.mean(0).sum((-2, -1))
+        share = (self.veil / (energy + self.veil)).to(light.dtype)
+        return light - share[:, None, None] * mean
+
+    def _encode(self, light: Tensor) -> Tensor:
+        light = light.clamp(0, 1)
+        return linear_rgb_to_rgb(light) if self.encoded else light
+
+
+@contextmanager
+def whole_picture(head: nn.Module, light: Tensor) -> Generator[None]:
+    """Let the closed forms in a network take away the stray light of a whole picture while they see parts of it.
+
+    Without it a network whose camera has stray light is refused by
+    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+
+    Args:
+        head: a network.
+        light: (B, 3, H, W), the picture in linear light, clipped to [0, 1] by the network.
+
+    Example:
+        >>> restore = ClosedForm()
+        >>> bank = PSFBank(torch.rand(4, 3, 5, 5), torch.arange(4.0), torch.ones(4, 3), torch.full((4, 3), 0.1))
+        >>> restore.set_psfs(bank)
+        >>> with whole_picture(restore, torch.full((1, 3, 8, 8), 0.25)):
+        ...     restore.mean_light.flatten()
+        tensor([0.2500, 0.2500, 0.2500])
+    """
+    parts = [module for module in head.modules() if isinstance(module, ClosedForm) and module.has_stray_light]
+    if parts:
+        strips = light.split(256, -2)  # a copy of a large picture would take its memory again
+        total = torch.stack([strip.clamp(0, 1).double().sum((-2, -1)) for strip in strips]).sum(0)
+        mean = total[..., None, None] / (light.shape[-2] * light.shape[-1])
+    try:
+        for part in parts:
+            part.mean_light = mean.to(part.psfs)
+        yield
+    finally:
+        for part in parts:
+            part.mean_light = None
+
+
+def _at_noise(estimates: Tensor, level: Tensor) -> Tensor:
+    """Interpolate between the estimates (B, D, C, H, W) to the best weight for the noise, given as its logarithm."""
+    # The weights are half a decade apart.
+    place = (2 * EXPONENT * (level - math.log10(NOISE))).clamp(0, len(WEIGHTS) - 1)
+    steps = torch.arange(len(WEIGHTS), device=level.device)[:, None, None, None]
+    shares = (1 - (place.unsqueeze(1) - steps).abs()).clamp(min=0)
+    return (shares * estimates).sum(1)
+
+
+def _renew_kernels(module: nn.Module, _: Any) -> None:
+    """Compute from a state that was loaded what follows from its PSFs."""
+    if isinstance(module, ClosedForm) and module.psfs.numel():
+        module.has_stray_light = bool(module.veil.any())
+        module._set_kernels(module.psfs)
+
+
+def _take_window(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Give the PSFs the size that they have in a state, before it is loaded."""
+    stored = state.get(f"{prefix}psfs")
+    if isinstance(module, ClosedForm) and stored is not None and stored.shape[:2] == module.psfs.shape[:2]:
+        module.psfs = module.psfs.new_empty(stored.shape)

@@ -1,0 +1,226 @@
+"""Restoration in closed form: its parts written out, and its noise."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+
+from kornia_tidy import SensorNoise
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.closed_form import NOISE, WEIGHTS, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.refocused import inverse_filters
+from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
+from tests.base import BaseTester
+
+
+def bank(depths=4, side=5, dtype=torch.float64):
+    """PSFs that are brightest at their centre and differ between colours and depths."""
+    x = torch.arange(side, dtype=dtype) - side // 2
+    widths = torch.linspace(0.5, 1.5, 3 * depths, dtype=dtype).view(depths, 3, 1, 1)
+    psfs = (-(x[:, None].square() + x.square() + 0.3 * x) / (2 * widths.square())).exp()
+    return PSFBank.from_measured(psfs, torch.arange(float(depths), dtype=dtype))
+
+
+def closed_form(dtype=torch.float64, **options):
+    restore = ClosedForm(**options).to(dtype)
+    restore.set_psfs(bank(options.get("layers", 4) or 4, dtype=dtype))
+    return restore
+
+
+def photo(*size, dtype=torch.float64):
+    """Away from black and white, where clipping would hide differences."""
+    return 0.3 + 0.3 * torch.rand(2, 3, *size, dtype=dtype, generator=torch.Generator().manual_seed(0))
+
+
+def best_weight(noise):
+    return 3e-3 * (noise / 0.002) ** 1.3
+
+
+def bilateral(image, window=7, color=0.2, space=2.0):
+    """The definition, pixel by pixel, over the interior of one image (3, H, W)."""
+    radius = window // 2
+    _, height, width = image.shape
+    result = torch.zeros(3, height - 2 * radius, width - 2 * radius, dtype=image.dtype)
+    for y in range(radius, height - radius):
+        for x in range(radius, width - radius):
+            total = weighted = 0.0
+            for v in range(-radius, radius + 1):
+                for u in range(-radius, radius + 1):
+                    other = image[:, y + v, x + u]
+                    apart = float((other - image[:, y, x]).abs().sum())
+                    weight = math.exp(-(apart**2) / (2 * color**2) - (u * u + v * v) / (2 * space**2))
+                    total, weighted = total + weight, weighted + weight * other
+            result[:, y - radius, x - radius] = weighted / total
+    return result
+
+
+class TestClosedForm(BaseTester):
+    @pytest.mark.parametrize("layers", [0, 4])
+    def test_smoke(self, layers, device, dtype):
+        restore = ClosedForm(layers).to(device, dtype)
+        restore.set_psfs(bank(dtype=torch.float32))
+        restored = restore.to(device)(photo(12, 17, dtype=dtype).to(device))
+        assert restored.image.dtype == restored.maps.dtype == dtype
+        assert restored.image.shape == (2, 3, 12, 17)
+        assert restored.maps.shape == (2, closed_form_channels(layers), 12, 17)
+
+    def test_cardinality_small_images(self):
+        for size in [(1, 1), (3, 40), (4, 4)]:
+            assert closed_form()(photo(*size), 0.01).image.shape == (2, 3, *size)
+
+    @pytest.mark.parametrize("encoded", [True, False])
+    def test_feature_maps_are_capture_deconvolutions_image_and_noise(self, encoded):
+        restore, capture = closed_form(encoded=encoded, bilateral=False), photo(20, 24)
+        light = rgb_to_linear_rgb(capture) if encoded else capture
+        kernels = tikhonov_kernels(bank().psfs.mean(0), WEIGHTS)
+        for index, weight in enumerate(WEIGHTS):
+            noise = NOISE * (weight / 3e-3) ** (1 / 1.3)
+            deconvolved = convolve_kernels(light, kernels[index : index + 1])[:, 0].clamp(0, 1)
+            expected = linear_rgb_to_rgb(deconvolved) if encoded else deconvolved
+            image, maps = restore(capture, noise)
+            self.assert_close(image, expected, atol=1e-9, rtol=0)
+            self.assert_close(maps[:, :3], capture)
+            self.assert_close(maps[:, 3 + 3 * index :][:, :3], expected)
+            self.assert_close(maps[:, 15:18], image)
+            self.assert_close(maps[:, 18:], torch.full_like(maps[:, 18:], math.log10(noise / 0.01)))
+
+    def test_feature_between_two_weights_the_kernel_is_nearly_that_of_the_weight(self):
+        """In ln g the transfer T = (1 - s) / h + s, s = g / (h^2 + g), has a second derivative below T. Interpolation
+        over half a decade therefore differs by less than (ln 10 / 2)^2 / 8 = 0.166 of the estimate."""
+        psf = bank().psfs.mean(0)
+        for noise in (0.003, 0.006, 0.012, 0.02):
+            capture, weight = photo(24, 24), best_weight(noise)
+            image = closed_form(encoded=False, bilateral=False)(capture, noise).image
+            exact, other = convolve_kernels(capture, tikhonov_kernels(psf, (weight, 4 * weight))).unbind(1)
+            difference = (image - exact.clamp(0, 1)).square().mean().sqrt()
+            assert difference < 0.166 * (exact - capture.mean()).square().mean().sqrt()
+            assert difference < 0.5 * (image - other.clamp(0, 1)).square().mean().sqrt()
+
+    def test_feature_the_bilateral_is_that_of_the_definition(self):
+        capture = photo(14, 13)
+        deconvolved = closed_form(bilateral=False)(capture, 0.01).image
+        found = closed_form()(capture, 0.01).image
+        self.assert_close(found[0, :, 3:-3, 3:-3], bilateral(deconvolved[0]), atol=1e-6, rtol=0)
+
+    def test_feature_layers_are_the_brightness_refocused_in_linear_light(self):
+        capture = photo(20, 24)
+        maps = closed_form(layers=3)(capture).maps
+        filters = inverse_filters(bank(3).psfs.mean(1))
+        brightness = rgb_to_linear_rgb(capture).mean(1, keepdim=True)
+        self.assert_close(maps[:, 19:], convolve_kernels(brightness, filters[:, None])[:, :, 0])
+
+    def test_feature_samples_and_pixels_have_their_own_noise(self):
+        restore, capture = closed_form(bilateral=False), photo(12, 20)
+        both = restore(capture, torch.tensor([0.002, 0.03]).view(2, 1, 1, 1)).image
+        for sample, noise in enumerate((0.002, 0.03)):
+            self.assert_close(both[sample], restore(capture, noise).image[sample])
+        halves = torch.full((1, 1, 1, 20), 0.002)
+        halves[..., 10:] = 0.03
+        image = restore(capture, halves).image
+        self.assert_close(image[..., :10], restore(capture, 0.002).image[..., :10])
+        self.assert_close(image[..., 10:], restore(capture, 0.03).image[..., 10:])
+        assert not torch.allclose(both[0], restore(capture, 0.03).image[0])
+
+    @pytest.mark.parametrize(
+        "sensor", [SensorNoise(0.01), SensorNoise.physical(full_well=2000, read_noise_electrons=3, dark_electrons=20)]
+    )
+    def test_feature_without_a_noise_it_is_that_of_the_sensor(self, sensor):
+        restore, capture = closed_form(), photo(8, 8)
+        restore.set_noise(sensor)
+        expected = sensor.std(rgb_to_linear_rgb(capture))
+        self.assert_close(restore.noise_map(capture), expected, rtol=1e-6)
+        self.assert_close(restore(capture).image, restore(capture, expected).image)
+
+    def test_feature_a_point_is_restored_to_a_sharper_one(self):
+        """Of a scene blurred by the mean PSF, in linear light."""
+        scene = torch.full((1, 3, 32, 32), 0.2, dtype=torch.float64)
+        scene[..., 16, 16:18] = 0.9
+        capture = linear_rgb_to_rgb(convolve_kernels(scene, bank().psfs.mean(0, keepdim=True))[:, 0])
+        sharp = linear_rgb_to_rgb(scene)
+        error = (closed_form()(capture, 0.002).image - sharp).square().mean()
+        assert error < 0.5 * (capture - sharp).square().mean()
+
+    def test_feature_flipped_psfs_for_correlations(self):
+        straight, flipped = closed_form(), ClosedForm().double()
+        turned = bank()
+        flipped.set_psfs(PSFBank(turned.psfs.flip((-2, -1)), turned.defocus, turned.energy), correlate=True)
+        self.assert_close(flipped.kernels, straight.kernels)
+
+    def test_feature_a_state_holds_psfs_and_noise(self):
+        restore, capture = closed_form(layers=3), photo(9, 9)
+        restore.set_noise(SensorNoise(0.03))
+        loaded = ClosedForm(3).double()
+        loaded.load_state_dict(restore.state_dict())
+        assert torch.equal(loaded(capture).maps, restore(capture).maps)
+        assert torch.equal(copy.deepcopy(loaded)(capture).maps, restore(capture).maps)
+        known = closed_form(layers=3)  # of a state of the same size
+        known.set_psfs(PSFBank(bank(3).psfs.flip(-1), torch.arange(3.0), torch.ones(3, 3)))
+        known.load_state_dict(restore.state_dict())
+        assert torch.equal(known(capture).maps, restore(capture).maps)
+
+    def test_feature_stray_light_is_taken_away(self):
+        """The capture of a scene with a fifth of its light spread evenly, against that of its PSFs alone."""
+        scene, lens = photo(20, 24), bank()
+        sharp = PSFBank(0.8 * lens.psfs, lens.defocus, 0.8 * lens.energy, 1 - 0.8 * lens.energy)
+        plain, stray = ClosedForm(encoded=False).double(), ClosedForm(encoded=False).double()
+        plain.set_psfs(PSFBank(sharp.psfs, lens.defocus, sharp.energy))
+        stray.set_psfs(sharp)
+        capture = convolve_kernels(scene, sharp.psfs.mean(0, keepdim=True))[:, 0]
+        mean = capture.mean((-2, -1), keepdim=True) / 0.8  # of the scene that the borders continue
+        found = stray(capture + 0.2 * mean, 0.01)
+        self.assert_close(found.image, plain(capture, 0.01).image)
+        assert (plain(capture + 0.2 * mean, 0.01).image - found.image).abs().max() > 0.1
+        stray.mean_light = mean
+        self.assert_close(stray((capture + 0.2 * mean)[..., :12], 0.01).image[..., :1], found.image[..., :1], atol=1e-2)
+        loaded = ClosedForm(encoded=False).double()
+        loaded.load_state_dict(stray.state_dict())
+        self.assert_close(loaded(capture + 0.2 * mean, 0.01).image, found.image)
+
+    def test_feature_gradients_reach_the_psfs(self):
+        psfs = bank().psfs.requires_grad_()
+        restore = ClosedForm().double()
+        restore.set_psfs(PSFBank(psfs, torch.arange(4.0), torch.ones(4, 3)))
+        restore(photo(12, 12), 0.01).image.square().sum().backward()
+        assert all(bool(part.any()) for part in psfs.grad.flatten(0, 1))
+
+    def test_feature_half_precision_is_computed_in_float32(self):
+        restore, capture = closed_form(torch.float32), photo(16, 16, dtype=torch.float32)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            assert torch.equal(restore(capture).image, closed_form(torch.float32)(capture).image)
+        found = restore(capture.bfloat16()).image
+        assert found.dtype == torch.bfloat16
+        exact = restore(capture.bfloat16().float()).image
+        assert (found.float() - exact).abs().max() <= 2**-9  # half a unit in the last place below 1
+
+    def test_gradcheck(self, device):
+        restore = closed_form().to(device)
+        self.gradcheck(lambda capture: restore(capture, 0.01).maps, (photo(8, 8)[:1].to(device),))
+
+    def test_dynamo(self, device):
+        """Traced, kernels are applied by strided convolutions."""
+        restore, capture = closed_form().to(device), photo(13, 16).to(device)
+        traced = torch.compile(lambda image: restore(image, 0.01).image, backend="eager", fullgraph=True)
+        self.assert_close(traced(capture), restore(capture, 0.01).image)
+        restore, capture = closed_form(torch.float32).to(device), capture.float()
+        with torch.autocast(device.type, dtype=torch.bfloat16):  # convolutions keep their precision
+            self.assert_close(traced(capture), restore(capture, 0.01).image)
+
+    def test_exception(self):
+        restore = ClosedForm()
+        with pytest.raises(ValueError, match=r"does not know its camera: call set_psfs\(optics.psf_bank\(\)\) first"):
+            restore(photo(8, 8, dtype=torch.float32))
+        with pytest.raises(ValueError, match=r"needs PSFs of shape \(5, 3, P, P\), got \(4, 3, 5, 5\)"):
+            ClosedForm(layers=5).set_psfs(bank())
+        with pytest.raises(ValueError, match=r"needs PSFs of shape \(D, 3, P, P\), got \(4, 1, 5, 5\)"):
+            restore.set_psfs(PSFBank.from_measured(torch.ones(4, 1, 5, 5), torch.arange(4.0)))
+        with pytest.raises(ValueError, match=r"noise must be .* broadcast to \(2, 3, 8, 8\), got \(2, 2, 1, 1\)"):
+            closed_form()(photo(8, 8), torch.ones(2, 2, 1, 1))
+        with pytest.raises(ValueError, match=r"noise must be .* got \(8,\)"):
+            closed_form()(photo(8, 8), torch.ones(8))
+        with pytest.raises(ValueError, match="layers must be a whole number of at least 0, got -1"):
+            ClosedForm(-1)

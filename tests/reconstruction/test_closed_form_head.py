@@ -1,0 +1,127 @@
+"""Networks that refine the closed form."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_tidy.inference.heads import PlainHead
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction import (
+    AttentionUNet,
+    ClosedFormHead,
+    NAFNet,
+    PhaseCam3DUNet,
+    closed_form_channels,
+    receptive_field,
+    reconstruct_tiled,
+)
+from tests.base import BaseTester
+from tests.reconstruction.onnx_export import check_onnx
+from tests.reconstruction.test_closed_form import bank, photo
+
+
+def head_of(network, layers=0, dtype=torch.float32, *, trained=False, **options):
+    head = ClosedFormHead(network, layers, **options).eval().to(dtype)
+    head.closed_form.set_psfs(bank(layers or 4, dtype=dtype))
+    if trained:
+        generator = torch.Generator().manual_seed(1)
+        for parameter in head.parameters():
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.02, generator=generator)
+    return head
+
+
+def small(maps=3, layers=0):
+    torch.manual_seed(0)
+    return NAFNet(closed_form_channels(layers), maps, width=2)
+
+
+class TestClosedFormHead(BaseTester):
+    @pytest.mark.parametrize("kind", [NAFNet, AttentionUNet, PlainHead])
+    @pytest.mark.parametrize("maps", [3, 4])
+    def test_smoke_begins_as_the_closed_form(self, kind, maps):
+        head = head_of(kind(closed_form_channels(5), maps, width=2), layers=5)
+        capture = photo(32, 48, dtype=torch.float32)
+        with torch.no_grad():
+            output = head(capture, torch.tensor([0.002, 0.02]).view(2, 1, 1, 1))
+            for sample, noise in enumerate((0.002, 0.02)):
+                assert torch.equal(output[sample, -3:], head.closed_form(capture, noise).image[sample])
+        assert not output[:, :-3].any()
+
+    def test_cardinality(self):
+        for size in [(33, 31), (1, 50), (1, 1)]:
+            assert head_of(small())(photo(*size, dtype=torch.float32)).shape == (2, 3, *size)
+        assert head_of(None)(photo(7, 9, dtype=torch.float32)).shape == (2, 3, 7, 9)
+
+    def test_feature_the_closed_form_alone_is_a_head(self):
+        head, capture = head_of(None, dtype=torch.float64), photo(20, 21)
+        self.assert_close(head(capture, 0.01), head.closed_form(capture, 0.01).image)
+        assert not list(head.parameters())
+
+    def test_feature_depth_is_estimated_by_the_network_alone(self):
+        network = PlainHead(closed_form_channels(4), 1, width=2)
+        head, capture = head_of(network, layers=4), photo(16, 16, dtype=torch.float32)
+        with torch.no_grad():
+            self.assert_close(head(capture), network(head.closed_form(capture).maps))
+
+    def test_feature_the_network_sees_the_noise(self):
+        """Beyond what the closed form makes of it: noises below 0.002 all have its least weight."""
+        head, capture = head_of(small(), trained=True), photo(32, 32, dtype=torch.float32)
+        with torch.no_grad():
+            assert torch.equal(head.closed_form(capture, 0.001).image, head.closed_form(capture, 0.002).image)
+            assert (head(capture, 0.001) - head(capture, 0.002)).abs().max() > 1e-3
+
+    def test_feature_gradients_reach_network_and_psfs(self):
+        psfs = bank(dtype=torch.float32).psfs.requires_grad_()
+        head = head_of(small(), trained=True)
+        head.closed_form.set_psfs(PSFBank(psfs, torch.arange(4.0), torch.ones(4, 3)))
+        head(photo(16, 16, dtype=torch.float32), 0.01).square().mean().backward()
+        assert psfs.grad.any()
+        assert all(parameter.grad.any() for parameter in head.parameters())
+
+    def test_feature_learns_from_zero(self):
+        """The last convolution learns at once, then the scales of the blocks, then all else."""
+        head = head_of(small()).train()
+        optimizer = torch.optim.Adam(head.parameters(), 1e-3)
+        capture = photo(32, 32, dtype=torch.float32)
+        for _ in range(3):
+            optimizer.zero_grad()
+            (head(capture, 0.01) - capture.flip(1)).square().mean().backward()
+            optimizer.step()
+        assert all(parameter.grad.any() for parameter in head.parameters())
+
+    def test_feature_half_precision_autocast_in_channels_last_is_near(self):
+        """The closed form is exact, and what the network adds differs by a few roundings of 2^-9."""
+        head, capture = head_of(small(), trained=True), photo(48, 64, dtype=torch.float32)
+        with torch.no_grad():
+            expected = head(capture, 0.01)
+            added = expected - head.closed_form(capture, 0.01).image
+            head = head.to(memory_format=torch.channels_last)
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                found = head(capture.to(memory_format=torch.channels_last), 0.01)
+        difference = (found.float() - expected).square().mean().sqrt()
+        assert 0 < difference < 0.03 * added.square().mean().sqrt()
+
+    def test_feature_tiles_are_the_whole(self):
+        """Kernels, the filter and the network see no farther than the margin."""
+        head = head_of(small(), trained=True)
+        assert receptive_field(head_of(None)) == 5 // 2 + 8 + 3
+        image = photo(40, 330, dtype=torch.float32)[:1]
+        with torch.no_grad():
+            whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 288))
+        self.assert_close(tiled, whole, atol=1e-4, rtol=0)
+
+    def test_feature_onnx_takes_capture_and_noise(self):
+        head = head_of(PlainHead(closed_form_channels(4), 4, width=2), layers=4, trained=True)
+        check_onnx(head, (photo(18, 21, dtype=torch.float32)[:1], torch.full((1, 1, 1, 1), 0.02)))
+
+    def test_exception(self):
+        with pytest.raises(ValueError, match="the network must take 19 channels, got in_channels=3"):
+            ClosedFormHead(NAFNet(width=2))
+        with pytest.raises(ValueError, match="PhaseCam3DUNet ends in Sigmoid"):
+            ClosedFormHead(PhaseCam3DUNet(closed_form_channels(), 3, width=2))
+        with pytest.raises(ValueError, match="does not know its camera"):
+            ClosedFormHead(small())(torch.rand(1, 3, 16, 16))
+        with pytest.raises(ValueError, match="image must have 3 channels, got 4"):
+            head_of(None)(torch.rand(1, 4, 8, 8))

@@ -1,0 +1,61 @@
+"""NAFNet: its size, its block written out, and how far it sees. What all heads share is in test_head.py."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from kornia_tidy.reconstruction import NAFNet, receptive_field
+from tests.base import BaseTester
+from tests.reconstruction.test_head import trained
+
+
+class TestNAFNet(BaseTester):
+    def test_feature_has_1_7_million_parameters(self):
+        """Counted by hand: a block of c channels has 6 c^2 + 32 c, with attention c^2 + c more."""
+        blocks = {16: 2, 32: 2, 64: 2, 128: 3, 256: 2}
+        count = sum(n * (6 * c * c + 32 * c) for c, n in blocks.items()) + 2 * (256**2 + 256)
+        count += sum(8 * c * c + 2 * c + 8 * c * c for c in (16, 32, 64, 128))  # down and up
+        count += 9 * 3 * 16 + 16 + 9 * 16 * 3 + 3
+        assert sum(p.numel() for p in NAFNet(width=16).parameters()) == count
+
+    def test_feature_a_block_is_the_formula(self):
+        block = trained("nafnet").double().middle[0]
+        x = torch.randn(1, 32, 5, 6, dtype=torch.float64)
+
+        def normalised(value, norm):
+            value = (value - value.mean(1, keepdim=True)) / (value.var(1, keepdim=True, correction=0) + 1e-5).sqrt()
+            return value * norm.weight[:, None, None] + norm.bias[:, None, None]
+
+        def linear(value, layer):
+            return torch.einsum("oi,bihw->bohw", layer.weight[..., 0, 0], value) + layer.bias[:, None, None]
+
+        u = functional.pad(linear(normalised(x, block.norm1), block.expand1), (1, 1, 1, 1))
+        taps = block.depthwise.weight[:, 0]
+        u = sum(taps[:, v, w, None, None] * u[..., v : v + 5, w : w + 6] for v in range(3) for w in range(3))
+        u = u + block.depthwise.bias[:, None, None]
+        u = u[:, :32] * u[:, 32:]
+        inside = functional.pad(torch.ones(1, 1, 5, 6, dtype=torch.float64), (1, 1, 1, 1))
+        around = functional.pad(u, (1, 1, 1, 1))
+        total, count = (sum(p[..., v : v + 5, w : w + 6] for v in range(3) for w in range(3)) for p in (around, inside))
+        u = u * linear(total / count, block.attention)
+        y = x + block.beta * linear(u, block.project1)
+        u = linear(normalised(y, block.norm2), block.expand2)
+        expected = y + block.gamma * linear(u[:, :32] * u[:, 32:], block.project2)
+        self.assert_close(block(x), expected)
+
+    def test_feature_sees_a_bounded_surround(self):
+        """A pixel for each depthwise convolution of its level, two for those of the middle, and one at each end."""
+        depthwise = 2 * (1 + 2 + 4) + 3 * 8 + 2 * 2 * 16
+        assert depthwise + 2 <= receptive_field(trained("nafnet")) < depthwise + 2 + 5 * 16
+
+    def test_feature_blocks_are_the_identity_at_first(self):
+        features = torch.rand(1, 4, 6, 6)
+        assert torch.equal(NAFNet(width=2).encoder[1](features), features)
+
+    def test_smoke_any_number_of_channels(self):
+        head = NAFNet(19, 4, width=2)
+        assert isinstance(head.last, nn.Conv2d)
+        assert list(head.modules())[-1] is head.last
+        assert head(torch.rand(1, 19, 17, 20)).shape == (1, 4, 17, 20)
