@@ -8,6 +8,7 @@ the masks too, which the network is not trained for, and stores the average unde
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -64,6 +65,6 @@ class MovingAverage(nn.Module):
                 own.copy_(new)
         self.steps += 1
 
-    def forward(self, *inputs: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor, **options: Any) -> Tensor:
         """Return the output of the averaged network."""
-        return self.network(*inputs)
+        return self.network(*inputs, **options)

@@ -23,6 +23,7 @@ from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.settings import TrainingSettings
 
+PAINTED = ("dead-leaves",)  # scenes that depend on their number alone, however many there are
 SPLITS = ("train", "validation", "test", "all")
 PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}
 SHARE = 10  # one scene in ten is for validation, and one for testing where no split is published
@@ -64,7 +65,8 @@ def _dead_leaves(settings: TrainingSettings, split: str, count: int | None) -> D
     counts = {"train": settings.scenes, "validation": settings.validation_scenes, "test": count or TESTED}
     depths = settings.depth_range or (0.3, math.inf)
     seed = keyed_seed(settings.seed, split)
-    return Remembered(DeadLeaves(counts[split], settings.size, settings.size, depth_range=depths, seed=seed))
+    leaves = DeadLeaves(counts[split], settings.size, settings.size, depth_range=depths, seed=seed)
+    return leaves if settings.learn == "network" else Remembered(leaves)  # captures are remembered in files
 
 
 def _flying_things(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:

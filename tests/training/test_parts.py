@@ -162,7 +162,7 @@ class TestSettings(BaseTester):
             ({"masks": -1}, "masks must be a whole number of at least 0, got -1"),
             ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
             ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
-            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', got 'ssim'"),
+            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', got 'ssim'"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
