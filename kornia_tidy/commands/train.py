@@ -29,7 +29,8 @@ DESCRIPTION = """\
 Learn the phase masks of a camera together with the network that reads its captures:
 an all-in-focus image (edof), a depth map (depth), or both (joint).
 
-Scenes are generated (dead-leaves) or read from --root: the frames of FlyingThings3D
+Scenes are painted, like photographs (photographic-leaves) or with sharp outlines and full
+textures (dead-leaves), or read from --root: the frames of FlyingThings3D
 (flying-things), the paper's patches of them (flying-things-patches), NYU Depth v2 (nyu),
 all as published, or your own folder (rgbd-folder), in which rgbd.json gives the pairs of
 files and the unit of depth:

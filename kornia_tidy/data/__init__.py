@@ -10,6 +10,7 @@ from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
+from kornia_tidy.data.photographic_leaves import PhotographicLeaves, photographic_leaves
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
@@ -20,6 +21,7 @@ __all__ = [
     "FlyingThings3D",
     "NYUDepthV2",
     "Patches",
+    "PhotographicLeaves",
     "RGBDFolder",
     "Scene",
     "SceneDataset",
@@ -30,6 +32,7 @@ __all__ = [
     "described_folder",
     "from_opencv",
     "paper_patches",
+    "photographic_leaves",
     "random_crop",
     "read_depth",
     "read_image",

@@ -19,7 +19,6 @@ from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
-from kornia_tidy.training.noisy_crops import noise_of
 from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
@@ -164,17 +163,14 @@ class TidyTraining(pl.LightningModule):
 
         Args:
             coded: captures, (B, 3, H, W).
-            noise: standard deviation of their noise, (B, 1, 1, 1). None: computed from the sensor.
+            noise: standard deviation of their noise, (B, 1, 1, 1), for a network that is conditioned on it. None: that
+                of the camera's sensor.
         """
         network = self.head if self.training or self.average is None else self.average
         if self.learn == "both":  # else the PSFs are those of on_fit_start
             update_psfs(network, self.optics)
-        options = {}
-        if self.takes_noise:
-            with torch.no_grad():
-                known = noise is not None
-                options["noise"] = noise if known else noise_of(self.optics.sensor, self.optics.decode(coded.float()))
-        return network(coded.contiguous(memory_format=self.memory_format), **options)
+        coded = coded.contiguous(memory_format=self.memory_format)
+        return network(coded, noise=noise) if self.takes_noise else network(coded)
 
     def reconstruct(self, batch: dict[str, Any]) -> BatchResult:
         """Estimate the maps of a batch's captures, or of its scenes, which are photographed first.

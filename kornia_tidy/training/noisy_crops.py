@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -145,19 +145,3 @@ def random_sensor(noise_range: tuple[float, float]) -> SensorNoise:
     if with_shot < SHOT_SHARE:
         return SensorNoise(READ_ELECTRONS / level, full_well=level)
     return SensorNoise(level)
-
-
-def noise_of(sensor: Any, light: Tensor) -> Tensor:
-    """Return the standard deviation of a sensor's noise, (B, 1, 1, 1): its root mean square over each image.
-
-    Args:
-        sensor: with a method ``std``, as :class:`~kornia_tidy.sensor.SensorNoise` has; None: no noise.
-        light: images in linear light, (B, C, H, W), without noise or as an estimate of it.
-
-    Example:
-        >>> noise_of(SensorNoise(0.002), torch.rand(2, 3, 4, 4)).flatten()
-        tensor([0.0020, 0.0020])
-    """
-    if sensor is None:
-        return light.new_zeros(len(light), 1, 1, 1)
-    return cast("Tensor", sensor.std(light)).square().mean((1, 2, 3), keepdim=True).sqrt()

@@ -74,7 +74,7 @@ class TrainingSettings(SystemSettings):
 
     learn: str = "both"
     design: int = 0
-    data: str = "dead-leaves"
+    data: str = "photographic-leaves"
     root: str | None = None
     size: int = 278
     crop: int | None = None

@@ -101,7 +101,7 @@ class TestTrain(BaseTester):
                     raise ValueError("cannot read /data/2.png: the file is cut short")
                 return super().__getitem__(index)
 
-        make = {"dead-leaves": lambda settings, split, count: Breaking(4 if split == "train" else 1, 32, 32)}
+        make = {TrainingSettings().data: lambda settings, split, count: Breaking(4 if split == "train" else 1, 32, 32)}
         monkeypatch.setattr(data_sets, "SCENES", make)
         order = [index for batch in scenes.EpochBatches(4, 1) for _, index in batch]
         broken = [order[2]]
