@@ -50,8 +50,8 @@ DESCRIPTION += textwrap.fill(
 
 EPILOG = """\
 FOLDER gets settings.json, last.safetensors (to go on from), best.safetensors (weights of
-the best epoch), training.csv, validation.csv, learning_curve.png, which tells from which
-step on the scores stay (with matplotlib), pictures of masks, PSFs and estimates in
+the best epoch), training.csv, validation.csv, learning_curve.png, which tells at which
+step the score levels off (with matplotlib), pictures of masks, PSFs and estimates in
 pictures/, and a log for `tensorboard --logdir FOLDER`. After Ctrl-C or a power failure
 --resume continues with the stored settings, and ends with the same weights as an
 uninterrupted run (to the bit on one CPU process).

@@ -23,7 +23,7 @@ SMOOTHING = 50  # points of the loss, each the mean of equally many steps
 
 
 def plateau_step(steps: Sequence[int], scores: Sequence[float], tolerance: float = TOLERANCE) -> int:
-    """Return the step from which all later scores lie within a tolerance of the best one.
+    """Return the first step whose score lies within a tolerance of the best one: later steps gain no more.
 
     Args:
         steps: at which the scores were taken, rising.
@@ -42,10 +42,7 @@ def plateau_step(steps: Sequence[int], scores: Sequence[float], tolerance: float
     """
     if not scores or len(scores) != len(steps):
         raise ValueError(f"a learning curve needs a score for each step, got {len(scores)} for {len(steps)} steps")
-    best, first = max(scores), len(scores) - 1
-    while first > 0 and scores[first - 1] >= best - tolerance:
-        first -= 1
-    return steps[first]
+    return next(step for step, score in zip(steps, scores, strict=True) if score >= max(scores) - tolerance)
 
 
 def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
@@ -87,7 +84,7 @@ def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
         open_chart(axes, LABEL)
         axes.set_xlabel("step", fontsize=LABEL, color=INK)
     figure.text(0.02, 0.92, f"Learning curve: {Path(folder).name}", fontsize=TITLE, color=INK, weight="bold")
-    level = f"within {TOLERANCE:g} dB of it from step {plateau:,} of {steps[-1]:,} on"
+    level = f"within {TOLERANCE:g} dB of it at step {plateau:,} of {steps[-1]:,}"
     if plateau == steps[-1] and len(steps) > 1:
         level = "still rising at the end"
     figure.text(0.02, 0.86, f"best {name} {max(decibels):.2f} dB; {level}", fontsize=SMALL, color=FAINT)

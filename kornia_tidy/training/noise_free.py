@@ -79,7 +79,7 @@ class NoiseFreeCaptures(Dataset):
         self.scenes, self.folder = scenes, Path(folder)
         self.optics = copy.deepcopy(optics).requires_grad_(requires_grad=False)
         self.optics.sensor = None
-        conditions = {"camera": _digest(self.optics), "made from": dict(made_from or {})}
+        conditions = {"camera": _digest(self.optics), "set of scenes": dict(made_from or {})}
         self.optics.color_space = "linear"
         self.decode = optics.decode
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -139,4 +139,6 @@ def _claim(path: Path, conditions: Mapping[str, Any]) -> None:
     there, here = read_json(path), json.loads(text)
     if there != here:
         other = [name for name in here if not isinstance(there, dict) or there.get(name) != here[name]]
-        raise ValueError(f"{path.parent} holds captures with another {' and '.join(other)}: choose another folder")
+        raise ValueError(
+            f"{path.parent} holds captures with another {' and another '.join(other)}: choose another folder"
+        )

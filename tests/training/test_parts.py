@@ -171,6 +171,9 @@ class TestSettings(BaseTester):
             ({"design": 5, "task": "joint"}, "designed before training for the task 'edof' only, got 'joint'"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
+            ({"learn": "masks"}, "learn must be one of 'both', 'network', got 'masks'"),
+            ({"size": 64, "crop": 65}, "crop must be at most the size of the scenes, 64, got 65"),
+            ({"noise_range": [0.1, 0.01]}, "noise_range must be 0 < least <= largest < 1 of full scale, got 0.1 and 0"),
         ],
     )
     def test_exception(self, change, sentence):
