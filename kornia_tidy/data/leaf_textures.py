@@ -76,7 +76,7 @@ def pattern_weights(
         at = np.flatnonzero((kind == number)[leaf])
         if not at.size:
             continue
-        tile = script_tile if texture is _script else noise_tile
+        tile = script_tile if number == SCRIPT else noise_tile
         pattern[at] = texture(along[at], across[at], size[at], style[:, leaf[at]], tile)
     return pattern
 
@@ -105,7 +105,7 @@ def paint_leaves(
     colours = _colours(count, rng)
     kind = rng.integers(0, len(TEXTURES), count)
     contrast = (rng.beta(2, 3, count) * (rng.random(count) > SMOOTH)).astype(np.float32)
-    contrast[kind == TEXTURES.index(_script)] = 1  # writing has full contrast
+    contrast[kind == SCRIPT] = 1  # writing has full contrast
     rough = (ROUGHEST * rng.random(count) ** 2).astype(np.float32)
     style = rng.random((3, count), dtype=np.float32)  # three numbers, whose meaning depends on the texture
     noise_tile, script_tile = make_noise_tile(rng), make_script_tile(rng)
@@ -230,3 +230,4 @@ def _rings(along: Array, across: Array, size: Array, style: Array, tile: Array) 
 TEXTURES: tuple[Callable[[Array, Array, Array, Array, Array], Array], ...] = (
     _plain, _plain, _cloud, _cloud, _veins, _veins, _stripes, _checks, _script, _spots, _rings,
 )  # fmt: skip
+SCRIPT = TEXTURES.index(_script)  # writing, whose tile is another one

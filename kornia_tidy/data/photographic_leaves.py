@@ -143,7 +143,7 @@ def _photographed(light: NDArray[np.float32], rng: Generator) -> NDArray[np.floa
     soft, place = rng.random(2)
     if soft < SOFT_SHARE:
         sigma = SOFTNESS[0] + (SOFTNESS[1] - SOFTNESS[0]) * place
-        image = cv2.GaussianBlur(image, (9, 9), sigma, borderType=cv2.BORDER_REFLECT)
+        return cv2.GaussianBlur(image, (9, 9), sigma, borderType=cv2.BORDER_REFLECT).astype(np.float32, copy=False)
     return image
 
 

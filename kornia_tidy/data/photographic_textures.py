@@ -7,6 +7,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from kornia_tidy.data.leaf_textures import (
+    SCRIPT,
     TEXTURES,
     Array,
     LeafPixels,
@@ -29,8 +30,9 @@ NOISE_EXPONENT = 1.45  # of the amplitude of cloudy textures: the power of light
 PLAIN = 0.4  # share of leaves without a pattern, as walls and tables
 GRAIN = (0.03, 0.5)  # standard deviation of the logarithm of fine texture, uniform in its own logarithm over leaves
 GRAIN_SIZE = (0.5, 2.0)  # enlargement of that texture
-WEIGHTS = {"_cloud": 6.0, "_plain": 2.0, "_veins": 1.0, "_stripes": 1.0, "_checks": 1.0, "_script": 0.7, "_spots": 0.7,
-           "_rings": 0.7}  # fmt: skip
+# Shares of the textures, in the order of TEXTURES: two plain, two cloudy, two with veins, then stripes, checks, script,
+# spots and rings.
+WEIGHTS = (1.0, 1.0, 3.0, 3.0, 0.5, 0.5, 1.0, 1.0, 0.7, 0.7, 0.7)
 SHADING = 0.35  # largest relative change of light from the middle of a leaf to its edge
 ILLUMINATION = 0.35  # standard deviation of the logarithm of a scene's illumination
 ILLUMINATION_CELLS = 4  # along a side; it is smooth between them
@@ -64,11 +66,9 @@ def photographic_light(
     count = len(radius)
     base = _log_colours(count, rng)
     change = np.stack([rng.normal(0, PATTERN, count), rng.laplace(0, 0.1, count), rng.laplace(0, 0.05, count)], 1)
-    names = [texture.__name__ for texture in TEXTURES]
-    weights = np.array([WEIGHTS[name] / names.count(name) for name in names])
-    kind = rng.choice(len(TEXTURES), count, p=weights / weights.sum())
+    kind = rng.choice(len(TEXTURES), count, p=np.array(WEIGHTS) / sum(WEIGHTS))
     contrast = (rng.random(count) > PLAIN) * rng.beta(2, 2, count)
-    writing = kind == names.index("_script")
+    writing = kind == SCRIPT
     change[writing, 0] = -np.abs(rng.normal(1.2, 0.5, count))[writing]  # dark on bright
     contrast[writing] = 1
     style = rng.random((3, count), dtype=np.float32)
@@ -80,7 +80,9 @@ def photographic_light(
 
     pixels = leaf_pixels(index, center, radius, angle)
     leaf, x, y, along, across, size = pixels
-    final = LeafPixels(leaf, x, y, along / zoom, across / zoom, size / zoom)
+    final = LeafPixels(
+        leaf, x, y, *((position / zoom).astype(np.float32, copy=False) for position in (along, across, size))
+    )
     pattern = pattern_weights(final, kind, style, noise_tile, script_tile)
     pattern *= contrast.astype(np.float32)[leaf]
     slope = shading[leaf] * (np.cos(direction)[leaf] * x + np.sin(direction)[leaf] * y) / size

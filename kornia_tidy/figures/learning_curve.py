@@ -23,7 +23,7 @@ SMOOTHING = 50  # points of the loss, each the mean of equally many steps
 
 
 def plateau_step(steps: Sequence[int], scores: Sequence[float], tolerance: float = TOLERANCE) -> int:
-    """Return the first step whose score lies within a tolerance of the best one: later steps gain no more.
+    """Return the first step with a score within a tolerance of the best score.
 
     Args:
         steps: at which the scores were taken, rising.

@@ -121,7 +121,7 @@ class TidyTraining(pl.LightningModule):
         check_positive("lr_metres", lr_metres, "metres")
         self.optics = optics.requires_grad_(requires_grad=False) if learn == "network" else optics
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        self.head = head.to(memory_format=self.memory_format) if channels_last else head
+        self.head = head.to(memory_format=self.memory_format) if channels_last else head  # ty: ignore[no-matching-overload]
         self.takes_noise = "noise" in inspect.signature(head.forward).parameters
         self.average = MovingAverage(head, ema) if ema else None
         self.task, self.loss, self.learn, self.settings = task, loss, learn, settings

@@ -31,7 +31,7 @@ from kornia_tidy.training.noisy_crops import NoisyCrops
 from kornia_tidy.training.settings import TrainingSettings, differences
 
 SETTINGS = "settings.json"
-SCENE_SETTINGS = ("data", "root", "size", "depth_range", "seed")  # that decide what scene an index has
+SCENE_SETTINGS = ("data", "root", "size", "depth_range", "seed")  # the scene of a number follows from them
 MAY_CHANGE = ("epochs", "patience")  # settings that may differ when a run is resumed
 
 
@@ -100,7 +100,12 @@ def _train(
     checkpoint = _prepare(folder, settings, resume)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
-        stage = {"head_from": head_from, "save_every": save_every, "workers": workers, "progress": progress}
+        stage: dict[str, Any] = {
+            "head_from": head_from,
+            "save_every": save_every,
+            "workers": workers,
+            "progress": progress,
+        }
         train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
         head_from = folder / "pretrain" / LAST
     if checkpoint is not None:  # the window was measured on the masks before training
