@@ -46,14 +46,15 @@ NOISES = (0.002, 0.01, 0.03)
 REAL, SIDE = 8, 320  # scenes of half A, middle pixels
 
 
-def prepared(settings: TrainingSettings) -> TidyTraining:
-    """Return a module with the shipped camera of five masks and a new network."""
+def prepared(settings: TrainingSettings, shipped_head: bool = False) -> TidyTraining:
+    """Return a module with the shipped camera of five masks, and a new network or the shipped one."""
     torch.manual_seed(settings.seed)
     shipped = load_pretrained("edof-5")
     optics = build_optics(settings.replace(window=shipped.optics.window))
     optics.masks.load_state_dict(shipped.optics.masks.state_dict())
     rates = {"lr": settings.lr, "learn": settings.learn, "channels_last": settings.channels_last}
-    return TidyTraining(optics, build_head(settings), settings.task, LOSSES[settings.loss], **rates, settings=settings)
+    head = shipped.head.requires_grad_() if shipped_head else build_head(settings)
+    return TidyTraining(optics, head, settings.task, LOSSES[settings.loss], **rates, settings=settings)
 
 
 def batches(module: TidyTraining, folder: Path) -> Iterator[dict[str, Any]]:
@@ -137,16 +138,18 @@ def scores(module: TidyTraining) -> dict[float, list[float]]:
     return found
 
 
-def scenes(seconds: float, seeds: int, kinds: list[str], folder: Path) -> None:
+def scenes(seconds: float, seeds: int, kinds: list[str], folder: Path, shipped_head: bool) -> None:
     """Print a table of networks that were trained for the same time on other captures."""
     print("| captures | seed | steps | capture | " + " | ".join(f"noise {noise:g}" for noise in NOISES) + " |")
     print("|---" * (4 + len(NOISES)) + "|")
     for seed in range(seeds):
         for name in kinds:
             settings = SETTINGS.replace(**KINDS[name], seed=seed, scenes=160, ema=0.99)
-            module = prepared(settings)
-            steps = len(clocked_steps(module, folder / f"{name}-{seed}", seconds))
-            cells = [f"{statistics.fmean(values):.2f}" for values in scores(module).values()]
+            module = prepared(settings.replace(lr=5e-4) if shipped_head else settings, shipped_head)
+            steps = len(clocked_steps(module, folder / f"{name}-{seed}", seconds)) if seconds else 0
+            found = scores(module)
+            print({noise: [round(value, 2) for value in values] for noise, values in found.items()}, file=sys.stderr)
+            cells = [f"{statistics.fmean(values):.2f}" for values in found.values()]
             print(f"| {name} | {seed} | {steps} | {' | '.join(cells)} |", flush=True)
 
 
@@ -163,6 +166,7 @@ def main() -> None:
     parser.add_argument("command", choices=("speed", "scenes"))
     parser.add_argument("--seconds", type=float, default=55, help="of a training (default: 55)")
     parser.add_argument("--seeds", type=int, default=1, help="(default: 1)")
+    parser.add_argument("--shipped", action="store_true", help="go on with the shipped network, at a rate of 5e-4")
     parser.add_argument("--kinds", nargs="+", choices=tuple(KINDS), default=list(KINDS))
     parser.add_argument("--captures", type=Path, help="folder of the captures (default: a temporary one)")
     args = parser.parse_args()
@@ -173,7 +177,7 @@ def main() -> None:
     if not ENTRIES:
         raise SystemExit("../shared/data is not on this machine: there are no photographs to score")
     with tempfile.TemporaryDirectory() as folder:
-        scenes(args.seconds, args.seeds, args.kinds, args.captures or Path(folder))
+        scenes(args.seconds, args.seeds, args.kinds, args.captures or Path(folder), args.shipped)
 
 
 if __name__ == "__main__":
