@@ -18,8 +18,8 @@ PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics alw
 LEARN = ("both", "network")
 
 NETWORK_RUN: dict[str, Any] = {
-    "learn": "network", "size": 256, "crop": 128, "scenes": 1000, "validation_scenes": 24, "batch": 4, "lr": 2e-3,
-    "schedule": "cosine", "loss": "charbonnier", "epochs": 24,
+    "learn": "network", "width": 8, "size": 256, "crop": 128, "scenes": 1000, "validation_scenes": 24, "batch": 4,
+    "lr": 2e-3, "schedule": "cosine", "loss": "charbonnier", "epochs": 24,
 }  # fmt: skip
 """Settings of a run of the network alone that differ from the defaults, which are the paper's for both."""
 

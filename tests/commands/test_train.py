@@ -54,7 +54,7 @@ class TestTrain(BaseTester):
         assert main(["train", *SMALL, *options, "-o", str(run)]) == 0
         assert "the network behind fixed optics" in capsys.readouterr().out
         settings = TrainingSettings.read(run / "settings.json")
-        given = {"size": 40, "crop": 32, "scenes": 4, "validation_scenes": 1, "batch": 2, "epochs": 2}
+        given = {"width": 4, "size": 40, "crop": 32, "scenes": 4, "validation_scenes": 1, "batch": 2, "epochs": 2}
         assert {name: getattr(settings, name) for name in NETWORK_RUN} == {**NETWORK_RUN, **given}
         assert len(list((run / "captures" / "train").glob("*.npy"))) == 4
         assert read_image(run / "learning_curve.png").shape[-1] == 1575
