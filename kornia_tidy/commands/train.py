@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import textwrap
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.figures.learning_curve import draw_learning_curve
 from kornia_tidy.inference.heads import HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
@@ -19,25 +21,38 @@ from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.lightning_extra import require_lightning
-from kornia_tidy.training.settings import PRECISIONS, SCHEDULES, TrainingSettings
+from kornia_tidy.training.settings import LEARN, NETWORK_RUN, PRECISIONS, SCHEDULES, TrainingSettings
 from kornia_tidy.training.task_loss import LOSSES
+
+CURVE = "learning_curve.png"
 
 DESCRIPTION = """\
 Learn the phase masks of a camera together with the network that reads its captures:
 an all-in-focus image (edof), a depth map (depth), or both (joint).
 
-Scenes are generated (dead-leaves) or read from --root: the frames of FlyingThings3D
+Scenes are painted, like photographs (photographic-leaves) or with sharp outlines and full
+textures (dead-leaves), or read from --root: the frames of FlyingThings3D
 (flying-things), the paper's patches of them (flying-things-patches), NYU Depth v2 (nyu),
 all as published, or your own folder (rgbd-folder), in which rgbd.json gives the pairs of
 files and the unit of depth:
   {"image": "*.png", "depth": "*_depth.png", "scale": 0.001}
 Published splits are kept; of a folder a tenth is for validation and a tenth for testing.
 FlyingThings3D has no metric scale: its nearest points are put at the camera's near end.
+
+--learn network trains the network alone, behind masks that stay as they start or are
+designed (--design). Each scene is rendered once without noise and kept on the disk; crop,
+gain, noise level and noise are drawn anew for each step, which then costs what the network
+costs. Its defaults are for a CPU:
 """
+DESCRIPTION += textwrap.fill(
+    " ".join(f"--{name.replace('_', '-')} {value}" for name, value in NETWORK_RUN.items() if name != "learn"),
+    88, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False,
+)  # fmt: skip
 
 EPILOG = """\
 FOLDER gets settings.json, last.safetensors (to go on from), best.safetensors (weights of
-the best epoch), training.csv, validation.csv, pictures of masks, PSFs and estimates in
+the best epoch), training.csv, validation.csv, learning_curve.png, which tells at which
+step the score levels off (with matplotlib), pictures of masks, PSFs and estimates in
 pictures/, and a log for `tensorboard --logdir FOLDER`. After Ctrl-C or a power failure
 --resume continues with the stored settings, and ends with the same weights as an
 uninterrupted run (to the bit on one CPU process).
@@ -52,6 +67,11 @@ examples:
     kornia-tidy train --task edof --start "focal sweep" --design 120 --refocus 5 --width 8 \\
       --residual --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 \\
       -o outputs/swept
+  A network behind five designed masks, in an hour on a CPU; then both together:
+    kornia-tidy train --learn network --start "focal sweep" --design 120 --width 8 \\
+      -o outputs/network
+    kornia-tidy train --learn both --start "focal sweep" --design 120 --width 8 \\
+      --head-from outputs/network/best.safetensors --lr 2e-4 --size 128 --batch 4 -o outputs/both
   The paper's patches, by the loss of PhaseCam3D:
     kornia-tidy train --task depth --data flying-things-patches --root FlyingThings3D \\
       --loss phasecam3d --border valid -o outputs/depth
@@ -78,6 +98,12 @@ def add_parser(subparsers: Any) -> None:
 
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
+    _setting(
+        system,
+        "learn",
+        choices=LEARN,
+        help="both: masks and network together; network: behind fixed masks, with captures rendered once",
+    )
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
     _setting(system, "start", choices=STARTS, help="heights of the masks at first; Fisher suits depth, sweep edof")
     _setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
@@ -106,7 +132,7 @@ def add_parser(subparsers: Any) -> None:
         system,
         "loss",
         choices=tuple(LOSSES),
-        help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes",
+        help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes; charbonnier: smooth l1",
     )
     _setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
     _setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
@@ -115,6 +141,20 @@ def add_parser(subparsers: Any) -> None:
     add_scene_options(data)
     _setting(data, "scenes", type=int, metavar="N", help="number for training, of patches and scenes made here")
     _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation, at most")
+    _setting(data, "crop", type=int, metavar="PX", help="side of what a step sees of a scene; --learn network only")
+    _setting(
+        data,
+        "noise_range",
+        type=float,
+        nargs=2,
+        metavar=("LEAST", "LARGEST"),
+        help="read noise, of full scale, drawn for half of the captures; --learn network only",
+    )
+    data.add_argument(
+        "--captures",
+        metavar="FOLDER",
+        help="of noise-free captures, which runs may share; --learn network only (default: in the run's)",
+    )
 
     add_camera_settings(parser.add_argument_group("camera"))
 
@@ -129,6 +169,12 @@ def add_parser(subparsers: Any) -> None:
     _setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
     _setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
     _setting(learning, "precision", choices=PRECISIONS, help="of the network; optics stay in float32")
+    _setting(
+        learning,
+        "channels_last",
+        action=argparse.BooleanOptionalAction,
+        help="the network's memory holds the channels of a pixel together: faster with bf16-mixed",
+    )
     _setting(learning, "seed", type=seed, metavar="N", help="everything random follows from it")
 
     machine = parser.add_argument_group("machine")
@@ -191,11 +237,16 @@ def run(args: argparse.Namespace) -> None:
         )
     folder = Path(args.output)
     stored = args.resume and (folder / SETTINGS).exists()
-    settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings()
-    settings = settings.replace(**given_settings(args))
+    given = given_settings(args)
+    usual = NETWORK_RUN if given.get("learn") == "network" else {}
+    settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings(**usual)
+    settings = settings.replace(**given)
+    if args.captures is not None and settings.learn != "network":
+        raise ValueError(f"--captures is for --learn network, got --learn {settings.learn}")
     say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # only one process prints
     many = {"strategy": "ddp"} if args.devices > 1 else {}
     say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
+    say("learn", "the network behind fixed optics" if settings.learn == "network" else "masks and network")
     goes_on = args.resume and (folder / LAST).exists()
     say("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
     try:
@@ -204,6 +255,7 @@ def run(args: argparse.Namespace) -> None:
             folder,
             resume=args.resume,
             head_from=args.head_from,
+            captures=args.captures,
             save_every=args.save_every,
             workers=args.workers,
             progress=sys.stderr.isatty(),
@@ -214,10 +266,22 @@ def run(args: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         say("stopped", f"--resume -o {folder} goes on from the last checkpoint")
         raise
+    finally:
+        drawn = _draw_curve(folder)
     say("camera", module.optics.extra_repr())
     say("wrote", f"{folder / BEST}: evaluate this one")
-    for name in (LAST, SETTINGS, "training.csv", "validation.csv", "pictures"):
+    for name in (LAST, SETTINGS, "training.csv", "validation.csv", *drawn, "pictures"):
         say("", str(folder / name))
+
+
+def _draw_curve(folder: Path) -> list[str]:
+    """Draw the learning curve of a run and return its file, if matplotlib is there and an epoch was validated."""
+    try:
+        figure = draw_learning_curve(folder)
+    except (ImportError, OSError, ValueError):
+        return []
+    figure.savefig(folder / CURVE, dpi=150)
+    return [CURVE]
 
 
 def _nothing(*_: str) -> None:

@@ -10,6 +10,7 @@ from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
+from kornia_tidy.data.photographic_leaves import PhotographicLeaves, photographic_leaves
 from kornia_tidy.data.published_folders import hypersim, kitti, middlebury, scannet, seven_scenes
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
@@ -24,6 +25,7 @@ __all__ = [
     "FlyingThings3D",
     "NYUDepthV2",
     "Patches",
+    "PhotographicLeaves",
     "RGBDFolder",
     "Scene",
     "SceneDataset",
@@ -38,6 +40,7 @@ __all__ = [
     "kitti",
     "middlebury",
     "paper_patches",
+    "photographic_leaves",
     "random_crop",
     "read_depth",
     "read_image",

@@ -30,7 +30,7 @@ PEN = 0.6  # px by which cv2.fillPoly grows a shape: it fills every pixel that t
 SUBPIXEL_BITS = 4  # cv2 draws with fixed-point coordinates
 
 
-class _Leaves(NamedTuple):
+class Leaves(NamedTuple):
     """Leaves sorted from far to near; entry 0 is the background."""
 
     center: NDArray[np.float64]  # (N, 2) x, y in px
@@ -91,11 +91,11 @@ def dead_leaves(
         >>> bool(depth.min() >= 0.5), bool(depth.isinf().any())
         (True, True)
     """
-    _check_arguments(height, width, depth_range, num_leaves, seed)
+    check_arguments(height, width, depth_range, num_leaves, seed)
     near, far = depth_range
     rng = np.random.default_rng(seed)
-    leaves = _scatter_leaves(height, width, num_leaves, rng)
-    index, inverse_depth = _rasterise(height, width, leaves)
+    leaves = scatter_leaves(height, width, num_leaves, rng)
+    index, inverse_depth = rasterise(height, width, leaves)
     image = paint_leaves(index, leaves.center, leaves.radius, leaves.angle, rng)
 
     dioptres = 1 / far + (1 / near - 1 / far) * inverse_depth
@@ -142,7 +142,7 @@ class DeadLeaves(SceneDataset):
             raise ValueError(f"length must be a positive integer, got {length!r}")
         if num_leaves is None:
             num_leaves = min(MOST_LEAVES, max(1, height * width // PIXELS_A_LEAF))
-        _check_arguments(height, width, depth_range, num_leaves, seed)
+        check_arguments(height, width, depth_range, num_leaves, seed)
         self.length, self.height, self.width = length, height, width
         self.depth_range, self.num_leaves, self.seed = depth_range, num_leaves, seed
 
@@ -163,7 +163,8 @@ class DeadLeaves(SceneDataset):
         return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
 
 
-def _check_arguments(height: int, width: int, depth_range: tuple[float, float], num_leaves: int, seed: int) -> None:
+def check_arguments(height: int, width: int, depth_range: tuple[float, float], num_leaves: int, seed: int) -> None:
+    """Raise ``ValueError`` for arguments of :func:`dead_leaves` that are not allowed."""
     for name, value in (("height", height), ("width", width), ("num_leaves", num_leaves)):
         if not isinstance(value, Integral) or value < 1:
             raise ValueError(f"{name} must be a positive integer, got {value!r}")
@@ -175,8 +176,19 @@ def _check_arguments(height: int, width: int, depth_range: tuple[float, float], 
         raise ValueError(f"seed must be an integer of 0 or more, got {seed!r}")
 
 
-def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Leaves:
-    largest = max(LARGEST_RADIUS * math.sqrt(height * width), 2 * SMALLEST_LEAF)
+def scatter_leaves(
+    height: int, width: int, count: int, rng: Generator, largest_radius: float = LARGEST_RADIUS
+) -> Leaves:
+    """Draw places, sizes, depths and outlines of leaves that cover a picture.
+
+    Args:
+        height: rows in pixels.
+        width: columns in pixels.
+        count: number of leaves; their total area is fixed.
+        rng: source of all draws.
+        largest_radius: of a leaf, in units of the picture's geometric mean side.
+    """
+    largest = max(largest_radius * math.sqrt(height * width), 2 * SMALLEST_LEAF)
     smallest = _smallest_radius(height, width, count, largest)
     radius = _radius_at(rng.random(count), height, width, smallest, largest)
     # Centres lie wherever a leaf touches the picture, so that the border is covered like the middle.
@@ -195,7 +207,7 @@ def _scatter_leaves(height: int, width: int, count: int, rng: Generator) -> _Lea
 
     middle = np.array([[(width - 1) / 2, (height - 1) / 2]])
     frame = np.resize(np.array([[-1, -1], [width, -1], [width, height], [-1, height]], float), (1, OUTLINE_POINTS, 2))
-    return _Leaves(
+    return Leaves(
         center=np.concatenate([middle, center]),
         radius=np.concatenate([[math.hypot(height, width) / 2], radius]),
         angle=np.concatenate([[0.0], angle]),
@@ -257,7 +269,7 @@ def _outlines(angle: NDArray[np.float64], radius: NDArray[np.float64], rng: Gene
     return np.stack([scale * (cos * x - sin * y), scale * (sin * x + cos * y)], axis=-1)
 
 
-def _rasterise(height: int, width: int, leaves: _Leaves) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def rasterise(height: int, width: int, leaves: Leaves) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return the visible leaf of each pixel and its normalised inverse depth, painted from far to near."""
     index = np.zeros((height, width), np.int32)
     inverse_depth = np.full((height, width), -1.0)

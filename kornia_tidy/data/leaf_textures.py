@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +27,58 @@ PALETTES = (
 SMOOTH = 0.35  # fraction of leaves without a pattern, as walls and skies, on which defocus is invisible
 ROUGHEST = 0.05  # largest standard deviation of the grain, relative to the light; most leaves have much less
 STRAY_COLOURS = 0.12  # fraction of leaves with colours of another palette
+
+
+class LeafPixels(NamedTuple):
+    """The pixels of a picture, each with its leaf and its place on it; flat arrays."""
+
+    leaf: NDArray[np.int32]
+    """Number of the leaf."""
+    x: Array
+    """Pixels to the right of the leaf's centre."""
+    y: Array
+    """Pixels below the leaf's centre."""
+    along: Array
+    """Pixels along the main axis of the leaf."""
+    across: Array
+    """Pixels across the main axis of the leaf."""
+    size: Array
+    """Radius of the leaf in pixels."""
+
+
+def leaf_pixels(
+    index: NDArray[np.int32], center: NDArray[np.float64], radius: NDArray[np.float64], angle: NDArray[np.float64]
+) -> LeafPixels:
+    """Return the place of each pixel on its leaf; the arguments are those of :func:`paint_leaves`."""
+    height, width = index.shape
+    leaf = index.ravel()
+    x = np.tile(np.arange(width, dtype=np.float32), height) - center.astype(np.float32)[leaf, 0]
+    y = np.repeat(np.arange(height, dtype=np.float32), width) - center.astype(np.float32)[leaf, 1]
+    cos, sin = np.cos(angle).astype(np.float32)[leaf], np.sin(angle).astype(np.float32)[leaf]
+    return LeafPixels(leaf, x, y, cos * x + sin * y, cos * y - sin * x, radius.astype(np.float32)[leaf])
+
+
+def pattern_weights(
+    pixels: LeafPixels, kind: NDArray[np.int64], style: Array, noise_tile: Array, script_tile: Array
+) -> Array:
+    """Return the weight of the second colour of its leaf in each pixel, in [0, 1].
+
+    Args:
+        pixels: of the picture.
+        kind: number in :data:`TEXTURES` of each leaf's texture, (N,).
+        style: three numbers in [0, 1] for each leaf, (3, N), whose meaning depends on the texture.
+        noise_tile: fractal noise.
+        script_tile: writing.
+    """
+    leaf, _, _, along, across, size = pixels
+    pattern = np.zeros_like(along)
+    for number, texture in enumerate(TEXTURES):
+        at = np.flatnonzero((kind == number)[leaf])
+        if not at.size:
+            continue
+        tile = script_tile if number == SCRIPT else noise_tile
+        pattern[at] = texture(along[at], across[at], size[at], style[:, leaf[at]], tile)
+    return pattern
 
 
 def paint_leaves(
@@ -52,32 +105,20 @@ def paint_leaves(
     colours = _colours(count, rng)
     kind = rng.integers(0, len(TEXTURES), count)
     contrast = (rng.beta(2, 3, count) * (rng.random(count) > SMOOTH)).astype(np.float32)
-    contrast[kind == TEXTURES.index(_script)] = 1  # writing has full contrast
+    contrast[kind == SCRIPT] = 1  # writing has full contrast
     rough = (ROUGHEST * rng.random(count) ** 2).astype(np.float32)
     style = rng.random((3, count), dtype=np.float32)  # three numbers, whose meaning depends on the texture
-    noise_tile, script_tile = _noise_tile(rng), _script_tile(rng)
+    noise_tile, script_tile = make_noise_tile(rng), make_script_tile(rng)
 
-    # Position on the leaf in pixels: along the picture and along the axes of the leaf.
-    leaf = index.ravel()
-    x = np.tile(np.arange(width, dtype=np.float32), height) - center.astype(np.float32)[leaf, 0]
-    y = np.repeat(np.arange(height, dtype=np.float32), width) - center.astype(np.float32)[leaf, 1]
-    cos, sin = np.cos(angle).astype(np.float32)[leaf], np.sin(angle).astype(np.float32)[leaf]
-    along, across = cos * x + sin * y, cos * y - sin * x
-    size = radius.astype(np.float32)[leaf]
+    pixels = leaf_pixels(index, center, radius, angle)
+    leaf, x, y, along, across, size = pixels
 
     # Light from the upper left on surfaces that are a little convex.
     light = 1 - np.float32(0.16) * (x + y) / size
-    grain = _read_tile(noise_tile, along + 97 * style[0, leaf], across + 89 * style[1, leaf])
+    grain = read_tile(noise_tile, along + 97 * style[0, leaf], across + 89 * style[1, leaf])
     light *= 1 + rough[leaf] * grain
 
-    pattern = np.zeros_like(x)
-    for number, texture in enumerate(TEXTURES):
-        at = np.flatnonzero((kind == number)[leaf])
-        if not at.size:
-            continue
-        tile = script_tile if texture is _script else noise_tile
-        pattern[at] = texture(along[at], across[at], size[at], style[:, leaf[at]], tile)
-    pattern *= contrast[leaf]
+    pattern = pattern_weights(pixels, kind, style, noise_tile, script_tile) * contrast[leaf]
     first, second = colours[0][leaf], colours[1][leaf]
     image = (first + (second - first) * pattern[:, None]) * light[:, None]
     return image.clip(0, 1).reshape(height, width, 3)
@@ -99,15 +140,15 @@ def _colours(count: int, rng: Generator) -> tuple[Array, Array]:
     return mixture(), mixture()
 
 
-def _noise_tile(rng: Generator) -> Array:
-    """Return periodic fractal noise of unit standard deviation with an amplitude of 1/f."""
+def make_noise_tile(rng: Generator, exponent: float = 1.0) -> Array:
+    """Return periodic fractal noise of unit standard deviation with an amplitude of 1/f^exponent."""
     frequency = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None])
     frequency[0, 0] = np.inf
-    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((TILE, TILE))) / frequency)
+    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((TILE, TILE))) / frequency**exponent)
     return (noise / noise.std()).astype(np.float32)
 
 
-def _script_tile(rng: Generator) -> Array:
+def make_script_tile(rng: Generator) -> Array:
     """Return lines of invented writing, 1 on 0: strokes between points of a 3x3 grid, with gaps between words."""
     tile = np.zeros((TILE, TILE), np.uint8)
     corners = np.indices((TILE // GLYPH[1], TILE // GLYPH[0])).T.reshape(-1, 1, 1, 2) * [GLYPH[1], GLYPH[0]]
@@ -117,7 +158,7 @@ def _script_tile(rng: Generator) -> Array:
     return tile.astype(np.float32) / 255
 
 
-def _read_tile(tile: Array, x: Array, y: Array) -> Array:
+def read_tile(tile: Array, x: Array, y: Array) -> Array:
     """Return values of a periodic tile, interpolated linearly at pixel positions."""
     side = 1024  # cv2.remap takes pictures of less than 32768 rows
     rows = -(-x.size // side)
@@ -157,7 +198,7 @@ def _checks(along: Array, across: Array, size: Array, style: Array, _tile: Array
 
 def _cloud(along: Array, across: Array, size: Array, style: Array, tile: Array) -> Array:
     zoom = np.maximum(4 * style[0], 1)
-    value = _read_tile(tile, along / zoom + TILE * style[1], across / zoom + TILE * style[2])
+    value = read_tile(tile, along / zoom + TILE * style[1], across / zoom + TILE * style[2])
     return (0.5 + 0.45 * value).clip(0, 1)
 
 
@@ -170,7 +211,7 @@ def _veins(along: Array, across: Array, size: Array, style: Array, _tile: Array)
 
 def _script(along: Array, across: Array, _size: Array, style: Array, tile: Array) -> Array:
     zoom = 1 + 0.6 * style[0]  # small print, which little blur makes unreadable
-    return _read_tile(tile, along / zoom + TILE * style[1], across / zoom + TILE * style[2])
+    return read_tile(tile, along / zoom + TILE * style[1], across / zoom + TILE * style[2])
 
 
 def _spots(along: Array, across: Array, size: Array, style: Array, _tile: Array) -> Array:
@@ -181,7 +222,7 @@ def _spots(along: Array, across: Array, size: Array, style: Array, _tile: Array)
 
 
 def _rings(along: Array, across: Array, size: Array, style: Array, tile: Array) -> Array:
-    wobble = 0.06 * size * _read_tile(tile, along / 2 + TILE * style[1], across / 2 + TILE * style[2])
+    wobble = 0.06 * size * read_tile(tile, along / 2 + TILE * style[1], across / 2 + TILE * style[2])
     off = np.hypot(along - 0.3 * size * (style[1] - 0.5), across - 0.3 * size * (style[2] - 0.5))
     return _wave(off + wobble, _period(style[0], size))
 
@@ -189,3 +230,4 @@ def _rings(along: Array, across: Array, size: Array, style: Array, tile: Array) 
 TEXTURES: tuple[Callable[[Array, Array, Array, Array, Array], Array], ...] = (
     _plain, _plain, _cloud, _cloud, _veins, _veins, _stripes, _checks, _script, _spots, _rings,
 )  # fmt: skip
+SCRIPT = TEXTURES.index(_script)  # writing, whose tile is another one

@@ -8,6 +8,7 @@ the masks too, which the network is not trained for, and stores the average unde
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -67,6 +68,6 @@ class MovingAverage(nn.Module):
         self.network.load_state_dict(others, strict=False)  # modules may take buffers of another size
         self.steps += 1
 
-    def forward(self, *inputs: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor, **options: Any) -> Tensor:
         """Return the output of the averaged network."""
-        return self.network(*inputs)
+        return self.network(*inputs, **options)

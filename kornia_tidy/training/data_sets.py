@@ -15,6 +15,7 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.flying_things import FOCAL_PX, NEAREST, paper_patches, split_frames
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.patches import central_crop, random_crop
+from kornia_tidy.data.photographic_leaves import PhotographicLeaves
 from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.data.rgbd_folder import described_folder
 from kornia_tidy.inference.tasks import metres
@@ -23,6 +24,7 @@ from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.settings import TrainingSettings
 
+PAINTED = ("photographic-leaves", "dead-leaves")  # scenes that depend on their number alone, however many there are
 SPLITS = ("train", "validation", "test", "all")
 PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}
 SHARE = 10  # one scene in ten is for validation, and one for testing where no split is published
@@ -60,11 +62,13 @@ def make_scenes(settings: TrainingSettings, split: str, count: int | None = None
     return scenes
 
 
-def _dead_leaves(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
+def _painted(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
     counts = {"train": settings.scenes, "validation": settings.validation_scenes, "test": count or TESTED}
     depths = settings.depth_range or (0.3, math.inf)
     seed = keyed_seed(settings.seed, split)
-    return Remembered(DeadLeaves(counts[split], settings.size, settings.size, depth_range=depths, seed=seed))
+    kind = PhotographicLeaves if settings.data == "photographic-leaves" else DeadLeaves
+    leaves = kind(counts[split], settings.size, settings.size, depth_range=depths, seed=seed)
+    return leaves if settings.learn == "network" else Remembered(leaves)  # captures are remembered in files
 
 
 def _flying_things(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
@@ -109,7 +113,8 @@ def _rgbd_folder(settings: TrainingSettings, split: str, count: int | None) -> D
 
 Maker = Callable[[TrainingSettings, str, int | None], Dataset[Any]]
 SCENES: dict[str, Maker] = {
-    "dead-leaves": _dead_leaves,
+    "photographic-leaves": _painted,
+    "dead-leaves": _painted,
     "flying-things": _flying_things,
     "flying-things-patches": _flying_things_patches,
     "nyu": _nyu,

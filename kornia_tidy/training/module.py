@@ -14,12 +14,13 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.inference.tasks import MAPS, centre_crop, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.losses import mse_loss
-from kornia_tidy.reconstruction.metrics import rmse
+from kornia_tidy.reconstruction.metrics import psnr, rmse
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
-from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
+from kornia_tidy.training.settings import LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
 
@@ -59,7 +60,11 @@ class TidyTraining(pl.LightningModule):
 
     Batches are mappings of ``"image"`` (B, 3, H, W), ``"depth"`` (B, 1, H, W) and, optionally, ``"mask"`` (bool, True
     where depth is known) and ``"noise_seed"`` (int, the seed of the sensor's noise; without it noise is drawn from the
-    global generator).
+    global generator). Batches of :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`, which hold captures, are for
+    ``learn="network"``.
+
+    A network whose ``forward`` has an argument ``noise`` is given the standard deviation of each capture's noise,
+    (B, 1, 1, 1), in linear light with full scale 1.
 
     Args:
         optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
@@ -74,6 +79,9 @@ class TidyTraining(pl.LightningModule):
         ema: decay of the moving average of the network's weights, which validation and trained systems use. 0: none.
         depth_weight: of the depth loss in the joint task.
         image_weight: of the image loss in the joint task.
+        learn: ``"both"``, or ``"network"``: the optics are fixed, and the network is trained by AdamW with its usual
+            betas, 0.9 and 0.999.
+        channels_last: keep the channels of a pixel together in the network's memory.
         settings: those that camera and network were made from; checkpoints hold them to rebuild both.
 
     Raises:
@@ -101,17 +109,22 @@ class TidyTraining(pl.LightningModule):
         ema: float = 0.999,
         depth_weight: float = 1.0,
         image_weight: float = 1.0,
+        learn: str = "both",
+        channels_last: bool = False,
         settings: TrainingSettings | None = None,
     ) -> None:
         super().__init__()
         check_choice("task", task, tuple(MAPS))
         check_choice("schedule", schedule, SCHEDULES)
+        check_choice("learn", learn, LEARN)
         check_positive("lr", lr)
         check_positive("lr_metres", lr_metres, "metres")
-        self.optics = optics
-        self.head = head
+        self.optics = optics.requires_grad_(requires_grad=False) if learn == "network" else optics
+        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        self.head = head.to(memory_format=self.memory_format) if channels_last else head  # ty: ignore[no-matching-overload]
+        self.takes_noise = takes_noise(head)
         self.average = MovingAverage(head, ema) if ema else None
-        self.task, self.loss, self.settings = task, loss, settings
+        self.task, self.loss, self.learn, self.settings = task, loss, learn, settings
         self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
         self.weights = {"depth": depth_weight, "image": image_weight}
 
@@ -140,35 +153,54 @@ class TidyTraining(pl.LightningModule):
             ema=settings.ema,
             depth_weight=settings.depth_weight,
             image_weight=settings.image_weight,
+            learn=settings.learn,
+            channels_last=settings.channels_last,
             settings=settings.replace(window=optics.window),
         )
 
-    def forward(self, coded: Tensor) -> Tensor:
-        """Return the network's estimates from captures; in eval mode those of its moving average."""
+    def forward(self, coded: Tensor, noise: Tensor | None = None) -> Tensor:
+        """Return the network's estimates from captures; in eval mode those of its moving average.
+
+        Args:
+            coded: captures, (B, 3, H, W).
+            noise: standard deviation of their noise, (B, 1, 1, 1), for a network that is conditioned on it. None: that
+                of the camera's sensor.
+        """
         network = self.head if self.training or self.average is None else self.average
-        update_psfs(network, self.optics)
-        return network(coded)
+        if self.learn == "both":  # else the PSFs are those of on_fit_start
+            update_psfs(network, self.optics)
+        coded = coded.contiguous(memory_format=self.memory_format)
+        return network(coded, noise=noise) if self.takes_noise else network(coded)
 
     def reconstruct(self, batch: dict[str, Any]) -> BatchResult:
-        """Photograph the scenes of a batch and estimate their maps.
+        """Estimate the maps of a batch's captures, or of its scenes, which are photographed first.
 
         Raises:
             ValueError: if one of the batch's scenes cannot be used.
         """
         if isinstance(batch, Broken):
             raise ValueError(batch.reason)
+        if "coded" in batch:
+            coded, mask = batch["coded"], batch["mask"]
+            truth = {"image": batch["image"], "depth": batch["inverse_depth"]}
+        else:
+            coded, truth, mask = self._photograph(batch)
+        output = self(coded, batch.get("noise"))
+        return BatchResult(coded, {name: m.float() for name, m in split_maps(self.task, output).items()}, truth, mask)
+
+    def _photograph(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        """Return captures, true maps and the mask of known depth of a batch of scenes."""
         seed = batch.get("noise_seed")
         noise = None if seed is None else torch.Generator(self.device).manual_seed(seed)
         sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
-        coded = sample["image"]
-        estimate = {name: maps.float() for name, maps in split_maps(self.task, self(coded)).items()}
+        coded, depth = sample["image"], sample["depth"]
         truth = {
             "image": sample["all_in_focus"],
-            "depth": normalised_inverse_depth(self.optics.camera, sample["depth"].float()),
+            "depth": normalised_inverse_depth(self.optics.camera, depth.float()),
         }
         mask = batch.get("mask")
-        mask = torch.ones_like(sample["depth"], dtype=torch.bool) if mask is None else mask
-        return BatchResult(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
+        mask = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
+        return coded, truth, centre_crop(mask, *coded.shape[-2:])
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
@@ -178,25 +210,42 @@ class TidyTraining(pl.LightningModule):
         return loss
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Log the mean over all scenes of the loss and of each map's root mean squared error."""
+        """Log the mean over all scenes of the loss, of each map's root mean squared error, and of the image's PSNR.
+
+        The PSNR is that of the image clipped to [0, 1], as it would be shown.
+        """
         result = self.reconstruct(batch)
         scores = {"val_loss": task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)}
         for name, maps in result.estimate.items():
             errors = rmse(maps, result.truth[name], result.mask if name == "depth" else None)
             scores[f"val_{name}_rmse"] = errors.nanmean()
+            if name == "image":
+                scores["val_image_psnr"] = psnr(maps.clamp(0, 1), result.truth[name]).mean()
         self.log_dict(scores, batch_size=len(result.coded), sync_dist=True, prog_bar=True)
 
     def configure_optimizers(self) -> Any:
         """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""
+        if self.learn == "network":
+            return self._scheduled(torch.optim.AdamW(self.head.parameters(), lr=self.lr))
         groups = self.optics.parameter_groups(self.lr_metres, self.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
         groups.append({"params": list(self.head.parameters()), "lr": self.lr})
-        adam = torch.optim.Adam(groups, lr=self.lr, betas=self.betas)
+        return self._scheduled(torch.optim.Adam(groups, lr=self.lr, betas=self.betas))
+
+    def _scheduled(self, adam: torch.optim.Optimizer) -> Any:
         if self.schedule == "constant":
             return adam
         steps = int(self.trainer.estimated_stepping_batches)
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: cosine_rate(step / max(1, steps)))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_fit_start(self) -> None:
+        """Hand the PSFs of fixed optics to the network and its average."""
+        if self.learn == "network":
+            with torch.no_grad():
+                for network in (self.head, self.average):
+                    if network is not None:
+                        update_psfs(network, self.optics)
 
     def on_train_start(self) -> None:
         """Cache all PSFs of a fixed lens: their rounding depends on which PSFs are computed together."""

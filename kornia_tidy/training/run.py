@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning.pytorch as pl
 import torch
@@ -24,11 +24,14 @@ from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
 from kornia_tidy.training.data_module import SceneData
-from kornia_tidy.training.data_sets import make_scenes
+from kornia_tidy.training.data_sets import PAINTED, make_scenes
 from kornia_tidy.training.module import TidyTraining
+from kornia_tidy.training.noise_free import NoiseFreeCaptures
+from kornia_tidy.training.noisy_crops import NoisyCrops
 from kornia_tidy.training.settings import TrainingSettings, differences
 
 SETTINGS = "settings.json"
+SCENE_SETTINGS = ("data", "root", "size", "depth_range", "seed")  # the scene of a number follows from them
 MAY_CHANGE = ("epochs", "patience")  # settings that may differ when a run is resumed
 
 
@@ -38,6 +41,7 @@ def train(
     *,
     resume: bool = False,
     head_from: str | os.PathLike[str] | None = None,
+    captures: str | os.PathLike[str] | None = None,
     save_every: int = 100,
     workers: int = 0,
     progress: bool = False,
@@ -52,6 +56,8 @@ def train(
             with ``pretrain_epochs`` the same files of that stage in ``pretrain/``.
         resume: resume the run in the folder, if there is one.
         head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens.
+        captures: folder of the noise-free captures, for ``learn="network"``. Runs with the same camera and scenes may
+            share it. Default: ``captures/`` in the folder of the run.
         save_every: steps between checkpoints within an epoch.
         workers: processes that load scenes.
         progress: show a progress bar.
@@ -70,9 +76,11 @@ def train(
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     folder.mkdir(parents=True, exist_ok=True)
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
+        stored = folder / "captures" if captures is None else Path(captures)
         return _train(
-            settings, folder, scenes, validation, resume, head_from, save_every, workers, progress, trainer_options
-        )
+            settings, folder, scenes, validation, resume, head_from, stored, save_every, workers, progress,
+            trainer_options,
+        )  # fmt: skip
 
 
 def _train(
@@ -82,6 +90,7 @@ def _train(
     validation: Dataset[Any],
     resume: bool,
     head_from: str | os.PathLike[str] | None,
+    captures: Path,
     save_every: int,
     workers: int,
     progress: bool,
@@ -91,7 +100,12 @@ def _train(
     checkpoint = _prepare(folder, settings, resume)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
-        stage = {"head_from": head_from, "save_every": save_every, "workers": workers, "progress": progress}
+        stage: dict[str, Any] = {
+            "head_from": head_from,
+            "save_every": save_every,
+            "workers": workers,
+            "progress": progress,
+        }
         train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
         head_from = folder / "pretrain" / LAST
     if checkpoint is not None:  # the window was measured on the masks before training
@@ -104,6 +118,11 @@ def _train(
         if module.average is not None:
             module.average.network.load_state_dict(module.head.state_dict())
     module.settings.write(folder / SETTINGS)
+    if settings.learn == "network":
+        if checkpoint is not None:  # the masks may have been designed
+            load_weights(checkpoint, module.optics)
+        parts = {"train": scenes, "validation": validation}
+        scenes, validation = (_crops(part, parts[part], module, captures / part) for part in parts)
     data = SceneData(scenes, validation, settings.batch, settings.seed, settings.augment, workers)
     callbacks: list[pl.Callback] = [
         WriteLog(folder),
@@ -136,6 +155,18 @@ def _train(
         )
         _fit(trainer, module, data, checkpoint)
     return module
+
+
+def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path) -> NoisyCrops:
+    """Return training samples of captures by a module's camera; of validation, whole captures."""
+    settings = module.settings
+    assert settings is not None
+    about = {"split": split, **{name: getattr(settings, name) for name in SCENE_SETTINGS}}
+    if settings.data not in PAINTED:  # of files, the number decides which are drawn
+        about["scenes"] = len(cast("Any", scenes))
+    captures = NoiseFreeCaptures(scenes, module.optics, folder, about)
+    crop = settings.crop if split == "train" else None
+    return NoisyCrops(captures, module.optics, crop, settings.noise_range)
 
 
 def _is_first_process() -> bool:

@@ -13,6 +13,7 @@ from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 
 GAIN = (0.8, 1.1)  # range of the brightness factor of augmentation
+CAPTURE = ("coded", "inverse_depth", "noise")  # of samples that are captures already
 
 
 # ---------------------------------------------------------------------- order
@@ -96,9 +97,10 @@ class RepeatableScenes(Dataset):
     """Data set whose items depend on epoch and index alone, not on the worker or the order of loading.
 
     Args:
-        scenes: a map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
-        seed: of random scenes and of the augmentation.
-        augment: flip scenes and vary their brightness.
+        scenes: a map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere; or
+            of captures, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`.
+        seed: of random scenes, of captures' crops and noise, and of the augmentation.
+        augment: flip scenes and vary their brightness; captures are not changed.
     """
 
     def __init__(self, scenes: Dataset, seed: int = 0, augment: bool = False) -> None:
@@ -114,6 +116,8 @@ class RepeatableScenes(Dataset):
         try:
             with seeded(keyed_seed(self.seed, "item", epoch, index)):
                 sample = self.scenes[index]
+                if "coded" in sample:
+                    return {**sample, "index": index, "name": sample.get("name", ""), "epoch": epoch}
                 image, depth = sample["image"], sample["depth"]
                 mask = sample.get("mask")
                 mask = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
@@ -158,7 +162,8 @@ class _Collate:
         if len(sizes) > 1:
             return Broken(f"the scenes of a batch must have one size, got {sorted(sizes)}")
         keys = [key for scene in scenes for key in (scene["epoch"], scene["index"])]
-        samples = [{key: scene[key] for key in ("image", "depth", "mask", "index", "name")} for scene in scenes]
+        kept = ("image", *(CAPTURE if "coded" in scenes[0] else ("depth",)), "mask", "index", "name")
+        samples = [{key: scene[key] for key in kept} for scene in scenes]
         return {**default_collate(samples), "noise_seed": keyed_seed(self.seed, "noise", *keys)}
 
 

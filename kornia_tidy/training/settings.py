@@ -10,10 +10,18 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.head import check_count
+from kornia_tidy.training.noisy_crops import check_noise_range
 from kornia_tidy.training.task_loss import LOSSES
 
 SCHEDULES = ("constant", "cosine")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
+LEARN = ("both", "network")
+
+NETWORK_RUN: dict[str, Any] = {
+    "learn": "network", "width": 8, "size": 256, "crop": 128, "scenes": 1000, "validation_scenes": 24, "batch": 4,
+    "lr": 2e-3, "schedule": "cosine", "loss": "charbonnier", "epochs": 24,
+}  # fmt: skip
+"""Settings of a run of the network alone that differ from the defaults, which are the paper's for both."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,15 +31,21 @@ class TrainingSettings(SystemSettings):
     Checkpoints and ``settings.json`` hold all of them in one dictionary.
 
     Args:
+        learn: ``"both"``, masks and network together; or ``"network"`` alone behind fixed optics: scenes are rendered
+            once, see :class:`~kornia_tidy.training.noise_free.NoiseFreeCaptures`, and crop, gain and noise are drawn
+            for each step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`.
         design: gradient steps that optimise the masks for the task before training, without scenes or network, see
             :func:`~kornia_tidy.training.designed.design_masks`; for the task ``"edof"`` only. 0: none. A fixed lens
             is not changed.
         data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
         root: folder of the data, where they are files. None: ``data/NAME``.
         size: side of the scenes in pixels; larger scenes are cropped, at random for training.
+        crop: side of the crops of the captures in pixels, for ``learn="network"``. None: whole captures.
+        noise_range: least and largest standard deviation of read noise, in units of full scale, for
+            ``learn="network"``; the sensor's own noise is that of scores afterwards.
         scenes: number of training scenes, for data whose number of scenes is not fixed.
         validation_scenes: largest number of validation scenes.
-        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does.
+        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for ``learn="network"``.
         lr: learning rate of the network.
         lr_metres: learning rate of the masks in metres of height.
         schedule: of both rates: ``"constant"``, or ``"cosine"``: a rise over the first tenth of the steps, then a fall
@@ -47,6 +61,7 @@ class TrainingSettings(SystemSettings):
         image_weight: of the image loss in the joint task.
         loss: name of the loss, see :data:`kornia_tidy.training.task_loss.LOSSES`.
         precision: of the network.
+        channels_last: keep the channels of a pixel together in the network's memory, which is faster in bfloat16.
         **system: the settings of :class:`~kornia_tidy.inference.settings.SystemSettings`.
 
     Raises:
@@ -57,10 +72,13 @@ class TrainingSettings(SystemSettings):
         1e-08
     """
 
+    learn: str = "both"
     design: int = 0
-    data: str = "dead-leaves"
+    data: str = "photographic-leaves"
     root: str | None = None
     size: int = 278
+    crop: int | None = None
+    noise_range: tuple[float, float] = (1e-3, 0.03)
     scenes: int = 5077
     validation_scenes: int = 64
     augment: bool = True
@@ -77,9 +95,11 @@ class TrainingSettings(SystemSettings):
     image_weight: float = 1.0
     loss: str = "mse"
     precision: str = "32-true"
+    channels_last: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_choice("learn", self.learn, LEARN)
         check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
         check_choice("schedule", self.schedule, SCHEDULES)
@@ -93,6 +113,12 @@ class TrainingSettings(SystemSettings):
             raise ValueError(f"masks can be designed before training for the task 'edof' only, got {self.task!r}")
         if self.patience is not None and self.patience < 1:
             raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
+        object.__setattr__(self, "noise_range", tuple(self.noise_range))  # JSON has no tuples
+        check_noise_range(self.noise_range)
+        if self.crop is not None:
+            check_count("crop", self.crop, 1)
+            if self.crop > self.size:
+                raise ValueError(f"crop must be at most the size of the scenes, {self.size}, got {self.crop}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must be in [0, 1), got {self.ema}")
 

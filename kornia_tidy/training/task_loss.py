@@ -7,12 +7,50 @@ from collections.abc import Callable, Mapping
 from torch import Tensor
 
 from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
+from kornia_tidy.reconstruction.validity import valid_maps
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 """From prediction (B, C, H, W), target (B, C, H, W) and validity mask, bool (B, 1, H, W) or None, to a scalar."""
 
-# That of TiDy-PSFs, of Ikoma et al. for depth, and of PhaseCam3D for depth; each is applied to every map of a task.
-LOSSES: dict[str, Loss] = {"mse": mse_loss, "l1": l1_loss, "phasecam3d": phasecam3d_loss}
+CHARBONNIER_EPSILON = 1e-3
+
+
+def charbonnier_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return the Charbonnier loss, an absolute error that is smooth at zero and so less sensitive to outliers.
+
+    .. math:: L = \frac{1}{N} \sum \sqrt{(x - \hat{x})^2 + \epsilon^2}, \quad \epsilon = 10^{-3}
+
+    Args:
+        prediction: (B, C, H, W), in [0, 1].
+        target: (B, C, H, W); anything, NaN included, where the mask is False.
+        mask: bool (B, 1, H, W), True where the target is known. None: everywhere.
+
+    Returns:
+        A scalar; N counts the valid samples. Zero if there are none.
+
+    Convention:
+        kornia's ``charbonnier_loss`` has :math:`\epsilon = 1`, and so is a squared error for images in [0, 1].
+
+    Source: Lai et al., Deep Laplacian Pyramid Networks (CVPR 2017), equation 2.
+
+    Example:
+        >>> import torch
+        >>> charbonnier_loss(torch.zeros(1, 1, 1, 2), torch.tensor([0.0, 0.5]).view(1, 1, 1, 2))
+        tensor(0.2505)
+    """
+    prediction, target, mask = valid_maps(prediction, target, mask)
+    error = ((prediction - target).square() + CHARBONNIER_EPSILON**2).sqrt()
+    return (error * mask).sum() / mask.sum().clamp(min=1)
+
+
+# That of TiDy-PSFs, of Ikoma et al. for depth, of PhaseCam3D for depth, and of restoration networks; each is applied to
+# every map of a task.
+LOSSES: dict[str, Loss] = {
+    "mse": mse_loss,
+    "l1": l1_loss,
+    "phasecam3d": phasecam3d_loss,
+    "charbonnier": charbonnier_loss,
+}
 
 
 def task_loss(

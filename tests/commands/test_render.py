@@ -48,7 +48,7 @@ class TestRender(BaseTester):
         assert main(["render", *SMALL, "--masks", "2", "--shard-items", "2", "-o", str(rendered)]) == 0
         out = capsys.readouterr().out
         assert re.search(r"wrote +.*: 0 captures in [\d.]+ s, 0.00 a second, 3 were there", out)
-        assert "3 of 'dead-leaves', train" in out
+        assert "3 of 'photographic-leaves', train" in out
         assert sorted(path.name for path in rendered.iterdir()) == [
             "00000.tar",
             "00001.tar",

@@ -11,7 +11,7 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import read_image
 from kornia_tidy.inference.trained import load_trained
-from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.settings import NETWORK_RUN, TrainingSettings
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
@@ -48,9 +48,24 @@ class TestTrain(BaseTester):
         assert main(["train", "-o", str(run)]) == 2
         assert "holds a run already" in capsys.readouterr().err
 
+    def test_feature_the_network_alone_has_defaults_of_its_own_and_a_learning_curve(self, tmp_path, capsys):
+        run = tmp_path / "run"
+        options = ["--learn", "network", "--crop", "32", "--epochs", "2", "--fidelity", "draft"]
+        assert main(["train", *SMALL, *options, "-o", str(run)]) == 0
+        assert "the network behind fixed optics" in capsys.readouterr().out
+        settings = TrainingSettings.read(run / "settings.json")
+        given = {"width": 4, "size": 40, "crop": 32, "scenes": 4, "validation_scenes": 1, "batch": 2, "epochs": 2}
+        assert {name: getattr(settings, name) for name in NETWORK_RUN} == {**NETWORK_RUN, **given}
+        assert len(list((run / "captures" / "train").glob("*.npy"))) == 4
+        assert read_image(run / "learning_curve.png").shape[-1] == 1575
+        assert load_trained(run / "best.safetensors").step in (2, 4)
+        both = ["--head-from", str(run / "best.safetensors"), "--epochs", "1", "--fidelity", "draft"]
+        assert main(["train", *SMALL, *both, "-o", str(tmp_path / "both")]) == 0
+
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
+            (["--captures", "x"], "--captures is for --learn network, got --learn both"),
             (["--masks", "1000000"], "masks must be 1024 or fewer, got 1000000"),
             (["--refocus", "1000000"], "refocus must be 1024 or fewer, got 1000000"),
             (["--size", "1000000"], "the scene has 1000000 x 1000000 pixels, more than 268435456"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kornia_tidy.data.leaf_textures import TEXTURES, _noise_tile, _script_tile, paint_leaves
+from kornia_tidy.data.leaf_textures import TEXTURES, make_noise_tile, make_script_tile, paint_leaves
 from tests.base import BaseTester
 
 
@@ -33,7 +33,7 @@ class TestPaintLeaves(BaseTester):
         size = rng.uniform(1, 300, 20000).astype(np.float32)
         style = rng.random((3, 20000), dtype=np.float32)
         value = texture(
-            along, across, size, style, _noise_tile(rng) if texture.__name__ != "_script" else _script_tile(rng)
+            along, across, size, style, make_noise_tile(rng) if texture.__name__ != "_script" else make_script_tile(rng)
         )
         assert value.shape == (20000,)
         assert value.min() >= 0
@@ -42,7 +42,7 @@ class TestPaintLeaves(BaseTester):
 
     def test_feature_the_noise_tile_repeats_without_a_seam(self):
         """The step from its last column to its first is as large as any other."""
-        tile = _noise_tile(np.random.default_rng(0))
+        tile = make_noise_tile(np.random.default_rng(0))
         inside = np.abs(np.diff(tile, axis=1)).mean()
         assert np.abs(tile[:, 0] - tile[:, -1]).mean() < 1.3 * inside
         assert np.abs(tile[0] - tile[-1]).mean() < 1.3 * inside

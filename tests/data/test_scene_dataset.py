@@ -15,6 +15,7 @@ from kornia_tidy.data import (
     FlyingThings3D,
     NYUDepthV2,
     Patches,
+    PhotographicLeaves,
     RGBDFolder,
     Scene,
     SceneDataset,
@@ -24,7 +25,7 @@ from kornia_tidy.data import (
 from tests.base import BaseTester
 from tests.data.published import write_flying_things, write_frames, write_nyu
 
-KINDS = ("dead leaves", "flying things", "nyu", "folder", "tum", "sun rgb-d")
+KINDS = ("dead leaves", "photographic leaves", "flying things", "nyu", "folder", "tum", "sun rgb-d")
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +41,7 @@ def data(tmp_path_factory):
     things = {"kind": "disparity", "focal_px": 1050.0, "baseline_m": 1.0}
     sets = (
         DeadLeaves(3, 40, 48, num_leaves=60),
+        PhotographicLeaves(3, 40, 48),
         FlyingThings3D(root, subsets="A"),
         NYUDepthV2(root, "all"),
         RGBDFolder(root, "frames_cleanpass/TRAIN/*/*/*/*.png", "disparity/TRAIN/*/*/*/*.pfm", **things),

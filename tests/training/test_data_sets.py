@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data import dead_leaves
+from kornia_tidy.data import dead_leaves, photographic_leaves
 from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.seeds import keyed_seed
-from kornia_tidy.training.data_sets import SCENES, make_scenes
+from kornia_tidy.training.data_sets import PAINTED, SCENES, make_scenes
 from kornia_tidy.training.scenes import SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
@@ -45,7 +45,7 @@ def roots(tmp_path_factory):
     return {"flying-things": things, "flying-things-patches": things, "nyu": nyu, "rgbd-folder": pairs}
 
 
-FILES = [name for name in SCENES if name != "dead-leaves"]
+FILES = [name for name in SCENES if name not in PAINTED]
 
 
 def settings_of(name, roots, **changes):
@@ -60,7 +60,7 @@ def names_of(scenes):
 class TestMakeScenes(BaseTester):
     @pytest.mark.parametrize("name", SCENES)
     def test_smoke_every_split_gives_scenes_of_the_size_in_metres(self, name, roots):
-        settings = settings_of(name, {**roots, "dead-leaves": "."})
+        settings = settings_of(name, {**roots, **dict.fromkeys(PAINTED, ".")})
         for split in ("train", "validation", "test"):
             sample = make_scenes(settings, split, 2)[0]
             assert sample["image"].shape == (3, 32, 32)
@@ -140,9 +140,15 @@ class TestMakeScenes(BaseTester):
         """Runs that were begun must see the same scenes when they go on."""
         assert keyed_seed(0, "train") == 1382848523564605726
         for split in ("train", "validation", "test"):
-            sample = make_scenes(TrainingSettings(size=24, scenes=3, validation_scenes=2), split)[1]
+            settings = TrainingSettings(data="dead-leaves", size=24, scenes=3, validation_scenes=2)
             seed = keyed_seed(keyed_seed(0, split), "scene", 1)
             image, depth = dead_leaves(24, 24, depth_range=(0.3, float("inf")), num_leaves=2, seed=seed)
+            sample = make_scenes(settings, split)[1]
+            assert torch.equal(sample["image"], image)
+            assert torch.equal(sample["depth"], depth)
+            seed = keyed_seed(keyed_seed(0, split), "photographic scene", 1)
+            image, depth = photographic_leaves(24, 24, depth_range=(0.3, float("inf")), seed=seed)
+            sample = make_scenes(settings.replace(data="photographic-leaves"), split)[1]
             assert torch.equal(sample["image"], image)
             assert torch.equal(sample["depth"], depth)
 
@@ -181,7 +187,9 @@ class TestMakeScenes(BaseTester):
         assert len(make_scenes(settings, "all")) == 2
 
     def test_exception_names_the_bad_value(self, roots):
-        with pytest.raises(ValueError, match="data must be one of 'dead-leaves', 'flying-things'"):
+        with pytest.raises(
+            ValueError, match="data must be one of 'photographic-leaves', 'dead-leaves', 'flying-things'"
+        ):
             make_scenes(TrainingSettings(data="kitti"), "train")
         with pytest.raises(ValueError, match="split must be one of 'train', 'validation', 'test', got 'all'"):
             make_scenes(settings_of("nyu", roots), "all")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import nn
@@ -124,6 +126,45 @@ class TestTidyTraining(BaseTester):
         assert not torch.equal(one, module.reconstruct({**sample, "noise_seed": 1}).coded)
         plain = {name: sample[name] for name in ("image", "depth")}
         assert not torch.equal(module.reconstruct(plain).coded, module.reconstruct(plain).coded)
+
+    def test_feature_a_network_conditioned_on_noise_is_told_that_of_each_capture(self):
+        class Told(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.weight, self.noise = nn.Parameter(torch.zeros(1)), "not called"
+
+            def forward(self, image, noise=None):
+                self.noise = noise
+                return image + self.weight
+
+        module = TidyTraining(build_optics(SETTINGS), Told(), ema=0)
+        levels = torch.tensor([0.002, 0.03]).view(2, 1, 1, 1)
+        known = torch.ones(2, 1, 8, 8, dtype=torch.bool)
+        captures = {"coded": torch.rand(2, 3, 8, 8), "image": torch.rand(2, 3, 8, 8), "mask": known}
+        result = module.reconstruct({**captures, "inverse_depth": torch.rand(2, 1, 8, 8), "noise": levels})
+        assert module.head.noise is levels
+        assert result.coded is captures["coded"]
+        assert result.truth["image"] is captures["image"]
+        module.reconstruct(batch())
+        assert module.head.noise is None  # as the camera's sensor has it
+
+    def test_feature_the_network_alone_has_adamw_and_optics_without_gradients(self):
+        module = made(learn="network", channels_last=True)
+        (group,) = module.configure_optimizers().param_groups
+        assert isinstance(module.configure_optimizers(), torch.optim.AdamW)
+        assert {id(p) for p in group["params"]} == {id(p) for p in module.head.parameters()}
+        assert not any(p.requires_grad for p in module.optics.parameters())
+        assert module.head.layers[0].weight.is_contiguous(memory_format=torch.channels_last)
+
+    def test_feature_the_psnr_of_validation_is_that_of_the_clipped_image(self, monkeypatch):
+        module, logged = made(task="edof", learn="network").eval(), {}
+        monkeypatch.setattr(module, "forward", lambda coded, noise=None: coded + 5)
+        monkeypatch.setattr(module, "log_dict", lambda scores, **options: logged.update(scores))
+        known, half = torch.ones(1, 1, 8, 8, dtype=torch.bool), torch.full((1, 3, 8, 8), 0.5)
+        scene = {"coded": half, "image": half, "inverse_depth": known.float(), "mask": known}
+        module.validation_step(scene, 0)
+        assert float(logged["val_image_psnr"]) == pytest.approx(20 * math.log10(2), abs=1e-4)
+        assert float(logged["val_image_rmse"]) == pytest.approx(5)
 
     def test_exception_a_broken_batch_tells_why(self):
         with pytest.raises(ValueError, match="scene 3 is gone"):

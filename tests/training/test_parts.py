@@ -162,7 +162,7 @@ class TestSettings(BaseTester):
             ({"masks": -1}, "masks must be a whole number of at least 0, got -1"),
             ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
             ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
-            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', got 'ssim'"),
+            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', got 'ssim'"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
@@ -174,6 +174,9 @@ class TestSettings(BaseTester):
             ({"residual": True, "closed_form": True}, "residual adds the capture and closed_form its restoration"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
+            ({"learn": "masks"}, "learn must be one of 'both', 'network', got 'masks'"),
+            ({"size": 64, "crop": 65}, "crop must be at most the size of the scenes, 64, got 65"),
+            ({"noise_range": [0.1, 0.01]}, "noise_range must be 0 < least <= largest < 1 of full scale, got 0.1 and 0"),
         ],
     )
     def test_exception(self, change, sentence):

@@ -19,12 +19,16 @@ from tests.base import BaseTester
 pl = pytest.importorskip("lightning.pytorch")
 
 from kornia_tidy.training.callbacks import drop_rows_after  # noqa: E402
+from kornia_tidy.training.module import TidyTraining  # noqa: E402
+from kornia_tidy.training.noise_free import NoiseFreeCaptures  # noqa: E402
 from kornia_tidy.training.run import train  # noqa: E402
 
 SETTINGS = TrainingSettings(
     task="depth", masks=1, head="plain", width=4, size=32, scenes=4, validation_scenes=1, batch=2, epochs=2, window=9,
     lr=1e-2,
 )  # fmt: skip
+
+NETWORK = {"task": "edof", "learn": "network", "crop": 24, "fidelity": "draft", "loss": "charbonnier"}
 
 
 def rows(path):
@@ -65,6 +69,7 @@ class TestTrain(BaseTester):
             {"masks": 0},
             {"refocus": 3, "start": "fisher, noise"},
             {"task": "edof", "design": 3, "start": "focal sweep", "window": None, "fidelity": "draft"},
+            {**NETWORK, "design": 3, "start": "focal sweep", "window": None},
         ],
     )
     def test_feature_more_epochs_go_on_as_if_asked_for_at_first(self, changes, tmp_path):
@@ -101,7 +106,7 @@ class TestTrain(BaseTester):
                     raise ValueError("cannot read /data/2.png: the file is cut short")
                 return super().__getitem__(index)
 
-        make = {"dead-leaves": lambda settings, split, count: Breaking(4 if split == "train" else 1, 32, 32)}
+        make = {TrainingSettings().data: lambda settings, split, count: Breaking(4 if split == "train" else 1, 32, 32)}
         monkeypatch.setattr(data_sets, "SCENES", make)
         order = [index for batch in scenes.EpochBatches(4, 1) for _, index in batch]
         broken = [order[2]]
@@ -113,6 +118,38 @@ class TestTrain(BaseTester):
         mended = train(settings, tmp_path / "a", resume=True, workers=workers).state_dict()
         whole = train(settings, tmp_path / "b").state_dict()
         assert all(torch.equal(whole[name], mended[name]) for name in whole)
+
+    def test_feature_captures_are_rendered_once_for_all_runs_and_epochs(self, tmp_path, monkeypatch):
+        rendered, render = [], NoiseFreeCaptures._render
+        monkeypatch.setattr(NoiseFreeCaptures, "_render", lambda c, i: rendered.append(i) or render(c, i))
+        settings = SETTINGS.replace(**NETWORK)
+        one = train(settings, tmp_path / "a", captures=tmp_path / "captures")
+        train(settings.replace(noise_range=(0.01, 0.02)), tmp_path / "b", captures=tmp_path / "captures")
+        assert sorted(rendered) == [0, 0, 1, 2, 3]  # four to train on, one to validate with
+        before = TidyTraining.from_settings(settings).optics.masks.phase
+        assert torch.equal(one.optics.masks.phase, before)
+        assert not one.optics.masks.phase.requires_grad
+        assert "val_image_psnr" in rows(tmp_path / "a" / "validation.csv")[0]
+        with pytest.raises(
+            ValueError, match="holds captures with another camera and another set of scenes: choose another folder"
+        ):
+            train(settings.replace(seed=1, data="dead-leaves"), tmp_path / "c", captures=tmp_path / "captures")
+
+    def test_feature_the_network_alone_goes_on_from_within_an_epoch(self, tmp_path, monkeypatch):
+        settings = SETTINGS.replace(**NETWORK, epochs=1, scenes=6)
+        whole = train(settings, tmp_path / "a").state_dict()
+        step, calls = TidyTraining.training_step, iter(range(9))
+
+        def stopping(*args):
+            if next(calls) == 2:
+                raise RuntimeError("stop")
+            return step(*args)
+
+        monkeypatch.setattr(TidyTraining, "training_step", stopping)
+        with pytest.raises(RuntimeError, match="stop"):
+            train(settings, tmp_path / "b", save_every=1)
+        parts = train(settings, tmp_path / "b", resume=True).state_dict()
+        assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
     def test_exception_a_full_disk_stops_the_run_and_keeps_the_last_checkpoint(self, tmp_path, monkeypatch):
         save, saves = state_file.save_file, []

@@ -1,0 +1,147 @@
+"""Crops of noise-free captures, with gain and sensor noise drawn anew for each step of training."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_part
+from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.training.noise_free import NoiseFreeCaptures
+
+GAIN = (0.5, 2.0)  # range of the exposure factor, uniform in its logarithm
+TINT = 0.1  # standard deviation of the logarithm of each channel's factor, as of another illuminant
+SHOT_SHARE = 0.5  # share of captures with shot noise; the others have read noise alone
+FULL_WELL = (500.0, 60e3)  # electrons, uniform in its logarithm: at a level of 0.3, a noise of 0.024 to 0.0022
+READ_ELECTRONS = 2.4  # read noise of captures with shot noise, as of an industrial sensor
+
+
+class NoisyCrops(Dataset):
+    r"""Training samples from noise-free captures: a crop, a gain for each channel, and the sensor's noise.
+
+    The gain g multiplies capture and image in linear light before the noise n is added, as a longer exposure or another
+    illuminant would; optics are linear, so the result is an exact capture:
+
+    .. math:: y = \mathrm{clip}(g \, (h * x) + n)
+
+    No value exceeds full scale, as g is limited to the reciprocal of the crop's brightest value in each channel.
+
+    Half of the captures have read noise alone, with a standard deviation uniform in its logarithm. The others have shot
+    noise, of a full well of 500 to 60,000 electrons, and a read noise of 2.4 electrons.
+
+    All draws are from torch's global generator, which
+    :class:`~kornia_tidy.training.scenes.RepeatableScenes` seeds by epoch and index.
+
+    Args:
+        captures: of fixed optics.
+        optics: their camera, for the encoding of the sensor's values.
+        crop: side of the crop in pixels. None: the whole capture, with a gain of one.
+        noise_range: least and largest standard deviation of the read noise, in linear light, full scale 1.
+
+    Raises:
+        ValueError: if the range is not 0 < least <= largest, or a capture is smaller than the crop.
+
+    Convention:
+        Items are mappings of
+
+        - ``"coded"``: the capture (3, H, W), and ``"image"``: the all-in-focus image, both encoded as the camera does;
+        - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True where depth is known;
+        - ``"noise"``: (1, 1, 1), standard deviation of the noise in linear light, full scale 1. Of shot noise it is the
+          root mean square over the crop.
+
+    Source: Foi et al., Practical Poissonian-Gaussian noise modeling (TIP 2008), for the noise; training over a range of
+    noise levels as in Zhang et al., FFDNet (TIP 2018).
+    """
+
+    def __init__(
+        self,
+        captures: NoiseFreeCaptures,
+        optics: TiDyOptics,
+        crop: int | None = None,
+        noise_range: tuple[float, float] = (1e-3, 0.03),
+    ) -> None:
+        check_noise_range(noise_range)
+        check_part("captures", captures, NoiseFreeCaptures, "NoiseFreeCaptures")
+        self.captures, self.encode, self.crop, self.noise_range = captures, optics.encode, crop, noise_range
+
+    def __len__(self) -> int:
+        """Return the number of captures."""
+        return len(self.captures)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """Return a sample."""
+        light, image, inverse_depth, mask = self.captures[index]
+        if self.crop is not None:
+            window = random_window(light.shape[-2], light.shape[-1], self.crop)
+            light, image, inverse_depth, mask = (plane[window] for plane in (light, image, inverse_depth, mask))
+            gain = random_gain(torch.maximum(light.amax((1, 2)), image.amax((1, 2))))
+            light, image = light * gain, image * gain
+        sensor = random_sensor(self.noise_range)
+        coded = sensor(light[None])[0]
+        return {
+            "coded": self.encode(coded[None])[0],
+            "image": self.encode(image[None])[0],
+            "inverse_depth": inverse_depth,
+            "mask": mask,
+            "noise": sensor.std(light).square().mean().sqrt().view(1, 1, 1),
+        }
+
+
+def check_noise_range(noise_range: tuple[float, float]) -> None:
+    """Raise ``ValueError`` unless a range of standard deviations is positive and ordered."""
+    least, largest = noise_range
+    if not 0 < least <= largest < 1:
+        raise ValueError(f"noise_range must be 0 < least <= largest < 1 of full scale, got {least} and {largest}")
+
+
+def random_window(height: int, width: int, side: int) -> tuple[slice, slice, slice]:
+    """Return a window of a picture (C, H, W) at random, by torch's global generator.
+
+    Raises:
+        ValueError: if the picture is smaller than the window.
+    """
+    if side > min(height, width):
+        raise ValueError(f"the crop must not exceed the captures of {height} x {width} pixels, got {side}")
+    top = int(torch.randint(height - side + 1, ()))
+    left = int(torch.randint(width - side + 1, ()))
+    return slice(None), slice(top, top + side), slice(left, left + side)
+
+
+def random_gain(peak: Tensor) -> Tensor:
+    """Return a gain for each channel, (C, 1, 1), by torch's global generator.
+
+    Args:
+        peak: brightest value of each channel, (C,). The gain is limited so that it does not exceed full scale.
+
+    Example:
+        >>> gain = random_gain(torch.tensor([1.0, 0.8, 0.5]))
+        >>> gain.shape, bool((gain.flatten() * torch.tensor([1.0, 0.8, 0.5]) <= 1).all())
+        (torch.Size([3, 1, 1]), True)
+    """
+    least, largest = (math.log(end) for end in GAIN)
+    exposure = least + (largest - least) * torch.rand(1)
+    gain = (exposure + TINT * torch.randn(len(peak))).exp()
+    return torch.minimum(gain, 1 / peak.clamp(min=1e-6))[:, None, None]
+
+
+def random_sensor(noise_range: tuple[float, float]) -> SensorNoise:
+    """Return a sensor with a noise drawn by torch's global generator; see :class:`NoisyCrops`.
+
+    Args:
+        noise_range: least and largest standard deviation of read noise without shot noise.
+
+    Example:
+        >>> 0.001 <= random_sensor((0.001, 0.03)).sigma <= 0.03
+        True
+    """
+    with_shot, place = torch.rand(2).tolist()
+    least, largest = FULL_WELL if with_shot < SHOT_SHARE else noise_range
+    level = least * (largest / least) ** place
+    if with_shot < SHOT_SHARE:
+        return SensorNoise(READ_ELECTRONS / level, full_well=level)
+    return SensorNoise(level)
