@@ -95,6 +95,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="go on with the run in FOLDER, if there is one")
     parser.add_argument("--head-from", metavar="CHECKPOINT", help="begin with the network of another run")
+    parser.add_argument("--masks-from", metavar="CHECKPOINT", help="begin with the masks of another run")
 
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
@@ -255,6 +256,7 @@ def run(args: argparse.Namespace) -> None:
             folder,
             resume=args.resume,
             head_from=args.head_from,
+            masks_from=args.masks_from,
             captures=args.captures,
             save_every=args.save_every,
             workers=args.workers,

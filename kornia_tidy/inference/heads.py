@@ -33,7 +33,8 @@ def check_head(name: str) -> None:
         Traceback (most recent call last):
         ...
         ValueError: head must be one of 'attention-unet', 'depth-anything-v2', 'nafnet', 'phasecam3d', 'midas-small', \
-'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', or the path of a class such as my_package.networks:Network, got 'nafnett'
+'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', or the path of a class such as my_package.networks:Network, \
+got 'nafnett'
     """
     known = (*HEADS, *CLOSED_FORMS)
     module, colon, attribute = name.partition(":")

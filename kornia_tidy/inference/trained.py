@@ -205,6 +205,22 @@ def load_weights(
         part.load_state_dict(own)
 
 
+def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
+    """Load the masks of a checkpoint into a camera, which may differ from the checkpoint's in all else.
+
+    Args:
+        checkpoint: path of a file that ``kornia-tidy train`` wrote.
+        optics: camera with as many masks of the same family and size. Its PSF window stays as it is.
+
+    Raises:
+        ValueError: if the masks do not fit. Nothing is then loaded.
+    """
+    prefix = "optics.masks."
+    own = below(read_state(checkpoint)["state_dict"], prefix)
+    check_weights(optics.masks, own, f"{checkpoint}, {prefix.removesuffix('.')}")
+    optics.masks.load_state_dict(own)
+
+
 def _head_prefix(weights: Mapping[str, Tensor]) -> str:
     """Return the prefix of the network's weights in a checkpoint; of the averaged ones, if there are any."""
     return "average.network." if any(key.startswith("average.") for key in weights) else "head."

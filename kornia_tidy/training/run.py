@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch.utils.data import Dataset
 
 from kornia_tidy.files import only_here
-from kornia_tidy.inference.trained import load_weights
+from kornia_tidy.inference.trained import fix_window, load_masks, load_weights
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
@@ -41,6 +41,7 @@ def train(
     *,
     resume: bool = False,
     head_from: str | os.PathLike[str] | None = None,
+    masks_from: str | os.PathLike[str] | None = None,
     captures: str | os.PathLike[str] | None = None,
     save_every: int = 100,
     workers: int = 0,
@@ -56,6 +57,7 @@ def train(
             with ``pretrain_epochs`` the same files of that stage in ``pretrain/``.
         resume: resume the run in the folder, if there is one.
         head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens.
+        masks_from: checkpoint with the initial masks, such as those of a shipped system.
         captures: folder of the noise-free captures, for ``learn="network"``. Runs with the same camera and scenes may
             share it. Default: ``captures/`` in the folder of the run.
         save_every: steps between checkpoints within an epoch.
@@ -78,8 +80,8 @@ def train(
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
         stored = folder / "captures" if captures is None else Path(captures)
         return _train(
-            settings, folder, scenes, validation, resume, head_from, stored, save_every, workers, progress,
-            trainer_options,
+            settings, folder, scenes, validation, resume, head_from, masks_from, stored, save_every, workers,
+            progress, trainer_options,
         )  # fmt: skip
 
 
@@ -90,6 +92,7 @@ def _train(
     validation: Dataset[Any],
     resume: bool,
     head_from: str | os.PathLike[str] | None,
+    masks_from: str | os.PathLike[str] | None,
     captures: Path,
     save_every: int,
     workers: int,
@@ -111,8 +114,12 @@ def _train(
     if checkpoint is not None:  # the window was measured on the masks before training
         settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
-    module = TidyTraining.from_settings(settings, design=checkpoint is None, progress=progress)
+    module = TidyTraining.from_settings(settings, design=checkpoint is None and masks_from is None, progress=progress)
     assert module.settings is not None
+    if masks_from is not None and checkpoint is None:
+        load_masks(masks_from, module.optics)
+        module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)
+        module.settings = module.settings.replace(window=fix_window(module.optics).window)
     if head_from is not None and checkpoint is None:
         load_weights(head_from, head=module.head)
         if module.average is not None:

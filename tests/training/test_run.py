@@ -88,6 +88,19 @@ class TestTrain(BaseTester):
         weights = first["state_dict"]["average.network.layers.0.weight"]
         self.assert_close(module.head.layers[0].weight.detach(), weights, rtol=0, atol=1e-9)
 
+    def test_feature_a_run_begins_with_the_masks_of_another(self, tmp_path):
+        first = train(SETTINGS.replace(epochs=1), tmp_path / "a")
+        other = SETTINGS.replace(epochs=1, lr_metres=1e-30, sigma=0.003, stray_light="veil", window=11)
+        second = train(other, tmp_path / "b", masks_from=tmp_path / "a" / "last.safetensors")
+        assert torch.equal(first.optics.masks.phase, second.optics.masks.phase)
+        assert second.optics.window == 11
+        assert second.optics.fidelity.stray_light == "veil"
+
+    def test_exception_masks_of_another_number_are_refused(self, tmp_path):
+        train(SETTINGS.replace(epochs=1), tmp_path / "a")
+        with pytest.raises(ValueError, match=r"optics\.masks does not fit: .*phase is \(1, 23, 23\)"):
+            train(SETTINGS.replace(masks=2), tmp_path / "b", masks_from=tmp_path / "a" / "last.safetensors")
+
     def test_feature_it_stops_when_nothing_improves_and_stays_stopped(self, tmp_path):
         still = SETTINGS.replace(lr=1e-30, lr_metres=1e-30, ema=0.0, patience=2, epochs=9)
         train(still, tmp_path)
