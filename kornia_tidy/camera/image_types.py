@@ -91,6 +91,27 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
     return wide if scale == 1 else wide.to(torch.promote_types(wide.dtype, torch.float32)) * scale
 
 
+def cropped_image(image: Any, margin: int) -> Any:
+    """Return a tensor (..., H, W), an array (H, W), (H, W, C) or (B, H, W, C), or a PIL image, without its edges.
+
+    Args:
+        image: or a depth map.
+        margin: pixels less on each side.
+
+    Example:
+        >>> cropped_image(np.zeros((8, 9, 3)), 2).shape
+        (4, 5, 3)
+    """
+    if not margin:
+        return image
+    if isinstance(image, Tensor):
+        return image[..., margin:-margin, margin:-margin]
+    if isinstance(image, np.ndarray):
+        inner = slice(margin, -margin)
+        return image[:, inner, inner] if image.ndim == 4 else image[inner, inner]
+    return image.crop((margin, margin, image.width - margin, image.height - margin))
+
+
 def _array(name: str, value: Any) -> np.ndarray:
     """Return an array or a PIL image as an array."""
     if isinstance(value, np.ndarray):
