@@ -2,12 +2,14 @@
 
 Read ``random_tidy_optics.py`` first: the camera with settings drawn for each image. ``optics_pipeline.py`` puts it
 between geometric and photometric augmentations; ``depth_augmentation.py`` says how depth reaches it in kornia's own
-containers.
+containers. The adapters of other libraries are imported by name: ``torchvision_v2``, ``albumentations_v2`` and
+``deepinv_physics``.
 """
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, DepthTap, bound_depth
 from kornia_tidy.augmentation.depth_blur import DepthBlur, RandomDepthBlur, depth_blur
 from kornia_tidy.augmentation.holes import fill_holes
+from kornia_tidy.augmentation.linear_camera import LinearCamera
 from kornia_tidy.augmentation.optics_pipeline import OpticsPipeline
 from kornia_tidy.augmentation.random_tidy_optics import RandomTiDyOptics
 from kornia_tidy.augmentation.scene_geometry import Scene, SceneGeometry
@@ -17,6 +19,7 @@ __all__ = [
     "DepthAugmentation",
     "DepthBlur",
     "DepthTap",
+    "LinearCamera",
     "OpticsPipeline",
     "RandomDepthBlur",
     "RandomSensorNoise",

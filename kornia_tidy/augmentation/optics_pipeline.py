@@ -9,6 +9,7 @@ import kornia.augmentation as K
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, container_leaves, moves_pixels
+from kornia_tidy.augmentation.pipeline_transform import PipelineTransform
 from kornia_tidy.augmentation.scene_geometry import SceneGeometry, warped_entries
 from kornia_tidy.camera.samples import DEPTH_KEYS
 from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -99,6 +100,10 @@ class OpticsPipeline(nn.Module):
                 "depth is missing: call pipeline(image, depth), pipeline((image, depth)) or pipeline(mapping)"
             )
         return self._scene(image, depth, None, {}, params)[:2]
+
+    def as_transform(self, seed: int | None = None, key: Any = "index") -> PipelineTransform:
+        """Return the pipeline as a transform of single samples, without gradients. See :class:`PipelineTransform`."""
+        return PipelineTransform(self, seed, key)
 
     def _mapping(self, sample: Mapping[str, Any], params: Mapping[str, Any] | None) -> dict[str, Any]:
         keys = [key for key in DEPTH_KEYS if key in sample]

@@ -74,10 +74,11 @@ class DatasetTransform:
                 return self._coded(sample)
             generator = item_generator(self.seed, self._item(sample))
             with repeatable():
-                return self._coded(sample, generator=generator)
+                return self._coded(sample, generator)
 
-    def _coded(self, sample: Any, **options: torch.Generator) -> Any:
+    def _coded(self, sample: Any, generator: torch.Generator | None = None) -> Any:
         """Return the capture of a sample of tensors, or of what becomes tensors."""
+        options = {} if generator is None else {"generator": generator}
         named = isinstance(sample, Mapping)
         if named:
             names = self._names(sample)
@@ -124,7 +125,7 @@ class DatasetTransform:
         return int(sample[self.key])
 
     def __repr__(self) -> str:
-        return f"DatasetTransform({self.optics!r}, seed={self.seed}, key={self.key!r})"
+        return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r})"
 
 
 def item_generator(seed: int, item: int) -> torch.Generator:

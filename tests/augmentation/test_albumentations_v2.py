@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from itertools import permutations
+
 import pytest
 
+from tests.augmentation.coded_scene import MarkDepth, assert_aligned, coded_scene
 from tests.augmentation.optional import need
 
 need("albumentations")
@@ -47,6 +50,14 @@ class TestOpticsTransform(BaseTester):
         assert np.array_equal(out["depth"], given["depth"][::-1])
         both = [captured(optics, given["image"][::-1], given["depth"][::-1]), captured(optics, **given)[::-1]]
         assert min(np.abs(out["image"] - one).max() for one in both) < 1e-6
+
+    @pytest.mark.parametrize("order", list(permutations(range(3))))
+    @pytest.mark.parametrize("warp", [A.HorizontalFlip(p=0.5), A.RandomCrop(20, 24), A.Rotate((90, 90), p=1.0)])
+    def test_property_aligned_in_all_orders(self, warp, order):
+        parts = [warp, OpticsTransform(MarkDepth(p=1.0)), A.CoarseDropout(fill_mask=None, p=1.0)]
+        image, depth = (x[0].permute(1, 2, 0).numpy() for x in coded_scene())
+        out = A.Compose([parts[n] for n in order], **DEPTH)(image=image, depth=depth)
+        assert_aligned(*(torch.from_numpy(out[name]).permute(2, 0, 1)[None] for name in ("image", "depth")))
 
     def test_feature_eight_bit_images_stay_eight_bit(self):
         optics, given = camera(sensor=None), arrays(np.uint8)

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from itertools import permutations
+
 import pytest
 import torch
 
+from tests.augmentation.coded_scene import MarkDepth, assert_aligned, coded_scene
 from tests.augmentation.optional import need_torchvision
 
 need_torchvision()
@@ -148,6 +151,17 @@ class TestOpticsTransform(BaseTester):
         batch = next(iter(loader))
         assert batch["image"].shape == (2, 3, 40, 48)
         assert torch.equal(plain(batch["depth"]), scene(2)[1].flip(-1))
+
+    @pytest.mark.filterwarnings("ignore:RandomErasing.. is currently passing through:UserWarning")
+    @pytest.mark.parametrize("order", list(permutations(range(3))))
+    @pytest.mark.parametrize(
+        "warp", [v2.RandomHorizontalFlip(0.5), v2.RandomCrop((20, 24)), v2.RandomRotation((90, 90))]
+    )
+    def test_property_aligned_in_all_orders(self, warp, order):
+        parts = [warp, OpticsTransform(MarkDepth(p=1.0)), v2.RandomErasing(1.0, scale=(0.02, 0.05))]
+        image, depth = coded_scene()
+        out = v2.Compose([parts[n] for n in order])(tv_tensors.Image(image), Depth(depth))
+        assert_aligned(*map(plain, out))
 
     def test_exception(self):
         image, depth = scene(1)

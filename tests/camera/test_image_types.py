@@ -74,7 +74,7 @@ class TestImageTypes(BaseTester):
         assert image_tensor(cropped_image(image, 2)).shape[-2:] == (3, 5)
 
     def test_exception(self):
-        with pytest.raises(TypeError, match=r"image must be a tensor, a NumPy array or a PIL image, got 'a.png'"):
+        with pytest.raises(TypeError, match=r"image must be a tensor, a NumPy array or a PIL image, got 'a\.png'"):
             image_tensor("a.png")
         with pytest.raises(TypeError, match=r"floating-point, 8-bit or 16-bit numbers, got torch.int64"):
             image_tensor(torch.ones(3, 4, 4, dtype=torch.int64))
