@@ -1,7 +1,7 @@
 """How much less an augmentation costs that is applied to a tenth of the images, in one run.
 
-``python -m tests.benchmarks.augmentation_probability`` prints, for each augmentation, the time of a batch at p = 1 and at
-p = 0.1, and their ratio. Calls of both take turns, so that a busy machine slows both alike. At p = 0.1 the same
+``python -m tests.benchmarks.augmentation_probability`` prints, for each augmentation, the time of a batch at p = 1 and
+at p = 0.1, and their ratio. Calls of both take turns, so that a busy machine slows both alike. At p = 0.1 the same
 number of images as on average is changed in each call: one of ten.
 """
 
