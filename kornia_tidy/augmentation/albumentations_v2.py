@@ -110,7 +110,7 @@ class OpticsTransform(A.DualTransform):
 
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
-        """Return what is done with each target: an image is coded, all else stays."""
+        """Return the function for each target: images are coded, masks, boxes and keypoints returned unchanged."""
         return {
             "image": self.apply,
             **dict.fromkeys(("mask", "masks", "bboxes", "keypoints"), _unchanged),

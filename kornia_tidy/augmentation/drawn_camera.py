@@ -17,7 +17,7 @@ from kornia_tidy.sensor.noise import SensorNoise
 
 
 class DrawnOptics(NamedTuple):
-    """What was drawn for the optics of one image. None: as the camera has it."""
+    """Drawn settings of the optics for one image. None leaves that of the camera."""
 
     focus_distance: float | None = None
     """Distance in focus, in metres."""
@@ -95,7 +95,7 @@ def _switching(modulator: nn.Module, switching_time: float, seed: int) -> nn.Mod
 
 
 class PhaseJitter(Modulator):
-    """A modulator whose masks have a random phase error in each pixel, the same for a whole exposure.
+    """Random phase error of each mask pixel, constant during an exposure.
 
     Args:
         modulator: shows the masks with their error.

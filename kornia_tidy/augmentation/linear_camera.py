@@ -84,7 +84,7 @@ class LinearCamera(nn.Module):
 
 
 class _Adjoint(torch.autograd.Function):
-    """The transpose of rendering, whose own gradient is rendering."""
+    """Adjoint of the renderer as a function of autograd: its gradient is the renderer."""
 
     @staticmethod
     def forward(ctx: Any, irradiance: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, *rest: Any) -> Tensor:

@@ -22,7 +22,7 @@ _OF_OPTICS = ("focus_distance", "aperture_diameter", "mask_jitter", "switching_t
 
 
 class RandomTiDyOptics(DepthAugmentation):
-    r"""Take pictures of images and their depth with a programmable camera whose settings are drawn for each image.
+    r"""Capture images with a programmable camera whose settings are drawn at random for each image.
 
     Args:
         optics: the camera. Default: :class:`~kornia_tidy.TiDyOptics` as it comes. Gradients reach its masks.

@@ -46,7 +46,7 @@ def changed_rows(
 
 
 def drawn_rows(params: Mapping[str, Any], count: int) -> dict[str, Tensor]:
-    """Return what was drawn for each image of a batch; kornia's containers put more into ``params``.
+    """Return the draws of each image of a batch, without the entries that kornia adds to ``params``.
 
     Args:
         params: of an augmentation.

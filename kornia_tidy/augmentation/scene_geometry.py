@@ -29,7 +29,7 @@ _DEPTH, _VALID = "mask_of_depth", "mask_of_valid_depth"
 
 
 class Scene(NamedTuple):
-    """An image, its depth, where the depth is valid, and what else was warped with them."""
+    """Warped scene: image, depth, mask of valid depth, and further entries."""
 
     image: Tensor
     """(B, C, H, W)."""
@@ -147,7 +147,7 @@ def _warps_masks(module: nn.Module) -> bool:
 
 
 def warped_entries(sample: Mapping[str, Any], taken: tuple[str, ...]) -> dict[str, Any]:
-    """Return the entries of a mapping that kornia warps with the image, besides those that are taken.
+    """Return the further entries of a mapping that kornia warps with the image.
 
     Args:
         sample: image, depth and others by name.

@@ -106,15 +106,15 @@ class OpticsTransform(v2.Transform):
         depth = depths[0].as_subclass(Tensor)
         return {"depth": fill_holes(depth, depth > 0)}
 
-    def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
+    def transform(self, entry: Any, params: dict[str, Any]) -> Any:
         """Return the capture of an image, and all else as it is."""
-        if not _is_image(inpt):
-            return inpt
-        plain = inpt.as_subclass(Tensor) if isinstance(inpt, Tensor) else inpt
+        if not _is_image(entry):
+            return entry
+        plain = entry.as_subclass(Tensor) if isinstance(entry, Tensor) else entry
         image = image_tensor(plain)
         coded = self.optics(image, params["depth"].to(image.device)).reshape(image.shape)
         out = like_image(coded, plain)
-        return tv_tensors.wrap(out, like=inpt) if isinstance(inpt, tv_tensors.TVTensor) else out
+        return tv_tensors.wrap(out, like=entry) if isinstance(entry, tv_tensors.TVTensor) else out
 
 
 def _is_image(entry: Any) -> bool:

@@ -77,7 +77,7 @@ class DatasetTransform:
                 return self._coded(sample, generator)
 
     def _coded(self, sample: Any, generator: torch.Generator | None = None) -> Any:
-        """Return the capture of a sample of tensors, or of what becomes tensors."""
+        """Return the sample with its image coded; arrays and PIL images are converted to tensors and back."""
         options = {} if generator is None else {"generator": generator}
         named = isinstance(sample, Mapping)
         if named:
