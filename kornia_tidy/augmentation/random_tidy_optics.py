@@ -57,6 +57,7 @@ class RandomTiDyOptics(DepthAugmentation):
         - Images with the same lens are captured together; each other lens takes PSFs of its own. So
           ``focus_distance``, ``aperture_diameter``, ``mask_jitter`` and ``switching_time`` cost more than ``exposure``
           and ``noise_level``.
+        - Matrices of drawn lenses are remembered as those of other lenses are, in 256 MiB for each process at most.
         - Compiled graphs call it eagerly.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023, for the camera.
