@@ -119,11 +119,13 @@ class TestOpticsTransform(BaseTester):
             self.assert_close(plain(out) if isinstance(out, torch.Tensor) else out, expected)
 
     def test_feature_a_flip_after_the_optics_flips_both(self):
-        """Silent in torchvision if the capture came back as a plain tensor."""
+        """Silent in torchvision if captures came back as plain tensors: of two, the flip would move the first alone."""
         optics, given = camera(sensor=None), sample()
+        given = {**given, "second": given["image"]}
         out = v2.Compose([OpticsTransform(optics), v2.RandomHorizontalFlip(1.0)])(given)
         assert torch.equal(plain(out["depth"]), plain(given["depth"]).flip(-1))
-        self.assert_close(plain(out["image"]), optics(*map(plain, given.values())).flip(-1))
+        for name in ("image", "second"):
+            self.assert_close(plain(out[name]), optics(plain(given["image"]), plain(given["depth"])).flip(-1))
 
     def test_feature_random_apply_keeps_one_set_of_keys(self):
         chain = v2.RandomApply([OpticsTransform(camera())], p=0.5)
