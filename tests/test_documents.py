@@ -27,6 +27,7 @@ import torch
 
 from kornia_tidy.cli import build_parser, main
 from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
+from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,6 +39,7 @@ SLOW: set[str] = set()  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 REASON = re.compile(r"<!-- not run: ((?:(?!-->).)+) -->\n\Z", re.DOTALL)
+NEEDS = re.compile(r"<!-- needs: (\w+) -->\n\Z")
 LINK = re.compile(r"\]\(([^)\s]*?)(?:#([^)\s]*))?\)")
 
 
@@ -49,6 +51,7 @@ class Block(NamedTuple):
     language: str
     text: str
     reason: str  # why it is not run, or nothing
+    needs: str = ""  # package without which it is only compiled
 
     @property
     def place(self) -> str:
@@ -60,10 +63,9 @@ def blocks(name: str, text: str) -> list[Block]:
     found = []
     for fence in FENCE.finditer(text):
         before = text[: fence.start()]
-        marker = REASON.search(before)
-        found.append(
-            Block(name, before.count("\n") + 1, fence[1], fence[2], " ".join(marker[1].split()) if marker else "")
-        )
+        marker, needs = REASON.search(before), NEEDS.search(before)
+        reason = " ".join(marker[1].split()) if marker else ""
+        found.append(Block(name, before.count("\n") + 1, fence[1], fence[2], reason, needs[1] if needs else ""))
     return found
 
 
@@ -76,15 +78,20 @@ def shell_lines(block: Block) -> list[list[str]]:
 def run_page(name: str, text: str) -> None:
     """Run the blocks of a page in the current folder; an error names the page and the line."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
-    printed = ""
+    printed: str | None = ""
     for block in blocks(name, text):
-        if block.language == "text":
-            if not block.reason:
+        if block.needs and importlib.util.find_spec(block.needs) is None:
+            compile(block.text, str(ROOT / name), "exec")
+            printed = None
+        elif block.language == "text":
+            if not block.reason and printed is not None:
                 same = doctest.OutputChecker().check_output(
                     block.text, printed, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
                 )
                 assert same, f"{block.place} shows\n{block.text}but printed is\n{printed}"
         elif block.language in RUN and not block.reason:
+            if block.needs in ("torchvision", "deepinv"):
+                need_torchvision()
             out = io.StringIO()
             with contextlib.redirect_stdout(out):
                 if block.language == "python":  # the empty lines give errors the page's own line numbers
@@ -244,6 +251,15 @@ class TestRunPage(BaseTester):
     def test_exception_another_command(self, folder):
         with pytest.raises(AssertionError, match="only kornia-tidy can be, not ls"):
             run_page("p.md", page("```bash", "ls", "```"))
+
+    def test_feature_a_block_that_needs_a_package_is_run_where_it_is(self, folder):
+        block = page("<!-- needs: {} -->", "```python", "print(1 / {})", "```", "```text", "1.0", "```")
+        run_page("p.md", block.format("gone", 0))
+        run_page("p.md", block.format("torch", 1))
+        with pytest.raises(ZeroDivisionError):
+            run_page("p.md", block.format("torch", 0))
+        with pytest.raises(SyntaxError):
+            run_page("p.md", block.format("gone", ")"))
 
     def test_feature_a_marked_block_is_not_run_and_the_next_one_is(self, folder):
         text = page(

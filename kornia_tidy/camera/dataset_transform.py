@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from kornia_tidy.camera.image_types import cropped_image, depth_tensor, image_tensor, like_image
+from kornia_tidy.camera.samples import DEPTH_KEYS
+from kornia_tidy.checks import check_positive
 from kornia_tidy.render.repeatable import repeatable
 
 
@@ -22,9 +25,21 @@ class DatasetTransform:
             one thread takes the picture, by the shipped cost profile, so that its last digits are the same too.
         key: with a seed, what tells items apart: the name of an entry of the sample, or a function of the sample that
             returns an integer.
+        image_key: name of the image in a mapping.
+        depth_key: name of the depth in a mapping. Default: ``"depth"`` or ``"mask_depth"``.
+        depth_scale: metres in one unit of the depth; 0.001 for millimetres.
+
+    Shape:
+        - A tuple ``(image, depth, ...)``, or a mapping, such as a sample of MONAI or of a Hugging Face data set; a
+          mapping of lists is a batch of them.
+        - The image is a tensor (C, H, W), an array (H, W, C) or (H, W), or a PIL image, of floating-point, 8-bit or
+          16-bit numbers, see :func:`~kornia_tidy.camera.image_types.image_tensor`; the capture is of the same kind.
+        - The depth is a tensor (1, H, W), an array (H, W) or a PIL image, and comes back as it was.
 
     Raises:
-        KeyError: if a seed is set and the sample has no such entry.
+        KeyError: if a mapping has no such image or depth, or a seed is set and the sample has no such entry.
+        TypeError: if the image or the depth is of another kind.
+        ValueError: as the camera.
 
     Example:
         >>> from kornia_tidy import TiDyOptics
@@ -34,19 +49,69 @@ class DatasetTransform:
         True
     """
 
-    def __init__(self, optics: nn.Module, seed: int | None = None, key: str | Callable[[Any], int] = "index") -> None:
+    def __init__(
+        self,
+        optics: nn.Module,
+        seed: int | None = None,
+        key: str | Callable[[Any], int] = "index",
+        image_key: str = "image",
+        depth_key: str | None = None,
+        depth_scale: float = 1.0,
+    ) -> None:
+        check_positive("depth_scale", depth_scale, "metres")
         self.optics = optics
         self.seed = seed
         self.key = key
+        self.image_key, self.depth_key, self.depth_scale = image_key, depth_key, depth_scale
 
     def __call__(self, sample: Any) -> Any:
         """Return the sample with its image coded, in the structure in which it came."""
+        if isinstance(sample, Mapping) and isinstance(images := sample.get(self.image_key), list):
+            singles = [self({name: entries[n] for name, entries in sample.items()}) for n in range(len(images))]
+            return {name: [single[name] for single in singles] for name in (singles[0] if singles else sample)}
         with torch.no_grad():
             if self.seed is None:
-                return self.optics(sample)
+                return self._coded(sample)
             generator = item_generator(self.seed, self._item(sample))
             with repeatable():
-                return self.optics(sample, generator=generator)
+                return self._coded(sample, generator)
+
+    def _coded(self, sample: Any, generator: torch.Generator | None = None) -> Any:
+        """Return the sample with its image coded; arrays and PIL images are converted to tensors and back."""
+        options = {} if generator is None else {"generator": generator}
+        named = isinstance(sample, Mapping)
+        if named:
+            names = self._names(sample)
+            image, depth = (sample[name] for name in names)
+            plain = names[0] == "image" and names[1] in DEPTH_KEYS
+        elif isinstance(sample, (tuple, list)) and len(sample) > 1:
+            (image, depth), plain = sample[:2], True
+        else:
+            return self.optics(sample, **options)  # raises
+        metres = self.depth_scale == 1 and isinstance(depth, Tensor) and depth.is_floating_point()
+        if plain and metres and isinstance(image, Tensor) and image.is_floating_point():
+            return self.optics(sample, **options)
+        whole = image_tensor(image)
+        coded = self.optics(whole, depth_tensor(depth, self.depth_scale), **options)
+        margin = (whole.shape[-2] - coded.shape[-2]) // 2
+        taken, warped = like_image(coded, image), cropped_image(depth, margin)
+        if not named:
+            parts, make = (taken, warped, *sample[2:]), cast("Any", type(sample))
+            return make(*parts) if hasattr(sample, "_fields") else make(parts)
+        mask = {"mask": cropped_image(sample["mask"], margin)} if margin and "mask" in sample else {}
+        clean = cropped_image(image, margin)
+        return {**sample, "all_in_focus": clean, **mask, names[0]: taken, names[1]: warped}
+
+    def _names(self, sample: Mapping[str, Any]) -> tuple[str, str]:
+        """Return the names of image and depth in a mapping."""
+        depths = DEPTH_KEYS if self.depth_key is None else (self.depth_key,)
+        found = [name for name in depths if name in sample]
+        if self.image_key not in sample or len(found) != 1:
+            raise KeyError(
+                f"a mapping sample needs an {self.image_key!r}, and its depth under {' or '.join(map(repr, depths))}, "
+                f"got the keys {list(sample)}: give image_key= and depth_key="
+            )
+        return self.image_key, found[0]
 
     def _item(self, sample: Any) -> int:
         if not isinstance(self.key, str):
@@ -60,7 +125,7 @@ class DatasetTransform:
         return int(sample[self.key])
 
     def __repr__(self) -> str:
-        return f"DatasetTransform({self.optics!r}, seed={self.seed}, key={self.key!r})"
+        return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r})"
 
 
 def item_generator(seed: int, item: int) -> torch.Generator:

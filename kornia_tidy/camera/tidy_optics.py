@@ -370,9 +370,9 @@ class TiDyOptics(CameraState):
         """
         return parameter_groups(self, self.masks, lr_metres, lr)
 
-    def as_transform(self, seed: int | None = None, key: Any = "index") -> DatasetTransform:
+    def as_transform(self, seed: int | None = None, key: Any = "index", **entries: Any) -> DatasetTransform:
         """Return the camera as a transform of single samples, without gradients. See :class:`DatasetTransform`."""
-        return DatasetTransform(self, seed, key)
+        return DatasetTransform(self, seed, key, **entries)
 
     @property
     def clamped_pixels(self) -> int:

@@ -1,0 +1,121 @@
+"""albumentations 2: the camera as a transform of arrays that takes depth as a target.
+
+Needs albumentations 2; nothing else of the package imports it. Its wheel requires a second OpenCV, which overwrites the
+one of this package: ``pip install --no-deps albumentations albucore`` keeps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
+from kornia_tidy.augmentation.holes import fill_holes
+from kornia_tidy.camera.image_types import depth_tensor, image_tensor, like_image
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_part
+
+try:
+    import albumentations as A  # ty: ignore[import-not-found]
+    from albumentations.core.transforms_interface import (  # ty: ignore[import-not-found]
+        BaseTransformInitSchema,
+    )
+except ImportError as error:
+    raise ImportError(f"kornia_tidy.augmentation.albumentations_v2 needs albumentations 2: {error}") from error
+
+_REMEDY = "A.Compose([...], additional_targets={'depth': 'mask'})"
+
+
+class OpticsTransform(A.DualTransform):
+    """Take the picture of an image with its depth, as a transform of albumentations.
+
+    Args:
+        optics: :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth, such as
+            :class:`~kornia_tidy.augmentation.RandomTiDyOptics`. Default: ``TiDyOptics()``.
+        p: probability of the picture to be taken.
+
+    Shape:
+        - ``image``: (H, W, 3), (H, W, 1) or (H, W), 8-bit, 16-bit or float in [0, 1]; comes back in its type.
+        - ``depth``: (H, W) or (H, W, 1), metres; comes back as it was, as do masks, boxes and keypoints.
+
+    Raises:
+        ValueError: if there is no depth, the ``Compose`` does not warp depth as a mask or interpolates masks, or the
+            camera's border is ``"valid"``; as the camera.
+
+    Convention:
+        - Give ``additional_targets={"depth": "mask"}`` to ``Compose``: else its flips would flip the image and not the
+          depth. That is refused.
+        - Holes of the depth, which are 0, are filled for the capture. The depth that comes out still has them.
+        - Noise and draws follow from the seed of ``Compose``. The generator of torch is left as it is.
+
+    Example:
+        >>> chain = A.Compose([A.HorizontalFlip(), OpticsTransform()], additional_targets={"depth": "mask"}, seed=3)
+        >>> sample = chain(image=np.zeros((64, 64, 3), np.uint8), depth=np.ones((64, 64), np.float32))
+        >>> sample["image"].shape, sample["image"].dtype
+        ((64, 64, 3), dtype('uint8'))
+    """
+
+    _targets = ()
+
+    class InitSchema(BaseTransformInitSchema):
+        """Arguments, as albumentations checks them."""
+
+        optics: Any
+
+    def __init__(self, optics: torch.nn.Module | None = None, p: float = 1.0) -> None:
+        super().__init__(p=p)
+        self.optics = TiDyOptics() if optics is None else optics
+        expected = "TiDyOptics or an augmentation that reads depth"
+        check_part("optics", self.optics, (TiDyOptics, DepthAugmentation), expected)
+        camera = self.optics if isinstance(self.optics, TiDyOptics) else getattr(self.optics, "optics", None)
+        if getattr(camera, "border", None) == "valid":
+            raise ValueError("border 'valid' crops the image and not the other targets: use another border")
+        self.mask_interpolation = cv2.INTER_NEAREST  # Compose(mask_interpolation=) sets it, as that of every transform
+
+    def __call__(self, *args: Any, force_apply: bool = False, **kwargs: Any) -> Any:
+        """Apply the transform; depth that others would not warp is refused whether or not the picture is taken."""
+        if "depth" in kwargs and self._additional_targets.get("depth") != "mask":
+            raise ValueError(f"depth passes through other transforms unwarped: tell them of it with {_REMEDY}")
+        return super().__call__(*args, force_apply=force_apply, **kwargs)
+
+    @property
+    def targets_as_params(self) -> list[str]:
+        """Return the targets that a capture needs."""
+        return ["image", "depth"]
+
+    def get_params(self) -> dict[str, Any]:
+        """Return the seed of the capture."""
+        return {"seed": int(self.random_generator.integers(2**31))}
+
+    def get_params_dependent_on_data(self, params: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+        """Return the depth of a sample, without holes."""
+        if self.mask_interpolation != cv2.INTER_NEAREST:
+            raise ValueError(
+                "depth must be resampled by the nearest pixel, got a Compose with another mask_interpolation"
+            )
+        depth = depth_tensor(data["depth"])
+        return {"depth_of_capture": fill_holes(depth, depth > 0)}
+
+    def apply(self, img: np.ndarray, depth_of_capture: torch.Tensor, seed: int, **params: Any) -> np.ndarray:
+        """Return the capture of an image."""
+        image = image_tensor(img)
+        with torch.no_grad(), torch.random.fork_rng():
+            torch.manual_seed(seed)
+            coded = self.optics(image, depth_of_capture).reshape(image.shape)
+        return like_image(coded, img)
+
+    @property
+    def targets(self) -> dict[str, Callable[..., Any]]:
+        """Return the function for each target: images are coded, masks, boxes and keypoints returned unchanged."""
+        return {
+            "image": self.apply,
+            **dict.fromkeys(("mask", "masks", "bboxes", "keypoints"), _unchanged),
+        }
+
+
+def _unchanged(target: Any, **params: Any) -> Any:
+    return target

@@ -1,0 +1,100 @@
+"""The camera as a linear operator at a known depth, with its transpose: what solvers of inverse problems need."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_float_tensor, check_part
+from kornia_tidy.psf.psf_bank import PSFBank
+
+_WANTED = [True, False, False, False, False]  # of image, defocus, nodes, PSFs and stray light
+
+
+class LinearCamera(nn.Module):
+    r"""The optics of a camera for one depth map: :math:`y = A x` from the scene's linear light to the irradiance.
+
+    Colour spaces and the sensor, which are not linear, are left out: images are linear light.
+
+    Args:
+        optics: the camera, gather or scatter. It is shared: A is that of its masks as they are at each call.
+        depth: (B, 1, H, W), (1, 1, H, W) or (1, H, W), as the camera takes it.
+
+    Shape:
+        - ``camera(x)``: (B, C, H, W) linear light to (B, C, H, W) irradiance, smaller for the border ``"valid"``.
+        - ``camera.adjoint(y)``: the irradiance's shape to that of the light.
+
+    Raises:
+        TypeError: if ``optics`` is no camera, or the depth is not a floating-point tensor.
+        ValueError: if compositing is occlusion, which is not linear, the spectrum has a basis, or a depth is not
+            positive.
+
+    Convention:
+        - Gradients reach x, y and, through ``camera(x)``, the masks.
+        - Computed in float32 or better; the result has the argument's type.
+
+    Source: Claerbout: Earth Soundings Analysis, 1992, for the adjoint and its dot-product test.
+
+    Example:
+        >>> camera = LinearCamera(TiDyOptics(), torch.full((1, 64, 64), 0.7))
+        >>> x, y = torch.rand(1, 3, 64, 64), torch.rand(1, 3, 64, 64)
+        >>> bool(((camera(x) * y).sum() / (x * camera.adjoint(y)).sum() - 1).abs() < 1e-4)
+        True
+    """
+
+    depth: Tensor
+
+    def __init__(self, optics: TiDyOptics, depth: Tensor) -> None:
+        super().__init__()
+        check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics()")
+        if optics.compositing == "occlusion":
+            raise ValueError("a linear camera needs compositing 'gather' or 'scatter', got 'occlusion'")
+        if optics.spectrum.basis is not None:
+            raise ValueError("a linear camera needs colours without spectra of their own, got a spectrum with a basis")
+        check_float_tensor("depth", depth, 3 if depth.ndim == 3 else 4, "(B, 1, H, W) or (1, H, W)")
+        self.optics = optics
+        self.register_buffer("depth", depth[None] if depth.ndim == 3 else depth, persistent=False)
+        optics.defocus(depth)  # raises
+
+    def forward(self, light: Tensor) -> Tensor:
+        """Return the irradiance A x of linear light x."""
+        scene, options = self._scene(light.shape[1], light.dtype)
+        image = light.to(scene[0].dtype)
+        return torch.ops.kornia_tidy.render_layers(image, *scene, *options).to(light.dtype)
+
+    def adjoint(self, irradiance: Tensor) -> Tensor:
+        """Return the transpose of the camera applied to an irradiance y: light of the scene's size."""
+        scene, options = self._scene(irradiance.shape[1], irradiance.dtype)
+        plain = [part if part is None else part.detach() for part in scene]
+        return _Adjoint.apply(irradiance.to(plain[0].dtype), *plain, *options).to(irradiance.dtype)
+
+    def _scene(self, channels: int, dtype: torch.dtype) -> tuple[list[Any], list[Any]]:
+        """Return defocus, nodes, PSFs and stray light, and the options of the renderer."""
+        dtype = torch.promote_types(dtype, torch.float64 if self.optics.fidelity.double else torch.float32)
+        now = self.optics.snapshot(dtype)
+        defocus = now.defocus(self.depth.to(dtype))
+        bank: PSFBank = now.psf_model.scene_bank(channels, dtype, defocus)
+        fidelity = now.psf_model.fidelity
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        options = [now.compositing, layers, now.border, fidelity.correlate, "auto"]
+        return [defocus, bank.defocus, bank.psfs, bank.veil], options
+
+
+class _Adjoint(torch.autograd.Function):
+    """Adjoint of the renderer as a function of autograd: its gradient is the renderer."""
+
+    @staticmethod
+    def forward(ctx: Any, irradiance: Tensor, defocus: Tensor, nodes: Tensor, psfs: Tensor, *rest: Any) -> Tensor:
+        ctx.save_for_backward(defocus, nodes, psfs, rest[0])
+        ctx.options = rest[1:]
+        light = irradiance.new_zeros(*irradiance.shape[:2], *defocus.shape[-2:])
+        scene = (light, defocus, nodes, psfs, *rest)
+        return torch.ops.kornia_tidy.render_layers_gradients(*scene, irradiance.contiguous(), _WANTED)[0]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        rendered = torch.ops.kornia_tidy.render_layers(gradients[0].contiguous(), *ctx.saved_tensors, *ctx.options)
+        return rendered, *(None,) * (4 + len(ctx.options))

@@ -1,0 +1,151 @@
+"""OpticsPipeline: geometric augmentations, then the camera, then photometric ones, for tuples and mappings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import kornia.augmentation as K
+from torch import Tensor, nn
+
+from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, container_leaves, moves_pixels
+from kornia_tidy.augmentation.pipeline_transform import PipelineTransform
+from kornia_tidy.augmentation.scene_geometry import SceneGeometry, warped_entries
+from kornia_tidy.camera.samples import DEPTH_KEYS
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_part
+
+
+class OpticsPipeline(nn.Module):
+    """Augment scenes in the order of light: warp image and depth together, take the picture, change its colours.
+
+    Args:
+        geometry: an augmentation of kornia, an ``AugmentationSequential``, or a
+            :class:`~kornia_tidy.augmentation.SceneGeometry`. None: no warp.
+        optics: :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth, such as
+            :class:`~kornia_tidy.augmentation.RandomTiDyOptics`. Default: ``TiDyOptics()``.
+        photometry: augmentations that move no pixel, for the image alone. None: none.
+
+    Shape:
+        - ``pipeline(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to image and depth.
+        - ``pipeline((image, depth, ...))`` to the same tuple.
+        - ``pipeline({"image": ..., "depth": ..., ...})`` to the same mapping, with ``"all_in_focus"`` the warped image
+          without optics, and, where geometry left holes in the depth, ``"mask"`` False there. The depth may stand
+          under ``"mask_depth"``.
+
+    Raises:
+        TypeError: if a part is of another kind.
+        ValueError: if photometry may move pixels, the camera's border is ``"valid"``, or an entry of the image's size
+            would pass unwarped; on use, as the parts.
+        KeyError: if a mapping has no image or no depth.
+
+    Convention:
+        - The depth that comes out is that of the geometry alone, with holes filled. It keeps its type, which should be
+          float32, whatever the image's is.
+        - A mapping's masks, boxes and keypoints are warped too, by the names that kornia knows; ``"mask"``, if it is
+          bool, tells where the depth is valid.
+        - :attr:`params` holds the draws of the last call; ``params=`` repeats them.
+
+    Example:
+        >>> import kornia.augmentation as K
+        >>> import torch
+        >>> pipeline = OpticsPipeline(K.RandomHorizontalFlip(), photometry=K.ColorJiggle(0.1, 0.1))
+        >>> sample = pipeline({"image": torch.rand(2, 3, 64, 64), "depth": torch.ones(2, 1, 64, 64), "name": "a"})
+        >>> sorted(sample)
+        ['all_in_focus', 'depth', 'image', 'name']
+    """
+
+    def __init__(
+        self,
+        geometry: nn.Module | None = None,
+        optics: nn.Module | None = None,
+        photometry: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        optics = TiDyOptics() if optics is None else optics
+        check_part("optics", optics, (TiDyOptics, DepthAugmentation), "TiDyOptics or an augmentation that reads depth")
+        camera = optics if isinstance(optics, TiDyOptics) else getattr(optics, "optics", None)
+        if getattr(camera, "border", None) == "valid":
+            raise ValueError("border 'valid' crops image and depth alone, got it in a pipeline: use another border")
+        for leaf in container_leaves(photometry) if photometry is not None else ():
+            if moves_pixels(leaf) or isinstance(leaf, DepthAugmentation):
+                raise ValueError(
+                    f"photometry may not move pixels, got a {type(leaf).__name__}: the depth would not move with them; "
+                    f"put it into geometry"
+                )
+        whole = geometry is None or isinstance(geometry, SceneGeometry)
+        self.geometry = geometry if whole else SceneGeometry(cast("nn.Module", geometry))
+        self.optics = optics
+        self.photometry = None if photometry is None else K.ImageSequential(photometry)
+        self.params: dict[str, Any] = {}
+
+    def forward(self, image: Any, depth: Tensor | None = None, params: Mapping[str, Any] | None = None) -> Any:
+        """Augment a scene given as tensors, a tuple or a mapping.
+
+        Args:
+            image: the image, or a whole sample; see the class for the forms.
+            depth: the depth map, if ``image`` is a tensor.
+            params: :attr:`params` of an earlier call, to be repeated.
+        """
+        if isinstance(image, Mapping):
+            return self._mapping(image, params)
+        if isinstance(image, (tuple, list)):
+            if len(image) < 2 or depth is not None:
+                raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
+            coded, warped, *_ = self._scene(image[0], image[1], None, {}, params)
+            parts, make = (coded, warped, *image[2:]), cast("Any", type(image))
+            return make(*parts) if hasattr(image, "_fields") else make(parts)
+        if depth is None:
+            raise ValueError(
+                "depth is missing: call pipeline(image, depth), pipeline((image, depth)) or pipeline(mapping)"
+            )
+        return self._scene(image, depth, None, {}, params)[:2]
+
+    def as_transform(self, seed: int | None = None, key: Any = "index") -> PipelineTransform:
+        """Return the pipeline as a transform of single samples, without gradients. See :class:`PipelineTransform`."""
+        return PipelineTransform(self, seed, key)
+
+    def _mapping(self, sample: Mapping[str, Any], params: Mapping[str, Any] | None) -> dict[str, Any]:
+        keys = [key for key in DEPTH_KEYS if key in sample]
+        if "image" not in sample or len(keys) != 1:
+            raise KeyError(
+                f"a mapping sample needs an 'image', and its depth under 'depth' or 'mask_depth', "
+                f"got the keys {list(sample)}"
+            )
+        mask = sample.get("mask")
+        own = mask is not None and str(mask.dtype) == "torch.bool"
+        taken = ("image", keys[0], *(["mask"] if own else []))
+        others = {} if self.geometry is None else warped_entries(sample, taken)
+        coded, depth, clean, valid, warped = self._scene(
+            sample["image"], sample[keys[0]], mask if own else None, others, params
+        )
+        out = {**sample, **warped, "image": coded, "all_in_focus": clean, keys[0]: depth}
+        if valid is not None and (own or not bool(valid.all())):
+            out["mask" if own or mask is None else "mask_of_valid_depth"] = valid
+        return out
+
+    def _scene(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        valid: Tensor | None,
+        others: Mapping[str, Any],
+        params: Mapping[str, Any] | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Mapping[str, Any]]:
+        """Return capture, depth, clean image, where the depth is valid, and the other entries."""
+        given, drawn = params or {}, {}
+        if self.geometry is not None:
+            image, depth, valid, others = self.geometry(image, depth, valid, others, params=given.get("geometry"))
+            drawn["geometry"] = self.geometry.params
+        if isinstance(self.optics, TiDyOptics):
+            drawn["optics"] = given["optics"] if "optics" in given else self.optics.draw(image)
+            coded = self.optics(image, depth, params=drawn["optics"])
+        else:
+            coded = self.optics(image, depth, params=given.get("optics"))
+            drawn["optics"] = self.optics._params
+            coded = coded.reshape(image.shape)
+        if self.photometry is not None:
+            coded = self.photometry(coded, params=given.get("photometry")).reshape(image.shape)
+            drawn["photometry"] = self.photometry._params
+        self.params = drawn
+        return coded, depth, image, valid, others

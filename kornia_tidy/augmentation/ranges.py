@@ -1,0 +1,37 @@
+"""Ranges of values that augmentations draw from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+Range = Sequence[float] | None
+"""Lowest and highest value, or None to leave a setting as it is."""
+
+
+def checked_range(name: str, ends: object, unit: str = "", zero: bool = False) -> tuple[float, float]:
+    """Return the lowest and the highest value of a range, or raise.
+
+    Args:
+        name: of the range, for messages.
+        ends: (low, high).
+        unit: of the values.
+        zero: whether the low end may be zero.
+
+    Raises:
+        TypeError: if the range is not two numbers.
+        ValueError: if it is empty, negative or infinite.
+
+    Example:
+        >>> checked_range("noise_level", (0, 0.1), "of full scale", zero=True)
+        (0.0, 0.1)
+    """
+    if isinstance(ends, str) or not isinstance(ends, Sequence) or len(ends) != 2:
+        raise TypeError(f"{name} must be a range (low, high){' ' + unit if unit else ''}, got {ends!r}")
+    low, high = (float(end) for end in ends)
+    if not (0 <= low <= high < math.inf) or (low == 0 and not zero):
+        raise ValueError(
+            f"{name} must be a range (low, high) with 0 {'<=' if zero else '<'} low <= high"
+            f"{', ' + unit if unit else ''}, got {(low, high)}"
+        )
+    return low, high

@@ -1,0 +1,81 @@
+"""Rows of a batch: an augmentation computes those that it changes, each with draws and noise of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_SEEDS = 2**31  # whole numbers that a cast of the parameters to float64 keeps
+
+
+def changed_rows(
+    image: Tensor,
+    params: Mapping[str, Any],
+    every: bool,
+    change: Callable[[Tensor | slice, dict[str, Tensor]], Tensor],
+) -> Tensor:
+    """Return a batch of which some images were changed. The others are not computed.
+
+    Args:
+        image: (B, C, H, W).
+        params: of an augmentation of kornia; ``"batch_prob"`` above 0.5 marks the images to be changed.
+        every: change all of them, whatever ``"batch_prob"`` says.
+        change: takes the indices of images and what was drawn for them, and returns the changed images.
+
+    Example:
+        >>> params = {"batch_prob": torch.tensor([0.0, 1.0]), "by": torch.tensor([1.0, 2.0])}
+        >>> ones = torch.ones(2, 1, 1, 1)
+        >>> changed_rows(ones, params, False, lambda rows, drawn: ones[rows] + drawn["by"]).flatten()
+        tensor([1., 3.])
+    """
+    drawn = drawn_rows(params, len(image))
+    if not len(image):
+        return image
+    rows = params["batch_prob"].flatten() > 0.5
+    if every or bool(rows.all()):
+        return change(slice(None), drawn)
+    index = rows.nonzero()[:, 0]
+    if not len(index):
+        return image
+    part = {name: value[index.to(value.device)] for name, value in drawn.items()}
+    index = index.to(image.device)
+    return image.index_copy(0, index, change(index, part))
+
+
+def drawn_rows(params: Mapping[str, Any], count: int) -> dict[str, Tensor]:
+    """Return the draws of each image of a batch, without the entries that kornia adds to ``params``.
+
+    Args:
+        params: of an augmentation.
+        count: images of the batch.
+
+    Example:
+        >>> sorted(drawn_rows({"seed": torch.ones(2), "batch_prob": torch.ones(2), "data_keys": ["input"]}, 2))
+        ['seed']
+    """
+    kornias = ("batch_prob", "forward_input_shape")
+    return {
+        name: value
+        for name, value in params.items()
+        if name not in kornias and isinstance(value, Tensor) and value.ndim and len(value) == count
+    }
+
+
+def row_seeds(count: int, same: bool) -> Tensor:
+    """Draw a seed for each image of a batch from the global generator.
+
+    Args:
+        count: images of the batch.
+        same: one seed for all of them.
+
+    Returns:
+        (count,) int64.
+
+    Example:
+        >>> row_seeds(3, same=True).unique().shape
+        torch.Size([1])
+    """
+    return torch.randint(_SEEDS, (1 if same else count,)).expand(count).clone()

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+from itertools import permutations
+
+import pytest
+
+from tests.augmentation.coded_scene import MarkDepth, assert_aligned, coded_scene
+from tests.augmentation.optional import need
+
+need("albumentations")
+
+import albumentations as A  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+
+from kornia_tidy.augmentation import RandomTiDyOptics  # noqa: E402
+from kornia_tidy.augmentation.albumentations_v2 import OpticsTransform  # noqa: E402
+from kornia_tidy.camera.image_types import depth_tensor, image_tensor  # noqa: E402
+from tests.base import BaseTester  # noqa: E402
+from tests.camera.pipeline_samples import camera, scene  # noqa: E402
+
+DEPTH = {"additional_targets": {"depth": "mask"}}
+
+
+def arrays(kind: type = np.float32) -> dict[str, np.ndarray]:
+    image, depth = scene(1)
+    image = image[0].permute(1, 2, 0).numpy()
+    return {"image": (image * 255).astype(np.uint8) if kind is np.uint8 else image, "depth": depth[0, 0].numpy()}
+
+
+def captured(optics: torch.nn.Module, image: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    return optics(image_tensor(image), depth_tensor(depth)).permute(1, 2, 0).detach().numpy()
+
+
+class TestOpticsTransform(BaseTester):
+    def test_feature_flip_optics_crop_equals_the_manual_chain(self):
+        optics, given = camera(sensor=None), arrays()
+        chain = A.Compose([A.HorizontalFlip(p=1.0), OpticsTransform(optics), A.CenterCrop(20, 24)], **DEPTH)
+        out = chain(**given)
+        flipped = {name: array[:, ::-1].copy() for name, array in given.items()}
+        expected = captured(optics, **flipped)[10:30, 12:36]
+        assert np.abs(out["image"] - expected).max() < 1e-6
+        assert np.array_equal(out["depth"], flipped["depth"][10:30, 12:36])
+
+    @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+    def test_feature_image_and_depth_stay_aligned_in_any_order(self, order):
+        optics, given = camera(sensor=None), arrays()
+        parts = [A.VerticalFlip(p=1.0), OpticsTransform(optics)]
+        out = A.Compose([parts[n] for n in order], **DEPTH)(**given)
+        assert np.array_equal(out["depth"], given["depth"][::-1])
+        both = [captured(optics, given["image"][::-1], given["depth"][::-1]), captured(optics, **given)[::-1]]
+        assert min(np.abs(out["image"] - one).max() for one in both) < 1e-6
+
+    @pytest.mark.parametrize("order", list(permutations(range(3))))
+    @pytest.mark.parametrize("warp", [A.HorizontalFlip(p=0.5), A.RandomCrop(20, 24), A.Rotate((90, 90), p=1.0)])
+    def test_property_aligned_in_all_orders(self, warp, order):
+        parts = [warp, OpticsTransform(MarkDepth(p=1.0)), A.CoarseDropout(fill_mask=None, p=1.0)]
+        image, depth = (x[0].permute(1, 2, 0).numpy() for x in coded_scene())
+        out = A.Compose([parts[n] for n in order], **DEPTH)(image=image, depth=depth)
+        assert_aligned(*(torch.from_numpy(out[name]).permute(2, 0, 1)[None] for name in ("image", "depth")))
+
+    def test_feature_eight_bit_images_stay_eight_bit(self):
+        optics, given = camera(sensor=None), arrays(np.uint8)
+        out = A.Compose([OpticsTransform(optics)], **DEPTH)(**given)["image"]
+        assert out.dtype == np.uint8
+        assert np.abs(out / 255 - captured(optics, **given)).max() <= 0.5001 / 255
+
+    def test_feature_noise_follows_the_seed_of_compose_and_leaves_torch_alone(self):
+        given, optics = arrays(), RandomTiDyOptics(camera(), noise_level=(0, 0.1), p=1.0)
+        before = torch.get_rng_state()
+        outs = [A.Compose([OpticsTransform(optics)], seed=seed, **DEPTH)(**given)["image"] for seed in (1, 1, 2)]
+        assert np.array_equal(outs[0], outs[1])
+        assert not np.array_equal(outs[0], outs[2])
+        assert torch.equal(torch.get_rng_state(), before)
+
+    def test_feature_masks_boxes_and_other_entries_pass(self):
+        given = {**arrays(), "mask": np.eye(40, 48, dtype=np.uint8), "label": 3}
+        boxes = np.array([[3, 4, 10, 12]], np.float32)
+        chain = A.Compose(
+            [OpticsTransform(camera())], bbox_params=A.BboxParams("pascal_voc", label_fields=["kinds"]), **DEPTH
+        )
+        out = chain(**given, bboxes=boxes, kinds=[1])
+        assert np.array_equal(out["mask"], given["mask"])
+        assert np.allclose(out["bboxes"], boxes)
+        assert out["label"] == 3
+
+    def test_feature_probability(self):
+        given = arrays()
+        out = A.Compose([OpticsTransform(camera(), p=0.0)], **DEPTH)(**given)
+        assert np.array_equal(out["image"], given["image"])
+
+    def test_feature_holes_of_a_rotation_are_filled_for_the_capture(self):
+        given = arrays()
+        out = A.Compose([A.Rotate((30, 30), p=1.0), OpticsTransform(camera())], **DEPTH)(**given)
+        assert (out["depth"] == 0).any()
+        assert np.isin(out["depth"], np.append(given["depth"], 0)).all()
+        assert np.isfinite(out["image"]).all()
+
+    def test_exception_depth_that_other_transforms_do_not_warp(self):
+        chain = A.Compose([A.HorizontalFlip(p=1.0), OpticsTransform(camera(), p=0.01)])
+        with pytest.raises(ValueError, match="depth passes through other transforms unwarped: tell them"):
+            chain(**arrays())
+
+    def test_exception_interpolated_masks(self):
+        chain = A.Compose([A.Rotate(), OpticsTransform(camera())], mask_interpolation=1, **DEPTH)
+        with pytest.raises(ValueError, match="got a Compose with another mask_interpolation"):
+            chain(**arrays())
+
+    def test_exception_no_depth(self):
+        with pytest.raises(ValueError, match=r"missing keys: {'depth'}"):
+            A.Compose([OpticsTransform(camera())], **DEPTH)(image=arrays()["image"])
+        with pytest.raises(ValueError, match="border 'valid' crops the image"):
+            OpticsTransform(camera(border="valid"))

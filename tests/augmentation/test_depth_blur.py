@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import kornia.augmentation as K
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import convolve
+
+from kornia_tidy.augmentation import DepthBlur, RandomDepthBlur, depth_blur
+from kornia_tidy.augmentation.depth_blur import blur_radius, disc
+from tests.base import BaseTester
+from tests.camera.pipeline_samples import scene
+
+LENS = {"focal_length": 10e-3, "pixel_pitch": 4e-6}  # blur of a few pixels
+
+
+def sampled_disc(radius: float, side: int, samples: int = 40) -> np.ndarray:
+    """A disc by counting points in each pixel."""
+    points = (np.arange(side * samples) + 0.5) / samples - side / 2
+    inside = np.hypot(points[:, None], points) <= radius
+    counts = inside.reshape(side, samples, side, samples).sum((1, 3)).astype(float)
+    return counts / counts.sum()
+
+
+class TestDepthBlur(BaseTester):
+    def test_smoke(self, device, dtype):
+        image, depth = (x.to(device) for x in scene(2))
+        blurred = depth_blur(image.to(dtype), depth, 1.0, 2.8, **LENS)
+        assert blurred.dtype == dtype
+        assert ((blurred >= 0) & (blurred <= 1 + 1e-6)).all()
+
+    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
+    def test_feature_half_precision_is_float32_rounded_once(self, kind):
+        image, depth = scene(1)
+        image = image.to(kind)
+        expected = depth_blur(image.float(), depth, 1.0, 2.8, **LENS)
+        self.assert_close(depth_blur(image, depth, 1.0, 2.8, **LENS), expected.to(kind))
+
+    @pytest.mark.parametrize("channels", [1, 3, 4])
+    @pytest.mark.parametrize("batch", [0, 1, 2])
+    def test_cardinality(self, batch, channels):
+        image, depth = torch.rand(batch, channels, 20, 24), torch.ones(batch, 1, 20, 24)
+        assert DepthBlur(0.6, 2.0, **LENS)(image, depth).shape == image.shape
+        assert RandomDepthBlur(p=1.0)(image, depth).shape == image.shape
+
+    @pytest.mark.parametrize("depth", [0.3, 0.9, 2.0, float("inf")])
+    def test_feature_one_depth_is_a_convolution_with_its_disc(self, depth):
+        """Against scipy with a disc of counted points, at radii on the nodes: the f-number is chosen for them."""
+        image = torch.rand(1, 1, 24, 30, dtype=torch.float64)
+        unit = float(blur_radius(torch.tensor(depth, dtype=torch.float64), 0.6, 1.0, **LENS))
+        f_number = abs(unit) / 2.5
+        blurred = depth_blur(image, torch.full_like(image, depth), 0.6, f_number, color_space="linear", **LENS)
+        expected = convolve(image[0, 0].numpy(), sampled_disc(2.5, 7), mode="nearest")
+        # Points on a grid of 1/40 px: the rim, 2 pi r long, is off by less than half a spacing.
+        bound = 2 * 2 * np.pi * 2.5 * 0.5 / 40 / (np.pi * 2.5**2)
+        assert np.abs(blurred[0, 0].numpy() - expected).max() < bound
+
+    def test_feature_radius_of_a_thin_lens(self):
+        """50 mm at f/2, focused at 1 m: s' = 52.63 mm, so that infinity has a disc of 25 mm * 52.63 mm / 1 m."""
+        radius = blur_radius(torch.tensor([torch.inf, 1.0, 0.5], dtype=torch.float64), 1.0, 2.0)
+        expected = 25e-3 * (0.05 / 0.95) / 2 / 8e-6
+        self.assert_close(radius, torch.tensor([-expected, 0.0, expected], dtype=torch.float64))
+
+    def test_feature_white_stays_white_and_focus_stays_sharp(self):
+        image, depth = scene(2)
+        self.assert_close(depth_blur(torch.ones_like(image), depth, 1.0, 1.4), torch.ones_like(image))
+        sharp = depth_blur(image, torch.full_like(depth, 1.0), 1.0, 1.4)
+        self.assert_close(sharp, image, atol=1e-5)
+
+    def test_feature_each_image_has_its_own_lens(self):
+        image, depth = scene(2)
+        focus, number = torch.tensor([0.5, 2.0]), torch.tensor([2.0, 4.0])
+        both = depth_blur(image, depth, focus, number, **LENS)
+        for row in range(2):
+            alone = depth_blur(
+                image[row : row + 1], depth[row : row + 1], focus[row].item(), number[row].item(), **LENS
+            )
+            self.assert_close(both[row : row + 1], alone, atol=1e-5)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_compositing(self, compositing):
+        image, depth = scene(1)
+        blurred = depth_blur(image, torch.full_like(depth, 0.9), 0.6, 2.0, compositing=compositing, **LENS)
+        gathered = depth_blur(image, torch.full_like(depth, 0.9), 0.6, 2.0, **LENS)
+        self.assert_close(blurred, gathered, atol=1e-4)  # one layer looks alike
+
+    def test_feature_the_largest_disc_is_the_limit(self):
+        image, depth = torch.rand(1, 3, 30, 30), torch.full((1, 1, 30, 30), 0.2)
+        near = depth_blur(image, depth, 0.6, 0.95, max_radius=3.0, **LENS)
+        self.assert_close(near, depth_blur(image, depth * 0.9, 0.6, 0.95, max_radius=3.0, **LENS))
+
+    def test_exception(self):
+        image, depth = scene(1)
+        with pytest.raises(ValueError, match=r"focus_distance must be beyond the focal length 0.05 m, got 0.04"):
+            depth_blur(image, depth, 0.04, 2.0)
+        with pytest.raises(ValueError, match="f_number must be positive"):
+            depth_blur(image, depth, 1.0, 0.0)
+        with pytest.raises(ValueError, match="depth must be positive metres, got 0"):
+            depth_blur(image, torch.zeros_like(depth), 1.0, 2.0)
+        with pytest.raises(ValueError, match="color_space must be one of 'srgb', 'linear'"):
+            depth_blur(image, depth, 1.0, 2.0, color_space="lab")
+        with pytest.raises(TypeError, match="image must be floating point"):
+            depth_blur(image.byte(), depth, 1.0, 2.0)
+
+    def test_gradcheck(self):
+        image, depth = scene(1, channels=1, height=6, width=7)
+        depth = depth.clamp(max=2.0).double() + 1e-3
+        self.gradcheck(
+            lambda x, z: depth_blur(x, z, 0.6, 4.0, color_space="linear", **LENS), (image, depth), eps=1e-6, atol=1e-4
+        )
+
+    def test_smoke_discs_sum_to_one(self):
+        for steps in (0, 1, 2, 7, 32):
+            assert abs(float(disc(steps, 33).sum()) - 1) < 1e-12
+
+
+class TestRandomDepthBlur(BaseTester):
+    def test_feature_is_the_function_with_the_drawn_lens(self):
+        image, depth = scene(3)
+        augmentation = RandomDepthBlur(p=1.0, **LENS)
+        blurred = augmentation(image, depth)
+        drawn = augmentation._params
+        self.assert_close(blurred, depth_blur(image, depth, drawn["focus_distance"], drawn["f_number"], **LENS))
+        assert torch.equal(augmentation(image, depth, params=drawn), blurred)
+
+    def test_feature_rows_that_are_left_out_keep_their_bits(self):
+        image, depth = scene(6)
+        augmentation = RandomDepthBlur(p=0.5, f_number=(1.0, 1.2), **LENS)
+        blurred = augmentation(image, depth)
+        left = augmentation._params["batch_prob"] < 0.5
+        assert 0 < left.sum() < 6
+        assert torch.equal(blurred[left], image[left])
+        assert not (blurred[~left] == image[~left]).flatten(1).all(1).any()
+
+    def test_feature_in_augmentation_sequential(self):
+        image, depth = scene(2)
+        blur = RandomDepthBlur(p=1.0, **LENS)
+        chain = K.AugmentationSequential(K.RandomVerticalFlip(p=1.0), blur.depth_tap, blur, data_keys=["input", "mask"])
+        blurred, warped = chain(image, depth)
+        assert torch.equal(warped, depth.flip(-2))
+        drawn = chain._params[-1].data
+        expected = depth_blur(image.flip(-2), warped, drawn["focus_distance"], drawn["f_number"], **LENS)
+        self.assert_close(blurred, expected)
+
+    def test_exception(self):
+        with pytest.raises(ValueError, match="focus_distance must be beyond the focal length"):
+            RandomDepthBlur(focus_distance=(0.01, 1.0))
+        with pytest.raises(ValueError, match=r"f_number must be a range \(low, high\)"):
+            RandomDepthBlur(f_number=(4.0, 2.0))
+
+    @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+    def test_dynamo(self):
+        image, depth = scene(2)
+        augmentation = RandomDepthBlur(p=0.5, **LENS)
+        params = augmentation.forward_parameters(image.shape)
+        compiled = torch.compile(augmentation, backend="eager")
+        self.assert_close(compiled(image, depth, params=params), augmentation(image, depth, params=params))

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics
+from kornia_tidy.augmentation.linear_camera import LinearCamera
+from tests.base import BaseTester
+from tests.camera.pipeline_samples import FAST, camera, scene
+from tests.rounding import gamma
+
+
+def linear(compositing: str = "gather", border: str = "reflect", **options: object) -> TiDyOptics:
+    return camera(compositing=compositing, border=border, sensor=None, color_space="linear", **options)
+
+
+class TestLinearCamera(BaseTester):
+    def test_smoke(self, device, dtype):
+        image, depth = (x.to(device) for x in scene(2))
+        operator = LinearCamera(linear().to(device), depth)
+        assert operator(image.to(dtype)).dtype == operator.adjoint(image.to(dtype)).dtype == dtype
+
+    @pytest.mark.parametrize("border", ["reflect", "valid"])
+    @pytest.mark.parametrize("channels", [1, 3])
+    def test_cardinality(self, border, channels):
+        image, depth = scene(2, channels)
+        operator = LinearCamera(linear(border=border), depth)
+        irradiance = operator(image)
+        assert irradiance.shape == linear(border=border)(image, depth).shape
+        assert operator.adjoint(irradiance).shape == image.shape
+
+    @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular", "valid"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+    def test_feature_dot_product(self, compositing, border, kind):
+        """<A x, y> = <x, A' y>, but for the rounding of sums of as many products as a PSF has pixels, and of FFTs."""
+        image, depth = scene(2)
+        operator = LinearCamera(linear(compositing, border), depth)
+        x = torch.randn(image.shape, dtype=kind)
+        ax = operator(x)
+        y = torch.randn(ax.shape, dtype=kind)
+        left, right = (ax.double() * y.double()).sum(), (x.double() * operator.adjoint(y).double()).sum()
+        # Every product of the two bilinear forms is rounded as often as a PSF has pixels and layers, in either order.
+        size = (operator(x.abs()).double().abs() * y.abs().double()).sum()
+        assert (left - right).abs() < 2 * gamma(9 * 9 * 5, kind) * size
+
+    def test_feature_it_is_the_capture_in_linear_light_without_noise(self):
+        image, depth = scene(2)
+        for compositing in ("gather", "scatter"):
+            optics = linear(compositing)
+            self.assert_close(LinearCamera(optics, depth)(image), optics(image, depth))
+
+    def test_feature_the_transpose_of_autograd(self):
+        image, depth = scene(1)
+        operator = LinearCamera(linear(), depth)
+        x = image.clone().requires_grad_()
+        y = torch.rand_like(image)
+        (expected,) = torch.autograd.grad(operator(x), x, y)
+        self.assert_close(operator.adjoint(y), expected)
+
+    def test_feature_gradients_reach_the_masks(self):
+        image, depth = scene(1)
+        optics = linear()
+        LinearCamera(optics, depth)(image).square().sum().backward()
+        assert optics.masks.phase.grad.abs().sum() > 0
+
+    def test_exception(self):
+        depth = scene(1)[1]
+        with pytest.raises(
+            ValueError, match="a linear camera needs compositing 'gather' or 'scatter', got 'occlusion'"
+        ):
+            LinearCamera(linear("occlusion"), depth)
+        with pytest.raises(TypeError, match="optics must be a camera"):
+            LinearCamera(torch.nn.Identity(), depth)
+        with pytest.raises(ValueError, match="depth must be positive metres"):
+            LinearCamera(linear(), depth * 0)
+
+    def test_gradcheck(self):
+        """Of the transpose, whose gradient is the camera."""
+        depth = torch.rand(1, 1, 10, 11, dtype=torch.float64)
+        optics = TiDyOptics(PixelwiseMask(1), DefocusRange(-5, 5), fidelity=FAST, sensor=None)
+        operator = LinearCamera(optics.requires_grad_(False), depth)
+        self.gradcheck(operator.adjoint, (torch.rand(1, 3, 10, 11),))
+        self.gradcheck(operator, (torch.rand(1, 3, 10, 11),))

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import kornia.augmentation as K
+import pytest
+import torch
+from torch import Tensor
+
+from kornia_tidy import TiDyOptics
+from kornia_tidy.augmentation import OpticsPipeline, RandomTiDyOptics, SceneGeometry
+from tests.base import BaseTester
+from tests.camera.pipeline_samples import camera, scene
+
+
+class Named(NamedTuple):
+    image: Tensor
+    depth: Tensor
+    label: int
+
+
+def pipeline(**options: object) -> OpticsPipeline:
+    return OpticsPipeline(
+        **{"geometry": K.RandomHorizontalFlip(p=1.0), "optics": RandomTiDyOptics(camera(sensor=None), p=1.0), **options}
+    )
+
+
+class TestOpticsPipeline(BaseTester):
+    def test_smoke_without_arguments_it_is_the_camera(self):
+        image, depth = scene(1)
+        coded, same = OpticsPipeline()(image, depth)
+        assert isinstance(OpticsPipeline().optics, TiDyOptics)
+        assert coded.shape == image.shape
+        assert torch.equal(same, depth)
+
+    @pytest.mark.parametrize("batched", [True, False])
+    @pytest.mark.parametrize("form", ["tensors", "tuple", "list", "named", "mapping", "mask_depth"])
+    def test_cardinality_every_form_comes_back_as_it_was(self, form, batched):
+        image, depth = scene(2) if batched else (x[0] for x in scene(1))
+        expected = camera_of(chain := pipeline())(image.flip(-1), depth.flip(-1))
+        if form == "tensors":
+            coded, warped = chain(image, depth)
+        elif form in ("tuple", "list", "named"):
+            make = {"tuple": tuple, "list": list, "named": lambda parts: Named(*parts)}[form]
+            out = chain(make((image, depth, 5)))
+            assert type(out) is type(make((image, depth, 5)))
+            assert out[2] == 5
+            coded, warped = out[:2]
+        else:
+            name = "mask_depth" if form == "mask_depth" else "depth"
+            out = chain({"image": image, name: depth, "label": 5, "name": "a"})
+            assert set(out) == {"image", name, "label", "name", "all_in_focus"}
+            assert torch.equal(out["all_in_focus"], image.flip(-1))
+            coded, warped = out["image"], out[name]
+        self.assert_close(coded, expected, rtol=0, atol=1e-6)
+        assert torch.equal(warped, depth.flip(-1))
+
+    def test_feature_holes_are_filled_and_masked(self):
+        image, depth = scene(2)
+        valid = depth > 0.5
+        out = pipeline(geometry=K.RandomRotation((30.0, 30.0), p=1.0))({"image": image, "depth": depth, "mask": valid})
+        assert (out["depth"] > 0).all()
+        assert out["mask"].dtype == torch.bool
+        assert (~out["mask"]).float().mean() > 0.05
+        assert out["image"].isfinite().all()
+        assert (out["depth"][out["mask"]] > 0.5).all()
+
+    def test_feature_a_mask_of_classes_is_warped_and_stays_a_mask_of_classes(self):
+        image, depth = scene(2)
+        classes = (depth > 1).long()
+        out = pipeline(geometry=K.RandomRotation((30.0, 30.0), p=1.0))(
+            {"image": image, "depth": depth, "mask": classes}
+        )
+        assert out["mask"].dtype == torch.int64
+        assert not out["mask_of_valid_depth"].all()
+
+    def test_feature_boxes_and_other_masks_are_warped(self):
+        image, depth = scene(2)
+        points = torch.tensor([[[3.0, 4.0]]]).expand(2, -1, -1)
+        out = pipeline()({"image": image, "depth": depth, "keypoints": points, "mask_people": depth})
+        assert out["keypoints"][0, 0].tolist() == [image.shape[-1] - 1 - 3, 4]
+        assert torch.equal(out["mask_people"], depth.flip(-1))
+
+    @pytest.mark.parametrize("optics", ["fixed", "random"])
+    def test_feature_params_repeat_a_call(self, optics):
+        part = camera() if optics == "fixed" else RandomTiDyOptics(camera(), noise_level=(0, 0.1), p=0.5)
+        chain = OpticsPipeline(K.RandomCrop((32, 36)), part, K.ColorJiggle(0.2, 0.2, p=1.0))
+        image, depth = scene(3)
+        first, params = chain(image, depth), chain.params
+        second = chain(image, depth)
+        assert not torch.equal(first[0], second[0])
+        assert all(map(torch.equal, chain(image, depth, params=params), first))
+
+    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
+    def test_feature_depth_stays_exact_whatever_the_image_is(self, kind):
+        image, depth = scene(2)
+        coded, warped = pipeline()(image.to(kind), depth)
+        assert coded.dtype == kind
+        assert torch.equal(warped, depth.flip(-1))
+
+    def test_feature_gradients_reach_the_masks(self):
+        image, depth = scene(2)
+        chain = OpticsPipeline(K.RandomHorizontalFlip(), camera(), K.ColorJiggle(0.2, p=1.0))
+        chain(image, depth)[0].square().mean().backward()
+        assert chain.optics.masks.phase.grad.abs().sum() > 0
+
+    def test_feature_photometry_comes_last(self):
+        image, depth = scene(2)
+        optics, invert = camera(sensor=None), K.RandomInvert(p=1.0)
+        plain, inverted = (pipeline(optics=optics, photometry=last)(image, depth)[0] for last in (None, invert))
+        self.assert_close(inverted, 1 - plain)
+
+    def test_exception_parts(self):
+        with pytest.raises(ValueError, match="photometry may not move pixels, got a RandomRotation"):
+            OpticsPipeline(photometry=K.AugmentationSequential(K.RandomRotation(5.0)))
+        with pytest.raises(ValueError, match="photometry may not move pixels, got a RandomTiDyOptics"):
+            OpticsPipeline(photometry=RandomTiDyOptics(camera()))
+        with pytest.raises(TypeError, match="optics must be TiDyOptics or an augmentation that reads depth"):
+            OpticsPipeline(optics=K.RandomGaussianBlur((3, 3), (1.0, 2.0)))
+        with pytest.raises(ValueError, match="border 'valid' crops image and depth alone"):
+            OpticsPipeline(optics=camera(border="valid"))
+        with pytest.raises(TypeError, match="augmentations of kornia that warp a mask"):
+            OpticsPipeline(torch.nn.AvgPool2d(2))
+
+    def test_exception_samples(self):
+        image, depth = scene(1)
+        with pytest.raises(KeyError, match="a mapping sample needs an 'image', and its depth under"):
+            pipeline()({"image": image})
+        with pytest.raises(ValueError, match="depth is missing"):
+            pipeline()(image)
+        with pytest.raises(ValueError, match=r"a tuple sample must be \(image, depth"):
+            pipeline()((image,))
+        with pytest.raises(ValueError, match="call it 'mask_normals'"):
+            pipeline()({"image": image, "depth": depth, "normals": image})
+
+    def test_feature_a_scene_geometry_is_taken_as_it_is(self):
+        geometry = SceneGeometry(K.RandomHorizontalFlip(), scale_depth=True)
+        assert OpticsPipeline(geometry).geometry is geometry
+
+
+def camera_of(chain: OpticsPipeline) -> TiDyOptics:
+    return chain.optics.optics

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import kornia.augmentation as K
+import pytest
+import torch
+from kornia.constants import DataKey
+
+from kornia_tidy.augmentation import RandomTiDyOptics, SceneGeometry
+from kornia_tidy.augmentation.scene_geometry import warped_entries
+from tests.base import BaseTester
+from tests.camera.pipeline_samples import camera, scene
+
+
+class TestSceneGeometry(BaseTester):
+    @pytest.mark.parametrize("batched", [True, False])
+    def test_cardinality(self, batched):
+        image, depth = scene(2)
+        out = SceneGeometry(K.RandomCrop((32, 36)))(*((image, depth) if batched else (image[0], depth[0])))
+        lead = (2,) if batched else ()
+        assert out.image.shape == (*lead, 3, 32, 36)
+        assert out.depth.shape == out.valid.shape == (*lead, 1, 32, 36)
+
+    def test_feature_a_flip_moves_image_depth_and_mask_alike(self):
+        image, depth = scene(2)
+        valid = depth > 1
+        out = SceneGeometry(K.RandomHorizontalFlip(p=1.0))(image, depth, valid)
+        assert torch.equal(out.image, image.flip(-1))
+        assert torch.equal(out.valid, valid.flip(-1))
+        assert torch.equal(out.depth[out.valid], depth.flip(-1)[out.valid])
+
+    def test_feature_a_rotation_leaves_holes_that_are_masked_and_filled_with_depths_of_the_scene(self):
+        image, depth = scene(2)
+        out = SceneGeometry(K.RandomRotation((30.0, 30.0), p=1.0))(image, depth)
+        assert 0.05 < (~out.valid).float().mean() < 0.4
+        assert torch.isin(out.depth, depth).all()  # nearest: no depth between two things
+
+    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+    def test_feature_depth_keeps_every_digit_whatever_the_type_of_the_image(self, kind):
+        image, depth = scene(2)
+        depth = depth * 12345.678
+        out = SceneGeometry(K.RandomVerticalFlip(p=1.0))(image.to(kind), depth)
+        assert out.image.dtype == kind
+        assert torch.equal(out.depth, depth.flip(-2))
+
+    def test_feature_depth_in_float64_is_not_rounded_by_an_image_in_float32(self):
+        image, depth = scene(1)
+        depth = depth.double() / 3
+        assert torch.equal(SceneGeometry(K.RandomHorizontalFlip(p=1.0))(image, depth).depth, depth.flip(-1))
+
+    def test_feature_enlarged_scenes_are_nearer_where_that_is_asked_for(self):
+        image, depth = scene(2)
+        affine = K.RandomAffine(0.0, scale=(2.0, 2.0), p=1.0)
+        plain = SceneGeometry(affine)
+        as_it_is = plain(image, depth)
+        scaled = SceneGeometry(affine, scale_depth=True)(image, depth, params=plain.params)
+        self.assert_close(scaled.depth, as_it_is.depth / 2)
+
+    def test_feature_scale_follows_a_resized_crop(self):
+        image, depth = scene(1)
+        crop = K.RandomResizedCrop((40, 48), scale=(0.25, 0.25), ratio=(1.2, 1.2), p=1.0)
+        out = SceneGeometry(crop, scale_depth=True)(image, torch.full_like(depth, 3.0))
+        magnification = (39 / 19 * 47 / 23) ** 0.5  # 20 x 24 pixels, from the first centre to the last
+        self.assert_close(out.depth, torch.full_like(depth, 3.0 / magnification))
+
+    def test_feature_other_masks_go_along(self):
+        image, depth = scene(1)
+        out = SceneGeometry(K.RandomHorizontalFlip(p=1.0))(image, depth, others={"mask_of_people": depth})
+        assert torch.equal(out.others["mask_of_people"], depth.flip(-1))
+
+    def test_exception_scale_of_a_perspective(self):
+        image, depth = scene(1)
+        with pytest.raises(ValueError, match="scale_depth needs a warp that enlarges all parts"):
+            SceneGeometry(K.RandomPerspective(p=1.0), scale_depth=True)(image, depth.clamp(max=5))
+
+    def test_exception_modules_that_would_warp_the_image_alone(self):
+        for module in (torch.nn.AvgPool2d(2), K.RandomMixUpV2()):
+            with pytest.raises(TypeError, match="augmentations of kornia that warp a mask with the image"):
+                SceneGeometry(module)
+        with pytest.raises(TypeError, match="is optics and belongs behind the geometry"):
+            SceneGeometry(K.AugmentationSequential(RandomTiDyOptics(camera())))
+
+    def test_exception_interpolated_depth(self):
+        bilinear = {DataKey.MASK: {"resample": "bilinear", "align_corners": None}}
+        chain = K.AugmentationSequential(K.RandomRotation(5.0), extra_args=bilinear)
+        with pytest.raises(ValueError, match="nearest pixel, got extra_args with BILINEAR"):
+            SceneGeometry(chain)
+
+    def test_exception_an_entry_that_would_pass_unwarped(self):
+        image, depth = scene(1)
+        with pytest.raises(ValueError, match="call it 'mask_normals'"):
+            warped_entries({"image": image, "depth": depth, "normals": image}, ("image", "depth"))
