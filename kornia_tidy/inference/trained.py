@@ -20,6 +20,7 @@ from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
@@ -74,6 +75,13 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 
 def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
+    if settings.depth_classes:
+        return LayeredJointHead(
+            make_head(settings.head, settings.depth_classes, settings.width, 3 + settings.refocus),
+            make_head(settings.head, 3, settings.width, REFINED_FROM),
+            settings.refocus,
+            encoded=settings.encoded,
+        )
     head = make_head(settings.head, channels_of(settings.task), settings.width, 3 + settings.refocus)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
@@ -81,16 +89,17 @@ def build_head(settings: SystemSettings) -> nn.Module:
 
 
 def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
-    """Update the PSFs of a network that refocuses captures (:class:`~kornia_tidy.reconstruction.Refocused`).
+    """Update the PSFs of a network that deconvolves captures.
 
-    They are the camera's present PSFs of green light, evenly spaced over the range of defocus. Other networks are
-    not changed.
+    They are the camera's present PSFs, evenly spaced over the range of defocus: those of green light for
+    :class:`~kornia_tidy.reconstruction.Refocused`, of all colours for
+    :class:`~kornia_tidy.reconstruction.LayeredJointHead`. Other networks are not changed.
     """
     for module in head.modules():
-        if isinstance(module, Refocused):
+        if isinstance(module, Refocused | LayeredJointHead):
             lo, hi = optics.camera.defocus_range
             nodes = torch.linspace(lo, hi, module.layers, dtype=torch.float64).tolist()
-            module.set_psfs(optics.psf_bank(1, defocus=nodes))
+            module.set_psfs(optics.psf_bank(1 if isinstance(module, Refocused) else 3, defocus=nodes))
 
 
 def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:

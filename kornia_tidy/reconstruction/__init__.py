@@ -5,7 +5,8 @@ Captures come in, maps of the same size go out. Read ``head.py``, the base class
 
 from kornia_tidy.reconstruction.attention_unet import AttentionUNet
 from kornia_tidy.reconstruction.head import ReconstructionHead
-from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
+from kornia_tidy.reconstruction.joint import JointEstimate, JointHead, UncertainJointEstimate
+from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
 from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
 from kornia_tidy.reconstruction.receptive_field import receptive_field
@@ -18,6 +19,7 @@ __all__ = [
     "AttentionUNet",
     "JointEstimate",
     "JointHead",
+    "LayeredJointHead",
     "MiDaSSmall",
     "PhaseCam3DUNet",
     "Preconditioned",
@@ -26,6 +28,7 @@ __all__ = [
     "Residual",
     "Tikhonov",
     "TikhonovLayers",
+    "UncertainJointEstimate",
     "load_midas_small",
     "receptive_field",
     "reconstruct_tiled",

@@ -103,15 +103,32 @@ class Refocused(ReconstructionHead):
         if not self.filters.numel():
             raise ValueError("the network does not know its camera: call set_psfs(optics.psf_bank(...)) first")
         brightness = image.to(torch.promote_types(image.dtype, self.filters.dtype)).mean(1, keepdim=True)
-        return self.network(torch.cat([image, _convolve(brightness, self.filters).to(image.dtype)], 1))
+        refocused = convolve_layers(brightness, self.filters.unsqueeze(1)).squeeze(2)
+        return self.network(torch.cat([image, refocused.to(image.dtype)], 1))
 
 
-def _convolve(image: Tensor, filters: Tensor) -> Tensor:
-    """Convolve (B, 1, H, W) with (D, P, P) to (B, D, H, W), with padded borders."""
+def convolve_layers(image: Tensor, filters: Tensor) -> Tensor:
+    """Convolve an image with one filter for each depth and channel.
+
+    Args:
+        image: (B, C, H, W). It is extended by reflection; if a side is too short for that, by replication.
+        filters: (D, C, P, P) with P odd.
+
+    Returns:
+        (B, D, C, H, W). NaN spreads to the pixels within the filters and no farther.
+
+    Example:
+        >>> convolve_layers(torch.ones(1, 1, 4, 5), torch.full((2, 1, 3, 3), 0.5)).unique()
+        tensor([4.5000])
+    """
     window = filters.shape[-1]
     padded = pad_border(image, window // 2, "reflect" if window // 2 < min(image.shape[-2:]) else "replicate")
     if torch.compiler.is_compiling():  # exporters do not support complex numbers
-        return functional.conv2d(padded, filters.flip((-2, -1)).unsqueeze(1))
+        planes = [
+            functional.conv2d(padded[:, [channel]], filters[:, [channel]].flip((-2, -1)))
+            for channel in range(image.shape[1])
+        ]
+        return torch.stack(planes, 2)
     unknown = padded.isnan()
     if marked := bool(unknown.any()):  # a transform would spread NaN over the whole picture
         padded = padded.where(~unknown, 0)
@@ -119,8 +136,10 @@ def _convolve(image: Tensor, filters: Tensor) -> Tensor:
     spectrum = to_spectrum(padded, size)
     # Without gradients, as for large pictures, one filter at a time takes a fraction of the memory.
     together = len(filters) if torch.is_grad_enabled() else 1
+    spectrum = spectrum.unsqueeze(1)
     layers = [from_spectrum(spectrum * to_spectrum(some, size), size, window) for some in filters.split(together)]
     convolved = torch.cat(layers, 1)
     if marked:
-        convolved = convolved.masked_fill(functional.max_pool2d(unknown.to(padded.dtype), window, 1) > 0, torch.nan)
+        spread = functional.max_pool2d(unknown.to(padded.dtype), window, 1) > 0
+        convolved = convolved.masked_fill(spread.unsqueeze(1), torch.nan)
     return convolved

@@ -11,9 +11,11 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.tasks import MAPS, centre_crop, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.tasks import MAPS, centre_crop, depth_logits, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.reconstruction.depth_distribution import fit_temperature
+from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import rmse
 from kornia_tidy.training.average import MovingAverage
@@ -21,6 +23,8 @@ from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
+
+HELD_OUT_STEP = 4  # of the pixels in a row, and of the rows, to which the temperature is fitted
 
 
 class BatchResult(NamedTuple):
@@ -34,6 +38,8 @@ class BatchResult(NamedTuple):
     """True maps by name: ``"image"`` is the all-in-focus scene, ``"depth"`` its normalised inverse depth in [0, 1]."""
     mask: Tensor
     """bool (B, 1, H, W), True where depth is known."""
+    logits: Tensor | None = None
+    """Those of the distribution of depth, (B, D, H, W) in float32, if the network estimates one."""
 
 
 def cosine_rate(progress: float, warm_up: float = 0.1) -> float:
@@ -63,7 +69,9 @@ class TidyTraining(pl.LightningModule):
 
     Args:
         optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
-        head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint.
+        head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint, or
+            D + 3 with a distribution of depth over D classes, which is then trained by
+            :func:`~kornia_tidy.reconstruction.depth_distribution.distribution_loss`.
         task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is estimated as
             :func:`~kornia_tidy.inference.tasks.normalised_inverse_depth`.
         loss: function of an estimated map, the true map and the validity mask; the same for all maps.
@@ -161,30 +169,52 @@ class TidyTraining(pl.LightningModule):
         noise = None if seed is None else torch.Generator(self.device).manual_seed(seed)
         sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
         coded = sample["image"]
-        estimate = {name: maps.float() for name, maps in split_maps(self.task, self(coded)).items()}
+        output = self(coded).float()
+        estimate = split_maps(self.task, output)
         truth = {
             "image": sample["all_in_focus"],
             "depth": normalised_inverse_depth(self.optics.camera, sample["depth"].float()),
         }
         mask = batch.get("mask")
         mask = torch.ones_like(sample["depth"], dtype=torch.bool) if mask is None else mask
-        return BatchResult(coded, estimate, truth, centre_crop(mask, *coded.shape[-2:]))
+        mask = centre_crop(mask, *coded.shape[-2:])
+        return BatchResult(coded, estimate, truth, mask, depth_logits(self.task, output))
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
         result = self.reconstruct(batch)
-        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)
+        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights, result.logits)
         self.log("loss", loss.detach(), prog_bar=True, batch_size=len(result.coded))
         return loss
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Log the mean over all scenes of the loss and of each map's root mean squared error."""
         result = self.reconstruct(batch)
-        scores = {"val_loss": task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)}
+        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights, result.logits)
+        scores = {"val_loss": loss}
         for name, maps in result.estimate.items():
             errors = rmse(maps, result.truth[name], result.mask if name == "depth" else None)
             scores[f"val_{name}_rmse"] = errors.nanmean()
         self.log_dict(scores, batch_size=len(result.coded), sync_dist=True, prog_bar=True)
+        if result.logits is not None:
+            maps = result.logits, result.truth["depth"], result.mask
+            self._held_out.append(tuple(part[..., ::HELD_OUT_STEP, ::HELD_OUT_STEP] for part in maps))
+
+    def on_validation_epoch_start(self) -> None:
+        """Begin to collect distributions of depth of the validation scenes, at a temperature of 1."""
+        self._held_out: list[tuple[Tensor, ...]] = []
+        self._set_temperature(1.0)
+
+    def on_validation_epoch_end(self) -> None:
+        """Fit the temperature of the distribution of depth to the validation scenes."""
+        if self._held_out:
+            self._set_temperature(fit_temperature(*(torch.cat(parts) for parts in zip(*self._held_out, strict=True))))
+            self._held_out.clear()
+
+    def _set_temperature(self, temperature: float) -> None:
+        for module in self.modules():
+            if isinstance(module, LayeredJointHead):
+                module.temperature.fill_(temperature)
 
     def configure_optimizers(self) -> Any:
         """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""

@@ -1,0 +1,180 @@
+"""Depth and image by layers: the capture deconvolved for each depth, blended by the estimated depth, then refined."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_positive
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
+from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.reconstruction.refocused import convolve_layers
+from kornia_tidy.reconstruction.tikhonov import transfer_function
+from kornia_tidy.render.borders import next_fast_size
+
+WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
+REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
+_PLANE = 4  # windows of a PSF; side of the plane in which filters are computed
+
+
+def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
+    r"""Return the filters that deconvolve a capture for each depth, truncated to nearly twice the window of the PSFs.
+
+    .. math:: w_k = \mathcal{F}^{-1} \left[ \frac{\bar{H}_k + \gamma}{|H_k|^2 + \gamma} \right]
+
+    They are :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with the capture as prior. A raised cosine fades them
+    out over the outer half of their radius, and each is scaled to a sum of one, so that white stays white. Truncation
+    bounds the receptive field, so that a picture can be reconstructed in tiles.
+
+    Args:
+        psfs: (L, C, P, P) with P odd, linear light.
+        weight: :math:`\gamma`, positive.
+
+    Returns:
+        (L, C, 2 P - 1, 2 P - 1) in the dtype of ``psfs``; gradients reach the PSFs.
+
+    Raises:
+        ValueError: if the weight is not positive.
+
+    Source: Sitzmann et al., ACM Transactions on Graphics 37(4) 114 (2018), for the closed form.
+
+    Example:
+        >>> point = torch.zeros(1, 1, 3, 3)
+        >>> point[..., 1, 1] = 1.0
+        >>> deconvolution_filters(point)[0, 0, 2].round(decimals=5).abs()
+        tensor([0., 0., 1., 0., 0.])
+    """
+    check_positive("weight", weight)
+    window = psfs.shape[-1]
+    size = next_fast_size(_PLANE * window)
+    transfer = transfer_function(psfs, (size, size))
+    power = transfer.real.square() + transfer.imag.square()
+    filters = torch.fft.irfft2((transfer.conj() + weight) / (power + weight), s=(size, size))
+    filters = filters.roll((window - 1, window - 1), (-2, -1))[..., : 2 * window - 1, : 2 * window - 1]
+    place = torch.arange(1 - window, window, dtype=psfs.dtype, device=psfs.device).abs() / window
+    fade = (0.5 + 0.5 * torch.cos(math.pi * (2 * place - 1).clamp(0, 1))).unsqueeze(-1)
+    filters = filters * fade * fade.mT
+    return filters / filters.sum((-2, -1), keepdim=True)
+
+
+class LayeredJointHead(ReconstructionHead):
+    r"""Estimates depth as a distribution, and the image from the capture deconvolved for each depth.
+
+    One network sees the capture and its brightness deconvolved for each of L depths, and estimates the distribution of
+    depth. The deconvolved captures are blended in linear light by the probabilities p of their depths:
+
+    .. math:: \hat x = \sum_k p_k \, (w_k * y)
+
+    A second network sees the capture, this blend, and mean and standard deviation of the depth, and estimates what the
+    blend lacks. Its last convolution is initialised with zeros: the initial image is the blend.
+
+    Args:
+        depth_network: takes 3 + L channels and returns D classes, evenly spaced over normalised inverse depth.
+        image_network: takes 8 channels, returns 3, and ends in a convolution.
+        layers: number L of depths, at least 2.
+        encoded: captures and images are encoded as sRGB. False: they are linear light.
+
+    Shape:
+        - image: (B, 3, H, W), a capture in [0, 1].
+        - output: (B, D + 3, H, W): the logits of the classes, then the image.
+
+    Raises:
+        ValueError: if a network has other channels, the image's network does not end in a convolution, a bank has
+            another number of layers or colours, or no bank was given before the first image.
+
+    Convention:
+        - The loss of the image does not reach the distribution: probabilities stay those of the depth.
+        - In eval mode logits are divided by ``temperature``, a number in the state that is fitted after training (see
+          :func:`~kornia_tidy.reconstruction.depth_distribution.fit_temperature`). It does not change the image.
+        - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the filters.
+        - The filters are computed by :meth:`set_psfs` from the camera's PSFs and are not part of the state.
+
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes the layers of a closed
+    form; the blend is the posterior mean if depth alone is uncertain.
+
+    Example:
+        >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
+        >>> head = LayeredJointHead(AttentionUNet(3 + 4, 16, 2), AttentionUNet(8, 3, 2), layers=4).eval()
+        >>> head.set_psfs(PSFBank.from_measured(torch.rand(4, 3, 5, 5), torch.arange(4.0)))
+        >>> with torch.no_grad():
+        ...     head(torch.rand(2, 3, 16, 20)).shape
+        torch.Size([2, 19, 16, 20])
+    """
+
+    filters: Tensor
+    temperature: Tensor
+
+    def __init__(
+        self,
+        depth_network: ReconstructionHead,
+        image_network: ReconstructionHead,
+        layers: int = 11,
+        *,
+        encoded: bool = True,
+    ) -> None:
+        check_count("layers", layers, 2)
+        check_count("the number of classes of depth_network", depth_network.out_channels, 2)
+        for name, network, channels in (
+            ("depth_network", depth_network, (3 + layers, depth_network.out_channels)),
+            ("image_network", image_network, (REFINED_FROM, 3)),
+        ):
+            if (network.in_channels, network.out_channels) != channels:
+                raise ValueError(
+                    f"{name} must have {channels[0]} input and {channels[1]} output channels, got "
+                    f"{network.in_channels} and {network.out_channels}"
+                )
+            network.looked = True  # no check of the range, as deconvolved maps leave [0, 1]
+        super().__init__(3, depth_network.out_channels + 3)
+        self.depth_network, self.image_network = depth_network, image_network
+        self.layers, self.encoded = layers, encoded
+        self.stride = math.lcm(depth_network.stride, image_network.stride)
+        self.register_buffer("filters", torch.zeros(0), persistent=False)
+        self.register_buffer("temperature", torch.ones(()))
+        _zero_last_convolution(image_network)
+
+    def set_psfs(self, bank: PSFBank) -> None:
+        """Compute the filters from a camera's PSFs, which are evenly spaced over its range of defocus."""
+        if tuple(bank.psfs.shape[:2]) != (self.layers, 3):
+            raise ValueError(
+                f"a network for {self.layers} layers of 3 colours needs as many PSFs, got {tuple(bank.psfs.shape[:2])}"
+            )
+        self.filters = deconvolution_filters(bank.psfs)
+
+    def predict(self, image: Tensor) -> Tensor:
+        """Return the logits of the depth's classes and the image."""
+        if not self.filters.numel():
+            raise ValueError("the network does not know its camera: call set_psfs(optics.psf_bank(...)) first")
+        capture = image.to(torch.promote_types(image.dtype, self.filters.dtype))
+        deconvolved = convolve_layers(self._to_light(capture), self.filters)
+        brightness = self._from_light(deconvolved).mean(2)
+        logits = self.depth_network(torch.cat([image, brightness.to(image.dtype)], 1))
+        known = logits.detach()
+        weights = layer_weights(known, self.layers)
+        blended = self._from_light((weights.unsqueeze(2) * deconvolved).sum(1)).to(image.dtype)
+        moments = [moment.to(image.dtype) for moment in depth_moments(known)]
+        refined = blended + self.image_network(torch.cat([image, blended, *moments], 1))
+        if not self.training:
+            logits = logits / self.temperature.to(logits.dtype)
+        return torch.cat([logits, refined.to(logits.dtype)], 1)
+
+    def extra_repr(self) -> str:
+        """Return layers, classes and temperature."""
+        return f"layers={self.layers}, classes={self.out_channels - 3}, temperature={self.temperature.item():.3g}"
+
+    def _to_light(self, image: Tensor) -> Tensor:
+        return rgb_to_linear_rgb(image) if self.encoded else image
+
+    def _from_light(self, light: Tensor) -> Tensor:
+        return linear_rgb_to_rgb(light.clamp(0, 1)) if self.encoded else light
+
+
+def _zero_last_convolution(network: nn.Module) -> None:
+    last = list(network.modules())[-1]
+    if not isinstance(last, nn.Conv2d):
+        raise ValueError(f"image_network must end in a convolution, {type(network).__name__} ends in {last}")
+    for parameter in last.parameters():
+        nn.init.zeros_(parameter)
