@@ -37,7 +37,6 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None =
         ImportError: if matplotlib is missing.
     """
     require_matplotlib()
-    from matplotlib import colormaps  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     height, width = depth.shape[-2:]
@@ -51,11 +50,11 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None =
     axes = figure.add_axes(
         ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
     )
-    colors = colormaps[DEPTH_COLORS](place)[..., :3]
+    axes.imshow(place, cmap=DEPTH_COLORS, vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
     if deviation is not None:
-        known = 1 - (12 * deviation[0, ::step, ::step].detach().cpu().square()).clamp(max=1).unsqueeze(-1).numpy()
-        colors = known * colors + (1 - known) * UNKNOWN
-    axes.imshow(colors, interpolation="antialiased", aspect="auto")
+        unknown = (12 * deviation[0, ::step, ::step].detach().cpu().square()).clamp(max=1).numpy()
+        grey = np.full_like(unknown, UNKNOWN)
+        axes.imshow(grey, cmap="gray", vmin=0, vmax=1, alpha=unknown, interpolation="antialiased", aspect="auto")
     axes.set_axis_off()
     depth_bar(figure.add_axes((0.06, 0.26 / (up + below), 0.88, 0.1 / (up + below))), camera)
     if deviation is not None:

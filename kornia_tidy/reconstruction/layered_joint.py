@@ -18,24 +18,25 @@ from kornia_tidy.render.borders import next_fast_size
 
 WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
 REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
-_PLANE = 4  # windows of a PSF; side of the plane in which filters are computed
+_SIDE = 3  # windows of a PSF: side of the filters
+_PLANE = 8  # windows of a PSF: side of the plane in which filters are computed, so that they hardly wrap around
 
 
 def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
-    r"""Return the filters that deconvolve a capture for each depth, truncated to nearly twice the window of the PSFs.
+    r"""Return the filters that deconvolve a capture for each depth, truncated to three times the window of the PSFs.
 
     .. math:: w_k = \mathcal{F}^{-1} \left[ \frac{\bar{H}_k + \gamma}{|H_k|^2 + \gamma} \right]
 
-    They are :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with the capture as prior. A raised cosine fades them
-    out over the outer half of their radius, and each is scaled to a sum of one, so that white stays white. Truncation
-    bounds the receptive field, so that a picture can be reconstructed in tiles.
+    They are :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with the capture as prior. A raised cosine g fades
+    them out over the outer half of their radius, and a multiple of g makes up for the light that is cut off, so that
+    white stays white. Truncation bounds the receptive field, so that a picture can be reconstructed in tiles.
 
     Args:
         psfs: (L, C, P, P) with P odd, linear light.
         weight: :math:`\gamma`, positive.
 
     Returns:
-        (L, C, 2 P - 1, 2 P - 1) in the dtype of ``psfs``; gradients reach the PSFs.
+        (L, C, 3 P, 3 P) in the dtype of ``psfs``; gradients reach the PSFs.
 
     Raises:
         ValueError: if the weight is not positive.
@@ -45,8 +46,8 @@ def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
     Example:
         >>> point = torch.zeros(1, 1, 3, 3)
         >>> point[..., 1, 1] = 1.0
-        >>> deconvolution_filters(point)[0, 0, 2].round(decimals=5).abs()
-        tensor([0., 0., 1., 0., 0.])
+        >>> deconvolution_filters(point)[0, 0, 4].round(decimals=5).abs()
+        tensor([0., 0., 0., 0., 1., 0., 0., 0., 0.])
     """
     check_positive("weight", weight)
     window = psfs.shape[-1]
@@ -54,11 +55,13 @@ def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
     transfer = transfer_function(psfs, (size, size))
     power = transfer.real.square() + transfer.imag.square()
     filters = torch.fft.irfft2((transfer.conj() + weight) / (power + weight), s=(size, size))
-    filters = filters.roll((window - 1, window - 1), (-2, -1))[..., : 2 * window - 1, : 2 * window - 1]
-    place = torch.arange(1 - window, window, dtype=psfs.dtype, device=psfs.device).abs() / window
-    fade = (0.5 + 0.5 * torch.cos(math.pi * (2 * place - 1).clamp(0, 1))).unsqueeze(-1)
-    filters = filters * fade * fade.mT
-    return filters / filters.sum((-2, -1), keepdim=True)
+    side = _SIDE * window
+    filters = filters.roll((side // 2, side // 2), (-2, -1))[..., :side, :side]
+    place = torch.linspace(-1, 1, side + 2, dtype=psfs.dtype, device=psfs.device)[1:-1].abs()
+    fade = (0.5 + 0.5 * torch.cos(math.pi * (2 * place - 1).clamp(min=0))).unsqueeze(-1)
+    fade = fade * fade.mT
+    filters = filters * fade
+    return filters + (1 - filters.sum((-2, -1), keepdim=True)) * (fade / fade.sum())
 
 
 class LayeredJointHead(ReconstructionHead):
