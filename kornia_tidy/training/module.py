@@ -122,6 +122,7 @@ class TidyTraining(pl.LightningModule):
         self.task, self.loss, self.settings = task, loss, settings
         self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
         self.weights = {"depth": depth_weight, "image": image_weight}
+        self._held_out: list[tuple[Tensor, ...]] = []  # distributions of depth of validation scenes, with the truth
 
     @classmethod
     def from_settings(cls, settings: TrainingSettings, *, design: bool = True, progress: bool = False) -> TidyTraining:
@@ -202,7 +203,7 @@ class TidyTraining(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """Begin to collect distributions of depth of the validation scenes, at a temperature of 1."""
-        self._held_out: list[tuple[Tensor, ...]] = []
+        self._held_out.clear()
         self._set_temperature(1.0)
 
     def on_validation_epoch_end(self) -> None:
