@@ -53,7 +53,9 @@ class TestSparsificationCurve(BaseTester):
         prediction, deviation, truth = gaussian()
         curve = sparsification_curve(prediction, deviation, truth, shares=(0.25, 1.0))
         rows = (prediction - truth)[..., : PIXELS // 4, :]
-        self.assert_close(curve, torch.stack([rows.square().mean().sqrt(), (prediction - truth).square().mean().sqrt()]))
+        self.assert_close(
+            curve, torch.stack([rows.square().mean().sqrt(), (prediction - truth).square().mean().sqrt()])
+        )
 
     def test_exception(self):
         maps = [torch.rand(1, 1, 2, 3)] * 3
