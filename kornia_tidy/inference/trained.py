@@ -77,7 +77,7 @@ def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
     if settings.depth_classes:
         return LayeredJointHead(
-            make_head(settings.head, settings.depth_classes, settings.width, 3 + settings.refocus),
+            make_head(settings.head, settings.depth_classes, settings.width, 3 + 2 * settings.refocus),
             make_head(settings.head, 3, settings.width, REFINED_FROM),
             settings.refocus,
             encoded=settings.encoded,

@@ -68,6 +68,25 @@ def layer_weights(logits: Tensor, layers: int) -> Tensor:
         return torch.einsum("lk,bkhw->blhw", soft_targets(centres, layers)[0, :, 0], probabilities)
 
 
+def interpolated_classes(maps: Tensor, classes: int) -> Tensor:
+    """Return maps of evenly spaced layers, linearly interpolated to classes over the same range.
+
+    Args:
+        maps: (B, L, H, W).
+        classes: number D, at least 2.
+
+    Returns:
+        (B, D, H, W).
+
+    Example:
+        >>> interpolated_classes(torch.tensor([0.0, 1.0]).view(1, 2, 1, 1), 3).flatten()
+        tensor([0.0000, 0.5000, 1.0000])
+    """
+    centres = torch.linspace(0, 1, classes, dtype=maps.dtype, device=maps.device).view(1, 1, 1, -1)
+    with torch.autocast(maps.device.type, enabled=False):
+        return torch.einsum("lk,blhw->bkhw", soft_targets(centres, maps.shape[1])[0, :, 0], maps)
+
+
 def soft_targets(depth: Tensor, classes: int) -> Tensor:
     """Return the distribution of a known depth: the two nearest classes, weighted so that their mean is the depth.
 

@@ -10,16 +10,17 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
+from kornia_tidy.reconstruction.depth_distribution import depth_moments, interpolated_classes, layer_weights
+from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
 from kornia_tidy.reconstruction.refocused import convolve_layers
 from kornia_tidy.reconstruction.tikhonov import transfer_function
-from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 
 WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
+SHARPNESS = 2.0  # temperature of the likelihood in closed form, whose scene is simpler than real ones
+LEAST = -12.0  # of the logarithm of a likelihood: no depth is excluded for certain
 REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
-_SIDE = 3  # windows of a PSF: side of the filters
-_PLANE = 8  # windows of a PSF: side of the plane in which filters are computed, so that they hardly wrap around
 
 
 def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
@@ -27,9 +28,8 @@ def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
 
     .. math:: w_k = \mathcal{F}^{-1} \left[ \frac{\bar{H}_k + \gamma}{|H_k|^2 + \gamma} \right]
 
-    They are :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with the capture as prior. A raised cosine g fades
-    them out over the outer half of their radius, and a multiple of g makes up for the light that is cut off, so that
-    white stays white. Truncation bounds the receptive field, so that a picture can be reconstructed in tiles.
+    They are :func:`~kornia_tidy.reconstruction.tikhonov.tikhonov` with the capture as prior. Truncation keeps their sum
+    of one, so that white stays white, and bounds the receptive field, so that a picture can be reconstructed in tiles.
 
     Args:
         psfs: (L, C, P, P) with P odd, linear light.
@@ -50,33 +50,28 @@ def deconvolution_filters(psfs: Tensor, weight: float = WEIGHT) -> Tensor:
         tensor([0., 0., 0., 0., 1., 0., 0., 0., 0.])
     """
     check_positive("weight", weight)
-    window = psfs.shape[-1]
-    size = next_fast_size(_PLANE * window)
+    size = plane_of(psfs)
     transfer = transfer_function(psfs, (size, size))
     power = transfer.real.square() + transfer.imag.square()
     filters = torch.fft.irfft2((transfer.conj() + weight) / (power + weight), s=(size, size))
-    side = _SIDE * window
-    filters = filters.roll((side // 2, side // 2), (-2, -1))[..., :side, :side]
-    place = torch.linspace(-1, 1, side + 2, dtype=psfs.dtype, device=psfs.device)[1:-1].abs()
-    fade = (0.5 + 0.5 * torch.cos(math.pi * (2 * place - 1).clamp(min=0))).unsqueeze(-1)
-    fade = fade * fade.mT
-    filters = filters * fade
-    return filters + (1 - filters.sum((-2, -1), keepdim=True)) * (fade / fade.sum())
+    return truncated(filters, SIDE * psfs.shape[-1])
 
 
 class LayeredJointHead(ReconstructionHead):
     r"""Estimates depth as a distribution, and the image from the capture deconvolved for each depth.
 
-    One network sees the capture and its brightness deconvolved for each of L depths, and estimates the distribution of
-    depth. The deconvolved captures are blended in linear light by the probabilities p of their depths:
+    One network sees the capture, its brightness deconvolved for each of L depths, and the likelihood of these depths in
+    closed form. It estimates what the logarithm of the likelihood lacks; its last convolution is initialised with
+    zeros. The deconvolved captures are blended in linear light by the probabilities p of their depths:
 
     .. math:: \hat x = \sum_k p_k \, (w_k * y)
 
     A second network sees the capture, this blend, and mean and standard deviation of the depth, and estimates what the
-    blend lacks. Its last convolution is initialised with zeros: the initial image is the blend.
+    blend lacks, initially nothing.
 
     Args:
-        depth_network: takes 3 + L channels and returns D classes, evenly spaced over normalised inverse depth.
+        depth_network: takes 3 + 2 L channels, returns D classes, evenly spaced over normalised inverse depth, and ends
+            in a convolution.
         image_network: takes 8 channels, returns 3, and ends in a convolution.
         layers: number L of depths, at least 2.
         encoded: captures and images are encoded as sRGB. False: they are linear light.
@@ -86,8 +81,8 @@ class LayeredJointHead(ReconstructionHead):
         - output: (B, D + 3, H, W): the logits of the classes, then the image.
 
     Raises:
-        ValueError: if a network has other channels, the image's network does not end in a convolution, a bank has
-            another number of layers or colours, or no bank was given before the first image.
+        ValueError: if a network has other channels or does not end in a convolution, a bank has another number of
+            layers or colours, or no bank was given before the first image.
 
     Convention:
         - The loss of the image does not reach the distribution: probabilities stay those of the depth.
@@ -97,11 +92,12 @@ class LayeredJointHead(ReconstructionHead):
         - The filters are computed by :meth:`set_psfs` from the camera's PSFs and are not part of the state.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes the layers of a closed
-    form; the blend is the posterior mean if depth alone is uncertain.
+    form; the blend is the posterior mean if depth alone is uncertain. For the likelihood see
+    :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`.
 
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet
-        >>> head = LayeredJointHead(AttentionUNet(3 + 4, 16, 2), AttentionUNet(8, 3, 2), layers=4).eval()
+        >>> head = LayeredJointHead(AttentionUNet(3 + 2 * 4, 16, 2), AttentionUNet(8, 3, 2), layers=4).eval()
         >>> head.set_psfs(PSFBank.from_measured(torch.rand(4, 3, 5, 5), torch.arange(4.0)))
         >>> with torch.no_grad():
         ...     head(torch.rand(2, 3, 16, 20)).shape
@@ -109,6 +105,8 @@ class LayeredJointHead(ReconstructionHead):
     """
 
     filters: Tensor
+    whitening: Tensor
+    log_determinants: Tensor
     temperature: Tensor
 
     def __init__(
@@ -122,7 +120,7 @@ class LayeredJointHead(ReconstructionHead):
         check_count("layers", layers, 2)
         check_count("the number of classes of depth_network", depth_network.out_channels, 2)
         for name, network, channels in (
-            ("depth_network", depth_network, (3 + layers, depth_network.out_channels)),
+            ("depth_network", depth_network, (3 + 2 * layers, depth_network.out_channels)),
             ("image_network", image_network, (REFINED_FROM, 3)),
         ):
             if (network.in_channels, network.out_channels) != channels:
@@ -130,14 +128,15 @@ class LayeredJointHead(ReconstructionHead):
                     f"{name} must have {channels[0]} input and {channels[1]} output channels, got "
                     f"{network.in_channels} and {network.out_channels}"
                 )
+            _zero_last_convolution(name, network)
             network.looked = True  # no check of the range, as deconvolved maps leave [0, 1]
         super().__init__(3, depth_network.out_channels + 3)
         self.depth_network, self.image_network = depth_network, image_network
         self.layers, self.encoded = layers, encoded
         self.stride = math.lcm(depth_network.stride, image_network.stride)
-        self.register_buffer("filters", torch.zeros(0), persistent=False)
+        for name in ("filters", "whitening", "log_determinants"):
+            self.register_buffer(name, torch.zeros(0), persistent=False)
         self.register_buffer("temperature", torch.ones(()))
-        _zero_last_convolution(image_network)
 
     def set_psfs(self, bank: PSFBank) -> None:
         """Compute the filters from a camera's PSFs, which are evenly spaced over its range of defocus."""
@@ -146,15 +145,20 @@ class LayeredJointHead(ReconstructionHead):
                 f"a network for {self.layers} layers of 3 colours needs as many PSFs, got {tuple(bank.psfs.shape[:2])}"
             )
         self.filters = deconvolution_filters(bank.psfs)
+        self.whitening, self.log_determinants = likelihood_filters(bank.psfs.mean(1))
 
     def predict(self, image: Tensor) -> Tensor:
         """Return the logits of the depth's classes and the image."""
         if not self.filters.numel():
             raise ValueError("the network does not know its camera: call set_psfs(optics.psf_bank(...)) first")
         capture = image.to(torch.promote_types(image.dtype, self.filters.dtype))
-        deconvolved = convolve_layers(self._to_light(capture), self.filters)
-        brightness = self._from_light(deconvolved).mean(2)
-        logits = self.depth_network(torch.cat([image, brightness.to(image.dtype)], 1))
+        light = self._to_light(capture)
+        deconvolved = convolve_layers(light, self.filters)
+        fits = depth_likelihood(light.mean(1, keepdim=True), self.whitening, self.log_determinants) / SHARPNESS
+        fits = fits.clamp(min=LEAST)
+        seen = torch.cat([self._from_light(deconvolved).mean(2), 1 - fits / LEAST], 1).to(image.dtype)
+        logits = self.depth_network(torch.cat([image, seen], 1))
+        logits = logits + interpolated_classes(fits, logits.shape[1]).to(logits.dtype)
         known = logits.detach()
         weights = layer_weights(known, self.layers)
         blended = self._from_light((weights.unsqueeze(2) * deconvolved).sum(1)).to(image.dtype)
@@ -175,9 +179,9 @@ class LayeredJointHead(ReconstructionHead):
         return linear_rgb_to_rgb(light.clamp(0, 1)) if self.encoded else light
 
 
-def _zero_last_convolution(network: nn.Module) -> None:
+def _zero_last_convolution(name: str, network: nn.Module) -> None:
     last = list(network.modules())[-1]
     if not isinstance(last, nn.Conv2d):
-        raise ValueError(f"image_network must end in a convolution, {type(network).__name__} ends in {last}")
+        raise ValueError(f"{name} must end in a convolution, {type(network).__name__} ends in {last}")
     for parameter in last.parameters():
         nn.init.zeros_(parameter)

@@ -59,7 +59,7 @@ class TestSparsificationCurve(BaseTester):
 
     def test_exception(self):
         maps = [torch.rand(1, 1, 2, 3)] * 3
-        with pytest.raises(ValueError, match="shares must be above 0 and at most 1, got 1.5"):
+        with pytest.raises(ValueError, match=r"shares must be above 0 and at most 1, got 1\.5"):
             sparsification_curve(*maps, shares=(0.5, 1.5))
         with pytest.raises(ValueError, match="there are none"):
             sparsification_curve(*maps, torch.zeros(1, 1, 2, 3, dtype=torch.bool), shares=(0.5,))
