@@ -18,7 +18,7 @@ from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 
 WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
-SHARPNESS = 2.0  # temperature of the likelihood in closed form, whose scene is simpler than real ones
+SHARPNESS = 8.0  # temperature of the likelihood in closed form, whose scene is simpler than real ones
 LEAST = -12.0  # of the logarithm of a likelihood: no depth is excluded for certain
 REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
 
@@ -154,8 +154,7 @@ class LayeredJointHead(ReconstructionHead):
         capture = image.to(torch.promote_types(image.dtype, self.filters.dtype))
         light = self._to_light(capture)
         deconvolved = convolve_layers(light, self.filters)
-        fits = depth_likelihood(light.mean(1, keepdim=True), self.whitening, self.log_determinants) / SHARPNESS
-        fits = fits.clamp(min=LEAST)
+        fits = self._fits(light)
         seen = torch.cat([self._from_light(deconvolved).mean(2), 1 - fits / LEAST], 1).to(image.dtype)
         logits = self.depth_network(torch.cat([image, seen], 1))
         logits = logits + interpolated_classes(fits, logits.shape[1]).to(logits.dtype)
@@ -167,6 +166,15 @@ class LayeredJointHead(ReconstructionHead):
         if not self.training:
             logits = logits / self.temperature.to(logits.dtype)
         return torch.cat([logits, refined.to(logits.dtype)], 1)
+
+    def closed_form_logits(self, light: Tensor) -> Tensor:
+        """Return the logits of the classes by the likelihood in closed form alone, from linear light (B, 3, H, W)."""
+        return interpolated_classes(self._fits(light), self.out_channels - 3)
+
+    def _fits(self, light: Tensor) -> Tensor:
+        """Return how well each layer fits, (B, L, H, W), from ``LEAST`` to 0."""
+        fits = depth_likelihood(light.mean(1, keepdim=True), self.whitening, self.log_determinants)
+        return (fits / SHARPNESS).clamp(min=LEAST)
 
     def extra_repr(self) -> str:
         """Return layers, classes and temperature."""
