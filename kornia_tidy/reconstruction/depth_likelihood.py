@@ -17,6 +17,8 @@ from kornia_tidy.render.borders import pad_border
 CONTRASTS = (0.02, 0.06, 0.2)  # standard deviations of the light of a scene, of full scale
 NOISE = 4e-3  # standard deviation of what the model leaves out, of full scale: sensor noise, depth edges
 EXPONENT, KNEE = 2.9, 1 / 256  # of the power spectrum of real scenes in linear light: f^-2.9 above 1/256 cycles a pixel
+# Its integral over the circle of half a cycle a pixel; over a plane of a few PSFs it would not be resolved.
+VARIANCE = math.pi / (EXPONENT / 2 - 1) * (KNEE ** (2 - EXPONENT) - (0.25 + KNEE**2) ** (1 - EXPONENT / 2))
 PATCH = 2.5  # pixels, standard deviation of the Gaussian window of a patch
 _SPARE = 0.5  # of the samples of a patch that count, as its pixels are not independent after truncation
 
@@ -48,8 +50,7 @@ def likelihood_filters(psfs: Tensor, noise: float = NOISE) -> tuple[Tensor, Tens
     if size % 2 == 0:
         share[-1] = 1.0
     share = (share / size**2).expand(size, -1)
-    spectrum = (rows.square() + columns.square() + KNEE**2) ** (-EXPONENT / 2)
-    spectrum = spectrum / (spectrum * share).sum()
+    spectrum = 1 / VARIANCE * (rows.square() + columns.square() + KNEE**2) ** (-EXPONENT / 2)
     contrasts = torch.tensor(CONTRASTS, dtype=psfs.dtype, device=psfs.device).view(-1, 1, 1, 1)
     power = (transfer.real.square() + transfer.imag.square()) * spectrum
     power = (contrasts.square() * power + noise**2).flatten(0, 1)

@@ -18,7 +18,7 @@ from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 
 WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
-SHARPNESS = 8.0  # temperature of the likelihood in closed form, whose scene is simpler than real ones
+SHARPNESS = 8.0  # temperature of the likelihood in closed form, which takes patches for uniform in depth
 LEAST = -12.0  # of the logarithm of a likelihood: no depth is excluded for certain
 REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
 
