@@ -24,7 +24,7 @@ from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
-HELD_OUT_STEP = 4  # of the pixels in a row, and of the rows, to which the temperature is fitted
+HELD_OUT_STEP = 4  # pixels between two to which the temperature is fitted, in a row and in a column
 
 
 class BatchResult(NamedTuple):

@@ -69,7 +69,7 @@ def told(logits, **options):
 
 
 def stirred(**options):
-    """A head whose logits and refinement are not small, as if it had been trained."""
+    """A head with the large logits and refinement of a trained one."""
     head = layered(**options)
     for network in (head.depth_network, head.image_network):
         nn.init.normal_(network.layers[-1].weight, std=0.5, generator=torch.Generator().manual_seed(0))
@@ -77,7 +77,7 @@ def stirred(**options):
 
 
 def scene():
-    """A texture with the spectrum of real scenes, the upper half of which is near, and its capture in linear light."""
+    """A texture with the spectrum of real scenes, near in its upper half, and its capture in linear light."""
     noise = torch.randn(1, 3, 60, 64, generator=torch.Generator().manual_seed(0))
     frequency = (torch.fft.fftfreq(60)[:, None].square() + torch.fft.rfftfreq(64).square()).sqrt()
     image = torch.fft.irfft2(torch.fft.rfft2(noise) * (frequency + 1 / 64) ** -1.45, s=(60, 64))

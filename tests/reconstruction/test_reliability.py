@@ -1,4 +1,4 @@
-"""Reliability and sparsification curves: on noise whose deviation is known, and by hand."""
+"""Reliability and sparsification curves of noise with known deviation."""
 
 from __future__ import annotations
 
