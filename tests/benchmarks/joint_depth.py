@@ -37,6 +37,7 @@ from kornia_tidy.reconstruction.depth_distribution import (
     fit_temperature,
     soft_targets,
 )
+from kornia_tidy.reconstruction.head import border_padding
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
@@ -168,6 +169,8 @@ def score(path: Path, count: int | None) -> None:
         capture, image = sample["image"], sample["all_in_focus"]
         truth, known = normalised_inverse_depth(optics.camera, sample["depth"]), scene["mask"][None]
         output = head(capture)
+        (left, _, top, _), _ = border_padding((capture.shape[-2], capture.shape[-1]), head.stride)
+        blend = blends.pop()[..., top : top + capture.shape[-2], left : left + capture.shape[-1]]
         logits = depth_logits("joint", output)
         assert logits is not None
         depth, deviation = depth_moments(logits)
@@ -182,7 +185,7 @@ def score(path: Path, count: int | None) -> None:
             {
                 "image, capture": psnr(capture, image).item(),
                 "image, blend by true depth": psnr(linear_rgb_to_rgb(by_truth.clamp(0, 1)), image).item(),
-                "image, blend by estimate": psnr(blends.pop(), image).item(),
+                "image, blend by estimate": psnr(blend, image).item(),
                 "image, refined": psnr(output[:, -3:].clamp(0, 1), image).item(),
                 **{
                     f"depth RMSE {where}, {name}": rmse(maps, truth, mask).item()
