@@ -70,7 +70,7 @@ def draw_reliability(estimates: Mapping[str, Reliability]) -> Figure:
         axes.set_xlabel(across, fontsize=LABEL, color=INK)
         axes.set_ylabel(up, fontsize=LABEL, color=INK)
         axes.legend(fontsize=SMALL, frameon=False, loc="upper left")
-    figure.text(0.025, 0.93, "Does the depth know how uncertain it is?", fontsize=TITLE, color=INK, weight="bold")
+    figure.text(0.025, 0.93, "Reliability of the estimated depth", fontsize=TITLE, color=INK, weight="bold")
     band = f"bins of equally many pixels; band: found within {WITHIN:.0%} of predicted"
     figure.text(0.975, 0.935, band, fontsize=SMALL, color=FAINT, ha="right")
     return figure
