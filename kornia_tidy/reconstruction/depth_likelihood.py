@@ -20,6 +20,8 @@ EXPONENT, KNEE = 2.9, 1 / 256  # of the power spectrum of real scenes in linear 
 # Its integral over the circle of half a cycle a pixel; over a plane of a few PSFs it would not be resolved.
 VARIANCE = math.pi / (EXPONENT / 2 - 1) * (KNEE ** (2 - EXPONENT) - (0.25 + KNEE**2) ** (1 - EXPONENT / 2))
 PATCH = 2.5  # pixels, standard deviation of the Gaussian window of a patch
+LARGEST = 25.0  # of the energy of a sample, whose mean is 1: an edge that no depth explains does not decide alone
+MEAN = 0.3  # light of a scene, of full scale
 _SPARE = 0.5  # of the samples of a patch that count, as its pixels are not independent after truncation
 
 
@@ -65,7 +67,7 @@ def depth_likelihood(light: Tensor, filters: Tensor, log_determinants: Tensor) -
                 \big[ ( (g_{ak} * y)^2 * w )(x) + \ell_{ak} \big] \Big)
 
     It is that of a Gaussian scene of unknown contrast, whose patch w of N samples is at one depth. On a blank wall all
-    depths are about equally likely.
+    depths are about equally likely. Squares are limited to 25.
 
     Args:
         light: y, (B, 1, H, W), brightness of a capture in linear light.
@@ -85,7 +87,7 @@ def depth_likelihood(light: Tensor, filters: Tensor, log_determinants: Tensor) -
         >>> depth_likelihood(torch.rand(1, 1, 20, 30), *likelihood_filters(psfs)).shape
         torch.Size([1, 4, 20, 30])
     """
-    energy = convolve_layers(light, filters.unsqueeze(1)).squeeze(2).square()
+    energy = convolve_layers(light - MEAN, filters.unsqueeze(1)).squeeze(2).square().clamp(max=LARGEST)
     samples = _SPARE * 2 * math.pi * PATCH**2
     fit = -0.5 * samples * (_patch_mean(energy) + log_determinants.view(-1, 1, 1))
     likelihood = fit.unflatten(1, (len(CONTRASTS), -1)).logsumexp(1)
