@@ -34,7 +34,7 @@ from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
 
 if TYPE_CHECKING:
-    from kornia_tidy.inference.light_head import LightHead, Reconstruction
+    from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
 
 DESCRIPTION = """\
 Reconstruct captures of any size with a trained network, tile by tile within a memory
@@ -44,8 +44,13 @@ JPEG, NPY). For each FILE, FOLDER gets
   FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
   FILE_depth.pfm, .npy    depth in metres, float32, infinity kept
   FILE_depth_colors.png   depth in colours, with a scale in metres
+  FILE_deviation.png      uncertainty of the depth: its standard deviation, in multiples
+  FILE_deviation.pfm      of --depth-unit or in metres; 65535 or infinity where nothing
+  FILE_deviation.npy      bounds the distance: far away, or depth unknown
 as far as the network estimates them, and FILE.json with the settings, which is written
-last. Files are written atomically.
+last. Files are written atomically. A network that tells the uncertainty (trained with
+--depth-classes) also makes FILE_depth_colors.png grey where the depth is unknown, as on
+blank walls.
 
 A network fits the camera that it was trained with, so HEAD must be trained with the
 masks and lens of the captures. The library includes edof-5, edof-1 (five masks, one
@@ -74,6 +79,7 @@ Exit status 2 if any file failed; the others are reconstructed all the same.
 
 PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".pfm", ".pgm", ".ppm"}
 PREVIEW_DPI = 150
+SMALLEST_DEVIATION = 1e-9  # m
 
 
 class Row(NamedTuple):
@@ -124,7 +130,7 @@ def run(args: argparse.Namespace) -> None:
     weights = head_file(args.head)
     system = load_trained(weights)
     head = LightHead(system).to(torch.device(args.device))
-    suffixes = result_suffixes(system.settings.task, args.format)
+    suffixes = result_suffixes(system.settings.task, args.format, uncertain=head.uncertain)
     if "_depth_colors.png" in suffixes:
         require_matplotlib()
     folder = Path(args.output)
@@ -178,8 +184,13 @@ def head_file(head: str) -> Path:
     return Path(head)
 
 
-def result_suffixes(task: str, picture: str) -> list[str]:
+def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list[str]:
     """Return the suffixes of a file's results; the last result is written when all others exist.
+
+    Args:
+        task: of the network.
+        picture: ``--format``.
+        uncertain: whether the network estimates the uncertainty of depth.
 
     Example:
         >>> result_suffixes("edof", "tiff")
@@ -187,7 +198,8 @@ def result_suffixes(task: str, picture: str) -> list[str]:
     """
     image = [SUFFIXES[picture], ".jpg"] if "image" in MAPS[task] else []
     depth = ["_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png"] if "depth" in MAPS[task] else []
-    return [*image, *depth, ".json"]
+    deviation = ["_deviation.png", "_deviation.pfm", "_deviation.npy"] if uncertain else []
+    return [*image, *depth, *deviation, ".json"]
 
 
 def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any]]:
@@ -203,23 +215,33 @@ def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[T
 
 def write_results(
     paths: list[Path],
-    result: Reconstruction,
+    result: Reconstruction | UncertainReconstruction,
     upright: Callable[[Tensor], Tensor],
     info: dict[str, Any],
     head: LightHead,
     depth_unit: float,
 ) -> tuple[int, int]:
     """Write pictures and depth with their suffixes; return columns and rows."""
+    from kornia_tidy.inference import light_head  # noqa: PLC0415
+
     image = None if result.image is None else upright(result.image)
     depth = None if result.depth is None else upright(result.depth)
+    deviation = unknown = None
+    if isinstance(result, light_head.UncertainReconstruction):
+        # A depth file holds no zero.
+        deviation = upright(result.deviation).clamp(min=SMALLEST_DEVIATION)
+        unknown = upright(result.relative_deviation)
     for path in paths:
         if path.name.endswith("_depth_colors.png"):
             assert depth is not None
             drawn = BytesIO()
-            draw_depth(depth, head.camera).savefig(drawn, format="png", dpi=PREVIEW_DPI)
+            draw_depth(depth, head.camera, unknown).savefig(drawn, format="png", dpi=PREVIEW_DPI)
             write_bytes(path, drawn.getvalue())
         elif path.stem.endswith("_depth") and depth is not None:
             write_depth(path, depth, depth_unit if path.suffix == ".png" else 1.0, saturate=True)
+        elif path.stem.endswith("_deviation"):
+            assert deviation is not None
+            write_depth(path, deviation, depth_unit if path.suffix == ".png" else 1.0, saturate=True)
         elif path.suffix != ".json":
             assert image is not None
             write_image(path, image, 8 if path.suffix == ".jpg" else 16, info)
@@ -325,6 +347,8 @@ def _in_words(head: LightHead, args: argparse.Namespace) -> dict[str, str]:
         words["image"] = "all in focus, 16 bits, encoded as sRGB"
     if "depth" in MAPS[head.task]:
         words["depth_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or farther"
+        if head.uncertain:
+            words["deviation_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or more, or unbounded"
         words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
     return words
 

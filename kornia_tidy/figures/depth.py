@@ -9,23 +9,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.figures.style import DEPTH_COLORS, quiet, require_matplotlib
+from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, SMALL, quiet, require_matplotlib
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+UNKNOWN = 0.6  # grey of a pixel without known depth, of white
 LONGER_SIDE = 12.0  # inches; 150 dots an inch make 1800 pixels
 TICK_DEPTHS = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 7, 10, 20, 50, math.inf)  # m
 
 
-def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
-    """Draw a depth map in colours linear in inverse depth, with a colour bar in metres.
+def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None = None) -> Figure:
+    """Draw a depth map in colours linear in inverse depth, with a colour bar in metres, grey where it is unknown.
 
     Args:
         depth: (1, H, W) in metres, may be infinite; depths beyond the camera's range have the colours of its ends.
         camera: its depth range is that of the colour bar.
+        deviation: (1, H, W), standard deviation of the normalised inverse depth. Colours fade to grey as its square
+            reaches that of a depth of which nothing is known, 1/12. None: no pixel is grey.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes its longer side 1800 pixels, the bar not counted.
@@ -48,8 +51,14 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera) -> Figure:
         ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
     )
     axes.imshow(place, cmap=DEPTH_COLORS, vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
+    if deviation is not None:
+        unknown = (12 * deviation[0, ::step, ::step].detach().cpu().square()).clamp(max=1).numpy()
+        grey = np.full_like(unknown, UNKNOWN)
+        axes.imshow(grey, cmap="gray", vmin=0, vmax=1, alpha=unknown, interpolation="antialiased", aspect="auto")
     axes.set_axis_off()
     depth_bar(figure.add_axes((0.06, 0.26 / (up + below), 0.88, 0.1 / (up + below))), camera)
+    if deviation is not None:
+        figure.text(0.06, 0.38 / (up + below), "grey: unknown", fontsize=SMALL, color=FAINT, va="bottom")
     return figure
 
 

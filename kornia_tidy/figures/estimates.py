@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 ERROR_SCALE = 3.0  # factor on error maps, so that small errors are visible
 COLUMN, MARGIN = 2.3, 0.3  # inches
 HEADINGS = ("the scene", "capture", "all-in-focus estimate", "its error, x3", "depth estimate", "its error, x3")
+PREDICTED = "the error it predicts, x3"
 
 
 class Estimate(NamedTuple):
@@ -27,6 +28,8 @@ class Estimate(NamedTuple):
     capture: Tensor
     image: Tensor
     inverse_depth: Tensor | None
+    deviation: Tensor | None = None
+    """Standard deviation of ``inverse_depth``, if the network tells it."""
 
     def scores(self, image: Tensor, inverse_depth: Tensor, known: Tensor | None = None) -> dict[str, float]:
         """Return PSNR (dB) of capture and image, SSIM of the image, and RMSE of the known normalised inverse depth."""
@@ -47,7 +50,8 @@ def draw_estimates(
 ) -> Figure:
     """Draw one row for each camera: the capture, the estimated image and depth, and error maps.
 
-    The depth columns of a network without depth estimate stay empty.
+    The depth columns of a network without depth estimate stay empty. If a network tells the standard deviation of its
+    depth, a last column shows it beside the error, at the same scale.
 
     Args:
         image: the scene in focus, (3, H, W) in [0, 1].
@@ -69,10 +73,11 @@ def draw_estimates(
 
     if len(estimates) < 2:
         raise ValueError(f"the picture compares two estimates or more, got {len(estimates)}")
+    headings = HEADINGS if all(estimate.deviation is None for estimate in estimates) else (*HEADINGS, PREDICTED)
     row = COLUMN * image.shape[-2] / image.shape[-1] + 0.35
     height = 0.7 + row * len(estimates)
-    figure = Figure(figsize=(len(HEADINGS) * COLUMN + 2 * MARGIN, height), facecolor="white")
-    axes = figure.subplots(len(estimates), len(HEADINGS), squeeze=False)
+    figure = Figure(figsize=(len(headings) * COLUMN + 2 * MARGIN, height), facecolor="white")
+    axes = figure.subplots(len(estimates), len(headings), squeeze=False)
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
     figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus, and how far it is", fontsize=14)
     legend = (
@@ -91,10 +96,12 @@ def draw_estimates(
                 (_in_colors(estimate.inverse_depth), f"RMSE {scores['depth_rmse']:.3f} of the range"),
                 ((estimate.inverse_depth - inverse_depth).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
             ]
+        if estimate.deviation is not None:
+            pictures.append((estimate.deviation.expand(3, -1, -1) * ERROR_SCALE, ""))
         for empty in axes[y][1 + len(pictures) :]:
             empty.set_axis_off()
         for x, (picture, words) in enumerate(pictures, start=1):
-            _show(axes[y][x], picture, words, HEADINGS[x] if y == 0 else "")
+            _show(axes[y][x], picture, words, headings[x] if y == 0 else "")
         axes[y][1].text(
             0.03,
             0.95,
@@ -108,7 +115,7 @@ def draw_estimates(
         )
         scene = (image, "") if y == 0 else (_in_colors(inverse_depth), "its depth; bright is near")
         if y < 2:
-            _show(axes[y][0], *scene, HEADINGS[0] if y == 0 else "")
+            _show(axes[y][0], *scene, headings[0] if y == 0 else "")
         else:
             axes[y][0].set_axis_off()
     return figure

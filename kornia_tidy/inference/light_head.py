@@ -12,10 +12,11 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
-from kornia_tidy.inference.tasks import MAPS, metres, split_maps
+from kornia_tidy.inference.tasks import MAPS, depth_logits, deviation_in_metres, metres, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.closed_form import whole_picture
+from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.tiled import reconstruct_tiled
 
@@ -27,6 +28,20 @@ class Reconstruction(NamedTuple):
     """All-in-focus image, (3, H, W) in [0, 1], encoded as sRGB."""
     depth: Tensor | None
     """Depth in metres, (1, H, W); may be infinite."""
+
+
+class UncertainReconstruction(NamedTuple):
+    """A :class:`Reconstruction` by a system that estimates how uncertain its depth is."""
+
+    image: Tensor
+    """As in :class:`Reconstruction`."""
+    depth: Tensor
+    """As in :class:`Reconstruction`."""
+    deviation: Tensor
+    """Standard deviation of the depth in metres, (1, H, W); infinite where the depth may be infinite, see
+    :func:`~kornia_tidy.inference.tasks.deviation_in_metres`."""
+    relative_deviation: Tensor
+    """The same in parts of the range, of normalised inverse depth: 0.29 where nothing is known."""
 
 
 class LightHead(nn.Module):
@@ -43,7 +58,7 @@ class LightHead(nn.Module):
     Shape:
         - light: (B, 3, H, W) or (B, 1, H, W), linear; black is 0 and saturation 1; other values are clipped.
         - output: the maps of the task, in the order of :data:`~kornia_tidy.inference.tasks.MAPS`: the image encoded as
-          sRGB, depth as normalised inverse depth.
+          sRGB, depth as normalised inverse depth; then its standard deviation, if the network is ``uncertain``.
 
     Raises:
         TypeError: if the camera has no metric scale.
@@ -63,15 +78,19 @@ class LightHead(nn.Module):
         self.task = system.settings.task
         self.camera = system.optics.camera
         self.encoded = system.optics.color_space == "srgb"
+        self.uncertain = system.settings.depth_classes > 0
         self.eval()
 
     def forward(self, light: Tensor) -> tuple[Tensor, ...]:
         """Return the maps."""
         light = light.clamp(0, 1).expand(-1, 3, -1, -1)
         capture = linear_rgb_to_rgb(light) if self.encoded else light
-        maps = split_maps(self.task, self.head(capture) if self.noise is None else self.head(capture, noise=self.noise))
+        output = self.head(capture) if self.noise is None else self.head(capture, noise=self.noise)
+        maps = split_maps(self.task, output)
         if "image" in maps and not self.encoded:
             maps["image"] = linear_rgb_to_rgb(maps["image"].clamp(0, 1))
+        if (logits := depth_logits(self.task, output)) is not None:
+            return (*maps.values(), depth_moments(logits)[1])
         return tuple(maps.values())
 
 
@@ -81,8 +100,8 @@ def reconstruct_light(
     *,
     memory_budget: int = 512 << 20,
     progress: Callable[[int, int], object] | None = None,
-) -> Reconstruction:
-    """Reconstruct image and depth from a capture of any size.
+) -> Reconstruction | UncertainReconstruction:
+    """Reconstruct image and depth from a capture of any size, and the uncertainty of depth if the network tells it.
 
     Args:
         head: a trained network.
@@ -101,11 +120,16 @@ def reconstruct_light(
     colours = light.expand(3, -1, -1)[None]
     with whole_picture(head, colours):
         maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
-    named = {name: part[0].float() for name, part in zip(MAPS[head.task], maps, strict=True)}
+    names = [*MAPS[head.task], *(["deviation"] if head.uncertain else [])]
+    named = {name: part[0].float() for name, part in zip(names, maps, strict=True)}
     image, near = named.get("image"), named.get("depth")
     if image is not None:
         image.clamp_(0, 1)
-    return Reconstruction(image, None if near is None else metres(head.camera, near))
+    if image is None or near is None or not head.uncertain:
+        return Reconstruction(image, None if near is None else metres(head.camera, near))
+    deviation = named["deviation"]
+    in_metres = deviation_in_metres(head.camera, near, deviation)
+    return UncertainReconstruction(image, metres(head.camera, near), in_metres, deviation)
 
 
 def reconstruct_opencv(
@@ -126,7 +150,7 @@ def reconstruct_opencv(
     light = from_opencv(picture)
     if not linear:
         light = rgb_to_linear_rgb(light.expand(3, -1, -1))
-    image, depth = reconstruct_light(head, light, memory_budget=memory_budget)
+    image, depth, *_ = reconstruct_light(head, light, memory_budget=memory_budget)
     return (
         None if image is None else to_opencv(image, picture.dtype),
         None if depth is None else depth[0].numpy(),

@@ -56,6 +56,9 @@ class SystemSettings:
             best of them, see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
         refocus: number of depths that the capture is refocused to before it enters the network, see
             :class:`~kornia_tidy.reconstruction.Refocused`. 0: none.
+        depth_classes: classes of a distribution of depth, for the task ``"joint"``, see
+            :class:`~kornia_tidy.reconstruction.LayeredJointHead`: the image then begins as the capture deconvolved for
+            each of ``refocus`` depths, blended by the distribution. 0: one depth a pixel without uncertainty.
         seed: of the initial masks, and of everything random in a run.
 
     Raises:
@@ -84,6 +87,7 @@ class SystemSettings:
     residual: bool = False
     closed_form: bool = False
     refocus: int = 0
+    depth_classes: int = 0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -96,9 +100,9 @@ class SystemSettings:
             check_choice("stray_light", self.stray_light, STRAY_LIGHT)
         for name in ("focal_length", "pixel_pitch"):
             check_positive(name, getattr(self, name))
-        for name in ("masks", "refocus", "seed"):
+        for name in ("masks", "refocus", "depth_classes", "seed"):
             check_count(name, getattr(self, name), 0)
-        for name in ("masks", "refocus"):
+        for name in ("masks", "refocus", "depth_classes"):
             if getattr(self, name) > MOST:
                 raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
         check_choice("start", self.start, STARTS)
@@ -111,8 +115,23 @@ class SystemSettings:
             raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
         if self.residual and (self.closed_form or self.head in CLOSED_FORMS):
             raise ValueError("residual adds the capture and closed_form its restoration: choose one of them")
+        if self.depth_classes:
+            self._check_distribution()
         if self.depth_range is not None:
             object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
+
+    def _check_distribution(self) -> None:
+        if self.task != "joint" or self.residual:
+            kind = f"task {self.task!r}" + (" with residual" if self.residual else "")
+            raise ValueError(f"depth_classes are for the task 'joint' without residual, got the {kind}")
+        for name in ("depth_classes", "refocus"):
+            if getattr(self, name) < 2:
+                raise ValueError(f"a distribution of depth needs {name} of at least 2, got {getattr(self, name)}")
+
+    @property
+    def encoded(self) -> bool:
+        """Whether captures are encoded as sRGB; otherwise they are taken for linear light."""
+        return (self.color_space or ("paper" if self.fidelity == "paper" else "srgb")) == "srgb"
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some values changed."""

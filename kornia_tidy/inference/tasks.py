@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
+from kornia_tidy.reconstruction.depth_distribution import depth_moments
 
 MAPS = {"edof": {"image": 3}, "depth": {"depth": 1}, "joint": {"depth": 1, "image": 3}}  # with channels, in order
 
@@ -22,10 +24,30 @@ def channels_of(task: str) -> int:
 
 
 def split_maps(task: str, output: Tensor) -> dict[str, Tensor]:
-    """Return a network's output as maps by name, ``"depth"`` (B, 1, H, W) and ``"image"`` (B, 3, H, W)."""
+    """Return a network's output as maps by name, ``"depth"`` (B, 1, H, W) and ``"image"`` (B, 3, H, W).
+
+    The depth of a network that estimates a distribution is the mean, see :func:`depth_logits`.
+    """
+    if (logits := depth_logits(task, output)) is not None:
+        return {"depth": depth_moments(logits)[0], "image": output[:, -MAPS[task]["image"] :]}
     if output.ndim != 4 or output.shape[1] != channels_of(task):
         raise ValueError(f"a head for the task {task!r} must return (B, {channels_of(task)}, H, W), got {output.shape}")
     return dict(zip(MAPS[task], output.split(list(MAPS[task].values()), 1), strict=True))
+
+
+def depth_logits(task: str, output: Tensor) -> Tensor | None:
+    """Return the logits of a network's distribution of depth, (B, D, H, W); None if it estimates one value a pixel.
+
+    A network for the task ``"joint"`` with a distribution of depth, such as
+    :class:`~kornia_tidy.reconstruction.LayeredJointHead`, returns D + 3 channels, with the image last.
+
+    Example:
+        >>> depth_logits("joint", torch.rand(1, 19, 4, 4)).shape, depth_logits("joint", torch.rand(1, 4, 4, 4))
+        (torch.Size([1, 16, 4, 4]), None)
+    """
+    if task != "joint" or output.ndim != 4 or output.shape[1] <= channels_of(task):
+        return None
+    return output[:, : -MAPS[task]["image"]]
 
 
 def normalised_inverse_depth(camera: ThinLensCamera | DefocusRange, depth: Tensor) -> Tensor:
@@ -69,6 +91,27 @@ def metres(camera: ThinLensCamera, inverse_depth: Tensor) -> Tensor:
     """
     lo, hi = camera.defocus_range
     return camera.depth(lo + (hi - lo) * inverse_depth.clamp(0, 1))
+
+
+def deviation_in_metres(camera: ThinLensCamera, inverse_depth: Tensor, deviation: Tensor) -> Tensor:
+    r"""Return the uncertainty of depth in metres: half the distance between one deviation nearer and one farther.
+
+    .. math:: \sigma_z = \big( z(n - \sigma_n) - z(n + \sigma_n) \big) / 2
+
+    Args:
+        camera: a lens with metric scale.
+        inverse_depth: normalised inverse depth n, any shape.
+        deviation: its standard deviation, same shape, in parts of the range.
+
+    Returns:
+        Same shape. Infinite where one deviation farther is infinitely far: nothing then bounds the depth in metres.
+
+    Example:
+        >>> deviation_in_metres(ThinLensCamera(), torch.tensor([0.5, 0.5, 0.05]), torch.tensor([0.0, 0.1, 0.28]))
+        tensor([0.0000, 0.1240,    inf])
+    """
+    far, near = metres(camera, inverse_depth - deviation), metres(camera, inverse_depth + deviation)
+    return torch.where(far.isinf(), far, (far - near) / 2)
 
 
 def centre_crop(tensor: Tensor, height: int, width: int) -> Tensor:

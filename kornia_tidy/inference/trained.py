@@ -22,6 +22,7 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
@@ -81,28 +82,36 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 
 def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
-    encoded = (settings.color_space or ("paper" if settings.fidelity == "paper" else "srgb")) == "srgb"
     if settings.head in CLOSED_FORMS:
-        return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=encoded)
+        return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=settings.encoded)
+    if settings.depth_classes:
+        return LayeredJointHead(
+            make_head(settings.head, settings.depth_classes, settings.width, 3 + 2 * settings.refocus),
+            make_head(settings.head, 3, settings.width, REFINED_FROM),
+            settings.refocus,
+            encoded=settings.encoded,
+        )
     channels = closed_form_channels(settings.refocus) if settings.closed_form else 3 + settings.refocus
     head = make_head(settings.head, channels_of(settings.task), settings.width, channels)
     if settings.closed_form:
-        return ClosedFormHead(head, settings.refocus, encoded=encoded)
+        return ClosedFormHead(head, settings.refocus, encoded=settings.encoded)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head
 
 
 def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
-    """Update the PSFs of a network that refocuses or restores captures, from a camera as it is now.
+    """Update the PSFs of a network that deconvolves captures, from a camera as it is now.
 
-    :class:`~kornia_tidy.reconstruction.Refocused` takes the PSFs of green light,
-    :class:`~kornia_tidy.reconstruction.ClosedForm` those of three colours and the noise of the sensor; both evenly
-    spaced over the range of defocus. Other networks are not changed.
+    They are evenly spaced over the range of defocus: those of green light for
+    :class:`~kornia_tidy.reconstruction.Refocused`, of all colours for
+    :class:`~kornia_tidy.reconstruction.LayeredJointHead` and :class:`~kornia_tidy.reconstruction.ClosedForm`, which
+    takes the noise of the sensor too. Other networks are not changed.
     """
     for module in head.modules():
-        if isinstance(module, Refocused):
-            module.set_psfs(optics.psf_bank(1, defocus=_nodes(optics, module.layers)))
+        if isinstance(module, Refocused | LayeredJointHead):
+            channels = 1 if isinstance(module, Refocused) else 3
+            module.set_psfs(optics.psf_bank(channels, defocus=_nodes(optics, module.layers)))
         elif isinstance(module, ClosedForm):
             bank = optics.psf_bank(3, defocus=_nodes(optics, module.layers or NODES))
             module.set_psfs(bank, correlate=optics.fidelity.correlate)

@@ -7,7 +7,8 @@ from kornia_tidy.reconstruction.attention_unet import AttentionUNet
 from kornia_tidy.reconstruction.closed_form import ClosedForm, Restoration, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.head import ReconstructionHead
-from kornia_tidy.reconstruction.joint import JointEstimate, JointHead
+from kornia_tidy.reconstruction.joint import JointEstimate, JointHead, UncertainJointEstimate
+from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
 from kornia_tidy.reconstruction.nafnet import NAFNet
 from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
@@ -24,6 +25,7 @@ __all__ = [
     "ClosedFormHead",
     "JointEstimate",
     "JointHead",
+    "LayeredJointHead",
     "MiDaSSmall",
     "NAFNet",
     "PhaseCam3DUNet",
@@ -34,6 +36,7 @@ __all__ = [
     "Restoration",
     "Tikhonov",
     "TikhonovLayers",
+    "UncertainJointEstimate",
     "Wiener",
     "closed_form_channels",
     "load_midas_small",

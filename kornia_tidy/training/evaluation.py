@@ -17,10 +17,12 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.tasks import centre_crop, metres, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.tasks import centre_crop, depth_logits, metres, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores
+from kornia_tidy.reconstruction.depth_distribution import depth_moments
+from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores, rmse
+from kornia_tidy.reconstruction.reliability import sparsification_curve
 from kornia_tidy.training.pictures import error_map
 from kornia_tidy.training.scenes import Broken, SceneLoader
 
@@ -28,6 +30,7 @@ Row = dict[str, Any]
 """``scene`` (its number), ``name``, and scores by name."""
 
 ABOUT_ROW = ("scene", "name")
+SUREST = 0.7  # part of the pixels
 REACH = 32.0  # in units of the near end: how far depth is scored in metres, if the range has no far end
 
 
@@ -43,6 +46,8 @@ class SceneResult(NamedTuple):
     """(1, H, W), as the data have it."""
     mask: Tensor
     """bool (1, H, W), True where depth is known."""
+    deviation: Tensor | None = None
+    """(1, H, W), standard deviation of the estimated depth, if the network tells it."""
 
 
 @torch.no_grad()
@@ -106,6 +111,9 @@ def depth_row(camera: ThinLensCamera | DefocusRange, result: SceneResult) -> dic
         - ``depth_rmse_metres``, ``depth_abs_rel``, ``depth_log10`` and ``depth_delta1`` to ``depth_delta3``, of depth
           in metres, over the fraction ``depth_counted`` of all pixels. A camera of normalised disparity has none of
           these.
+        - If the network tells how uncertain its depth is, ``depth_deviation``, the root mean square of the predicted
+          standard deviations, which equals ``depth_rmse`` if the uncertainty is true on average, and
+          ``depth_rmse_surest``, the RMSE over the 70 % of the pixels that it is surest of.
 
     Convention:
         Scores in metres count the pixels whose depth is known and lies within :func:`metric_range`, which excludes
@@ -115,6 +123,10 @@ def depth_row(camera: ThinLensCamera | DefocusRange, result: SceneResult) -> dic
     lo, hi = camera.defocus_range
     unit, radians = defocus_scores(estimate, truth, mask, span=hi - lo).values()
     row = {"depth_rmse": unit, "depth_rmse_radians": radians}
+    if result.deviation is not None:
+        deviation = result.deviation[None]
+        row["depth_deviation"] = rmse(deviation, torch.zeros_like(deviation), mask)
+        row["depth_rmse_surest"] = _surest_rmse(estimate, deviation, truth, mask)
     if isinstance(camera, ThinLensCamera):
         near, far = metric_range(camera)
         depth = result.depth[None].to(estimate)
@@ -196,8 +208,16 @@ def _reconstruct(system: TrainedSystem, batch: dict[str, Any]) -> SceneResult:
     noise = torch.Generator().manual_seed(batch["noise_seed"])
     sample = system.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
     coded, depth = sample["image"], sample["depth"]
-    maps = split_maps(system.settings.task, system.head(coded).float())
+    output = system.head(coded).float()
+    maps, logits = split_maps(system.settings.task, output), depth_logits(system.settings.task, output)
     truth = {"image": sample["all_in_focus"][0], "depth": normalised_inverse_depth(system.optics.camera, depth)[0]}
     mask = centre_crop(batch["mask"], *coded.shape[-2:])[0]
     estimate = {name: m[0] for name, m in maps.items()}
-    return SceneResult(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask)
+    deviation = None if logits is None else depth_moments(logits)[1][0]
+    return SceneResult(int(batch["index"]), batch["name"][0], coded[0], estimate, truth, depth[0], mask, deviation)
+
+
+def _surest_rmse(estimate: Tensor, deviation: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+    if not bool(mask.any()):
+        return torch.tensor(torch.nan)
+    return sparsification_curve(estimate, deviation, truth, mask, shares=(SUREST,))[0]

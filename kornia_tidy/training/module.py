@@ -11,10 +11,12 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.tasks import MAPS, centre_crop, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.tasks import MAPS, centre_crop, depth_logits, normalised_inverse_depth, split_maps
 from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.head import takes_noise
+from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
 from kornia_tidy.training.average import MovingAverage
@@ -22,6 +24,8 @@ from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
+
+HELD_OUT_STEP = 4  # pixels between two to which the temperature is fitted, in a row and in a column
 
 
 class BatchResult(NamedTuple):
@@ -35,6 +39,8 @@ class BatchResult(NamedTuple):
     """True maps by name: ``"image"`` is the all-in-focus scene, ``"depth"`` its normalised inverse depth in [0, 1]."""
     mask: Tensor
     """bool (B, 1, H, W), True where depth is known."""
+    logits: Tensor | None = None
+    """Those of the distribution of depth, (B, D, H, W) in float32, if the network estimates one."""
 
 
 def cosine_rate(progress: float, warm_up: float = 0.1) -> float:
@@ -68,7 +74,9 @@ class TidyTraining(pl.LightningModule):
 
     Args:
         optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
-        head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint.
+        head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint, or
+            D + 3 with a distribution of depth over D classes, which is then trained by
+            :func:`~kornia_tidy.reconstruction.depth_distribution.distribution_loss`.
         task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is estimated as
             :func:`~kornia_tidy.inference.tasks.normalised_inverse_depth`.
         loss: function of an estimated map, the true map and the validity mask; the same for all maps.
@@ -127,6 +135,7 @@ class TidyTraining(pl.LightningModule):
         self.task, self.loss, self.learn, self.settings = task, loss, learn, settings
         self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
         self.weights = {"depth": depth_weight, "image": image_weight}
+        self._held_out: list[tuple[Tensor, ...]] = []  # distributions of depth of validation scenes, with the truth
 
     @classmethod
     def from_settings(cls, settings: TrainingSettings, *, design: bool = True, progress: bool = False) -> TidyTraining:
@@ -185,8 +194,8 @@ class TidyTraining(pl.LightningModule):
             truth = {"image": batch["image"], "depth": batch["inverse_depth"]}
         else:
             coded, truth, mask = self._photograph(batch)
-        output = self(coded, batch.get("noise"))
-        return BatchResult(coded, {name: m.float() for name, m in split_maps(self.task, output).items()}, truth, mask)
+        output = self(coded, batch.get("noise")).float()
+        return BatchResult(coded, split_maps(self.task, output), truth, mask, depth_logits(self.task, output))
 
     def _photograph(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor], Tensor]:
         """Return captures, true maps and the mask of known depth of a batch of scenes."""
@@ -205,7 +214,7 @@ class TidyTraining(pl.LightningModule):
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
         result = self.reconstruct(batch)
-        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)
+        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights, result.logits)
         self.log("loss", loss.detach(), prog_bar=True, batch_size=len(result.coded))
         return loss
 
@@ -215,13 +224,33 @@ class TidyTraining(pl.LightningModule):
         The PSNR is that of the image clipped to [0, 1], as it would be shown.
         """
         result = self.reconstruct(batch)
-        scores = {"val_loss": task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights)}
+        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights, result.logits)
+        scores = {"val_loss": loss}
         for name, maps in result.estimate.items():
             errors = rmse(maps, result.truth[name], result.mask if name == "depth" else None)
             scores[f"val_{name}_rmse"] = errors.nanmean()
             if name == "image":
                 scores["val_image_psnr"] = psnr(maps.clamp(0, 1), result.truth[name]).mean()
         self.log_dict(scores, batch_size=len(result.coded), sync_dist=True, prog_bar=True)
+        if result.logits is not None:
+            maps = result.logits, result.truth["depth"], result.mask
+            self._held_out.append(tuple(part[..., ::HELD_OUT_STEP, ::HELD_OUT_STEP] for part in maps))
+
+    def on_validation_epoch_start(self) -> None:
+        """Begin to collect distributions of depth of the validation scenes, at a temperature of 1."""
+        self._held_out.clear()
+        self._set_temperature(1.0)
+
+    def on_validation_epoch_end(self) -> None:
+        """Fit the temperature of the distribution of depth to the validation scenes."""
+        if self._held_out:
+            self._set_temperature(fit_temperature(*(torch.cat(parts) for parts in zip(*self._held_out, strict=True))))
+            self._held_out.clear()
+
+    def _set_temperature(self, temperature: float) -> None:
+        for module in self.modules():
+            if isinstance(module, LayeredJointHead):
+                module.temperature.fill_(temperature)
 
     def configure_optimizers(self) -> Any:
         """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
+from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
 from kornia_tidy.reconstruction.validity import valid_maps
 
@@ -54,7 +55,12 @@ LOSSES: dict[str, Loss] = {
 
 
 def task_loss(
-    loss: Loss, estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor], mask: Tensor, weights: Mapping[str, float]
+    loss: Loss,
+    estimate: Mapping[str, Tensor],
+    truth: Mapping[str, Tensor],
+    mask: Tensor,
+    weights: Mapping[str, float],
+    logits: Tensor | None = None,
 ) -> Tensor:
     """Return the weighted sum of the losses of a task's maps.
 
@@ -64,13 +70,17 @@ def task_loss(
         truth: the true maps by name.
         mask: bool (B, 1, H, W), True where depth is known. The image is known everywhere.
         weights: factor of each map's loss by name.
+        logits: those of the distribution of depth, (B, D, H, W), if the network estimates one. The loss of depth is
+            then :func:`~kornia_tidy.reconstruction.depth_distribution.distribution_loss` instead of ``loss``.
 
     Convention:
         The depth loss of a batch without any known depth, such as a crop inside a hole, is zero.
     """
     terms = []
     for name, maps in estimate.items():
-        if name == "depth" and not bool(mask.any()):
+        if name == "depth" and logits is not None:
+            terms.append(weights[name] * distribution_loss(logits, truth[name], mask))
+        elif name == "depth" and not bool(mask.any()):
             terms.append(0 * maps.sum())
         else:
             terms.append(weights[name] * loss(maps, truth[name], mask if name == "depth" else None))

@@ -97,6 +97,25 @@ class TestRawReconstruct(BaseTester):
         assert record["size"] == [110, 90]
         assert record["depth_png"] == "metres = value * 0.001; 65535 is 65.535 m or farther"
 
+    def test_feature_uncertainty_is_a_second_map(self, tmp_path, capsys):
+        weights = checkpoint(tmp_path / "joint.safetensors", task="joint", depth_classes=6, refocus=2)
+        folder, file = tmp_path / "out", capture(tmp_path / "a.png")
+        assert reconstruct([file], weights, folder, "--linear", "--depth-unit", "0.01") == 0
+        maps = [f"a_deviation{end}" for end in (".png", ".pfm", ".npy")]
+        assert sorted(contents(folder)) == sorted([*(f"a{end}" for end in ENDS), *maps])
+        result = reconstruct_light(LightHead(load_trained(weights)), read_image(file))
+        exact = np.load(folder / "a_deviation.npy")
+        assert np.array_equal(exact, result.deviation[0].numpy())
+        assert np.array_equal(np.load(folder / "a_depth.npy"), result.depth[0].numpy())
+        self.assert_close(read_depth(folder / "a_deviation.pfm").depth, result.deviation)
+        units = cv2.imread(str(folder / "a_deviation.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(units, np.clip(np.rint(exact.astype(float) / 0.01), 1, 65535))
+        record = json.loads((folder / "a.json").read_text())
+        assert record["deviation_png"] == "metres = value * 0.01; 65535 is 655.35 m or more, or unbounded"
+        with pytest.raises(SystemExit):
+            main(["raw", "reconstruct", "--help"])
+        assert "uncertainty of the depth: its standard deviation" in capsys.readouterr().out
+
     def test_feature_an_image_task_has_no_depth(self, tmp_path):
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
         assert reconstruct([capture(tmp_path / "a.png")], weights, tmp_path / "out", "--format", "tiff") == 0

@@ -19,6 +19,13 @@ class TestDrawDepth(BaseTester):
         figure = draw_depth(torch.tensor([near / 2, near, middle, far]).expand(1, 3, 4), camera)
         np.testing.assert_allclose(figure.axes[0].images[0].get_array()[0], [1, 1, 0.5, 0], atol=1e-6)
 
+    def test_feature_the_less_is_known_the_greyer(self):
+        """By the share of the variance of a depth of which nothing is known, 1/12."""
+        deviation = torch.tensor([0.0, 1 / 48**0.5, 1 / 12**0.5, 0.5]).expand(1, 3, 4)
+        figure = draw_depth(torch.full((1, 3, 4), 0.6), ThinLensCamera(), deviation)
+        np.testing.assert_allclose(figure.axes[0].images[1].get_alpha()[0], [0, 0.25, 1, 1], atol=1e-6)
+        assert [text.get_text() for text in figure.texts] == ["grey: unknown"]
+
     def test_feature_the_bar_names_depths_far_enough_apart(self):
         places = [place for place, _ in depth_ticks(ThinLensCamera())]
         assert min(np.diff(sorted(places))) > 0.12

@@ -46,6 +46,13 @@ class TestDrawEstimates(BaseTester):
         shown = [axes.axison for axes in draw_estimates(image, inverse_depth, estimates).axes]
         assert shown == 6 * [True] + 4 * [True] + 2 * [False]
 
+    def test_feature_a_told_uncertainty_is_a_last_column(self):
+        image, inverse_depth = scene()
+        told = Estimate("told", image, image, inverse_depth, 0.1 + 0 * inverse_depth)
+        figure = draw_estimates(image, inverse_depth, [told, Estimate("K = 1", image, image, inverse_depth)])
+        assert [axes.axison for axes in figure.axes] == 7 * [True] + 6 * [True] + [False]
+        np.testing.assert_allclose(figure.axes[6].images[0].get_array(), 0.3, atol=1e-6)
+
     def test_exception_one_estimate_is_no_comparison(self):
         image, inverse_depth = scene()
         with pytest.raises(ValueError, match="compares two estimates or more, got 1"):

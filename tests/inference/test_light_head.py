@@ -11,7 +11,12 @@ import torch
 from kornia.color import linear_rgb_to_rgb
 from torch import nn
 
-from kornia_tidy.inference.light_head import LightHead, reconstruct_light, reconstruct_opencv
+from kornia_tidy.inference.light_head import (
+    LightHead,
+    UncertainReconstruction,
+    reconstruct_light,
+    reconstruct_opencv,
+)
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics, update_psfs
@@ -30,6 +35,13 @@ class Passing(nn.Module):
         maps = {"edof": image, "depth": image[:, :1], "joint": torch.cat([image[:, :1], image], 1)}[self.task]
         assert maps.shape[1] == channels_of(self.task)
         return maps
+
+
+class Unsure(nn.Module):
+    """Returns the image, and a depth that is 0 or 1 with equal chances."""
+
+    def forward(self, image):
+        return torch.cat([image[:, :2] * 0, image], 1)
 
 
 def light_head(task, color_space=None, head=None, **settings):
@@ -116,6 +128,17 @@ class TestReconstructLight(BaseTester):
         self.assert_close(found.image, whole, atol=1e-5, rtol=0)
         dark = head(optics.encode(light[None, ..., :60]))[0]
         assert (dark - whole[..., :60])[..., :30].abs().max() > 0.01
+
+    def test_feature_a_distribution_of_depth_tells_its_uncertainty(self):
+        """Half a range on each side of the focus: from the near end, 0.2975 m, to infinity."""
+        head = light_head("joint", "linear", Unsure(), depth_classes=2, refocus=2)
+        result = reconstruct_light(head, torch.rand(3, 5, 6))
+        assert isinstance(result, UncertainReconstruction)
+        self.assert_close(result.depth, torch.full((1, 5, 6), 0.595))
+        self.assert_close(result.relative_deviation, torch.full((1, 5, 6), 0.5))
+        assert result.deviation.isinf().all()
+        _, depth = reconstruct_opencv(head, np.full((4, 5), 77, np.uint8))
+        assert depth.shape == (4, 5)
 
     def test_feature_the_light_is_left_alone(self):
         light = torch.rand(3, 12, 14) * 2

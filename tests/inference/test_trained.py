@@ -54,6 +54,10 @@ class TestLoadTrained(BaseTester):
             ({"depth_range": [1, None]}, "depth_range must be two numbers"),
             ({"window": "9"}, "window must be a whole number"),
             ({"residual": 1}, "residual must be true or false"),
+            ({"depth_classes": 1, "refocus": 2}, "a distribution of depth needs depth_classes of at least 2, got 1"),
+            ({"depth_classes": 8, "refocus": 1}, "a distribution of depth needs refocus of at least 2, got 1"),
+            ({"depth_classes": 8, "refocus": 2, "residual": True}, "got the task 'joint' with residual"),
+            ({"depth_classes": 8, "refocus": 2, "task": "depth"}, "got the task 'depth'"),
         ],
     )
     def test_exception_settings_that_cannot_be(self, changes, sentence, state, tmp_path):

@@ -61,6 +61,17 @@ class TestDepthRow(BaseTester):
         assert row["depth_counted"] == pytest.approx(2 / 3)
         assert row["depth_abs_rel"] == pytest.approx(0, abs=1e-6)
 
+    def test_feature_a_told_uncertainty_is_scored(self):
+        """Ten pixels: three in ten are left out, the least sure ones, which hold the large errors."""
+        deviation = torch.tensor([0.1] * 7 + [0.3] * 3).view(1, 1, -1)
+        estimate = [0.6] * 7 + [0.9, 0.0, 1.0]
+        scene = result(DefocusRange(), [0.5] * 10, estimate)._replace(deviation=deviation)
+        row = depth_row(DefocusRange(), scene)
+        assert row["depth_rmse_surest"] == pytest.approx(0.1, rel=1e-5)
+        assert row["depth_deviation"] == pytest.approx(math.sqrt(0.7 * 0.1**2 + 0.3 * 0.3**2), rel=1e-5)
+        unknown = depth_row(DefocusRange(), scene._replace(mask=torch.zeros_like(scene.mask)))
+        assert math.isnan(unknown["depth_rmse_surest"])
+
     def test_feature_normalised_disparity_has_no_metres(self):
         camera = DefocusRange(-10, 10)
         row = depth_row(camera, result(camera, [0.0, 0.5], [0.1, 0.4]))

@@ -8,7 +8,9 @@ from torch import nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
+from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_optics, check_weights, load_trained, load_weights
+from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.training.scenes import Broken, SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
@@ -110,6 +112,20 @@ class TestTidyTraining(BaseTester):
         difference = module(coded) - module.eval()(coded)
         self.assert_close(difference, torch.ones_like(difference))
 
+    def test_feature_the_temperature_is_fitted_to_what_validation_sees(self, tmp_path):
+        """Weights do not depend on it, and a checkpoint holds it."""
+        module = made(depth_classes=6, refocus=2, masks=1)
+        module.head.temperature.fill_(5.0)
+        loader = SceneLoader(DeadLeaves(2, 48, 48), 2, train=False)
+        trainer(tmp_path).validate(module, loader, verbose=False)
+        result = module.eval().reconstruct(next(iter(loader)))
+        fitted = float(module.average.network.temperature)
+        assert fitted == float(module.head.temperature)
+        seen = [part[..., ::4, ::4] for part in (result.logits * fitted, result.truth["depth"], result.mask)]
+        assert fitted == pytest.approx(fit_temperature(*seen), rel=1e-4)
+        assert fitted != 5.0
+        assert "head.temperature" in module.state_dict()
+
     def test_feature_a_valid_border_crops_truth_and_mask_alike(self):
         module, sample = made(border="valid"), batch()
         sample["mask"][..., 11, 11], sample["mask"][..., 0, 0] = False, False
@@ -208,6 +224,17 @@ class TestCheckpoint(BaseTester):
         coded = module.eval().reconstruct(batch()).coded
         # PSFs with and without gradients are computed in two ways, equal to round-off.
         torch.testing.assert_close(system.head(coded), module(coded), rtol=1e-5, atol=1e-5)
+
+    def test_feature_a_network_with_a_distribution_of_depth_comes_back(self, tmp_path):
+        module = made(depth_classes=6, refocus=2, masks=1, ema=0)
+        module.head.temperature.fill_(1.5)
+        trainer(tmp_path).fit(module, SceneLoader(DeadLeaves(2, 48, 48), 2))
+        state = {"settings": module.settings.as_dict(), "state_dict": module.state_dict(), "global_step": 2}
+        write_state(tmp_path / "a", state)
+        system = load_trained(tmp_path / "a")
+        coded = torch.rand(1, 3, 48, 48)
+        with torch.no_grad():
+            assert torch.equal(system.head(coded), module.eval()(coded))
 
     def test_feature_weights_go_into_objects_of_ones_own(self, saved):
         module, path = saved

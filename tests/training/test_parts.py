@@ -16,8 +16,16 @@ from kornia_tidy.inference.heads import make_head
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, load_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
-from kornia_tidy.inference.tasks import centre_crop, metres, normalised_inverse_depth, split_maps
+from kornia_tidy.inference.tasks import (
+    centre_crop,
+    depth_logits,
+    deviation_in_metres,
+    metres,
+    normalised_inverse_depth,
+    split_maps,
+)
 from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
 from kornia_tidy.training.settings import TrainingSettings
@@ -129,6 +137,28 @@ class TestTasks(BaseTester):
         self.assert_close(metres(camera, normalised_inverse_depth(camera, depth)), depth, rtol=1e-12)
         ends = metres(camera, torch.tensor([-0.5, 1.5]))
         self.assert_close(ends, torch.tensor(depth_range[::-1]))
+
+    @pytest.mark.parametrize("depth_range", [(0.3, float("inf")), (0.5, 4.0)])
+    def test_feature_deviations_in_metres_are_half_of_what_lies_between_one_nearer_and_one_farther(self, depth_range):
+        """Near zero it is the deviation times the derivative of depth, and it is unbounded where infinity is within."""
+        camera = ThinLensCamera.for_scene(depth_range)
+        inverse = torch.tensor([0.3, 0.5, 0.9], dtype=torch.float64, requires_grad=True)
+        small = torch.full_like(inverse, 1e-6)
+        (slope,) = torch.autograd.grad(metres(camera, inverse).sum(), inverse)
+        self.assert_close(deviation_in_metres(camera, inverse.detach(), small), -slope * small, rtol=1e-6, atol=0)
+        wide = deviation_in_metres(camera, torch.tensor([0.1]), torch.tensor([0.2]))
+        assert bool(wide.isinf()) == (depth_range[1] == float("inf"))
+
+    def test_feature_a_distribution_has_its_mean_as_depth_and_a_loss_of_its_own(self):
+        output, truth = torch.randn(1, 8, 3, 3), {"depth": torch.rand(1, 1, 3, 3), "image": torch.rand(1, 3, 3, 3)}
+        logits, estimate = depth_logits("joint", output), split_maps("joint", output)
+        assert torch.equal(logits, output[:, :5])
+        assert torch.equal(estimate["image"], output[:, 5:])
+        self.assert_close(estimate["depth"], (logits.softmax(1) * torch.linspace(0, 1, 5).view(5, 1, 1)).sum(1, True))
+        mask = torch.rand(1, 1, 3, 3) > 0.3
+        loss = task_loss(LOSSES["l1"], estimate, truth, mask, {"depth": 2.0, "image": 3.0}, logits)
+        image = (output[:, 5:] - truth["image"]).abs().mean()
+        self.assert_close(loss, 2 * distribution_loss(logits, truth["depth"], mask) + 3 * image)
 
     def test_exception_a_head_of_other_channels_is_refused(self):
         with pytest.raises(ValueError, match=r"must return \(B, 1, H, W\)"):
