@@ -87,7 +87,7 @@ def report_markdown(design: CoDesign) -> str:
         "",
         f"Depths {near:g} to {far:g} m, lens {task.focal_length * 1e3:g} mm, pixels of {task.pixel_pitch * 1e6:g} um, "
         f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g} in the same exposure time at every "
-        f"f-number, read noise {task.read_noise_electrons:g} electrons. {task.masks} masks of {task.mask_size} x "
+        f"f-number, read noise {task.read_noise_electrons:g} electrons. K = {task.masks} masks of {task.mask_size} x "
         f"{task.mask_size} pixels; modulator: {_modulator_in_words(task)}. What matters: {matters}.",
         "",
         "## Simulated captures",
@@ -138,7 +138,7 @@ def focus_distance(task: DesignTask, one: Candidate) -> float:
 
 def _finalist_row(task: DesignTask, one: Finalist, is_best: bool) -> str:
     candidate, form = one.candidate, "; ".join(one.settings.values())
-    name = "flat lens" if candidate.is_flat else f"{task.masks} masks, {candidate.start}"
+    name = "flat lens" if candidate.is_flat else f"K = {task.masks}, {candidate.start}"
     name = f"**{name}**" if is_best else name
     focus = f"{focus_distance(task, candidate):.3g}"
     return (
