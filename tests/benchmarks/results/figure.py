@@ -75,7 +75,8 @@ def _over_f_number(axes: Axes, results: Results, scenes: str) -> None:
         for number, key in by_kind["coded"]:
             mark = "D" if key.restoration == NETWORK else "s"
             axes.plot([number], [results.mean(key, "psnr")], mark, color=color, markersize=5)
-            axes.annotate(key.system, (number, results.mean(key, "psnr")), fontsize=SMALL, color=color)
+            place = number, results.mean(key, "psnr")
+            axes.annotate(key.system, place, (6, -3), textcoords="offset points", fontsize=SMALL, color=color)
     axes.set_xlabel("f-number", fontsize=LABEL, color=INK)
     axes.set_title(
         "Equal exposure time: flat lenses, and coded cameras as marks", fontsize=TITLE, color=INK, loc="left"
