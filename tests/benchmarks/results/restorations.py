@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,13 +12,16 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.inference.tasks import MAPS, split_maps
+from kornia_tidy.reconstruction import head
 from kornia_tidy.reconstruction.tikhonov import tikhonov
+from kornia_tidy.reconstruction.wiener import Wiener
 from tests.benchmarks.results.captures import Capture, encode
 from tests.benchmarks.results.systems import System
 
 Settings = dict[str, float]
 WEIGHTS = tuple(10 ** (quarter / 4) for quarter in range(-20, 5))
 COLORS, SPACES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6), (1.0, 1.5, 2.0, 3.0, 5.0)
+FACTORS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 DIAMETER = 7  # pixels of the bilateral filter
 LAYERS = 11  # depths of an inversion that knows the depth
 NETWORK = "network"
@@ -73,9 +75,16 @@ def _tikhonov_by_depth(capture: Capture, settings: Settings) -> Tensor:
     return light
 
 
+def _wiener(capture: Capture, settings: Settings) -> Tensor:
+    """Wiener restoration by the statistics of scenes and the noise, times a factor of the noise power."""
+    noise = capture.noise.mean((-2, -1), keepdim=True)
+    return Wiener(weight=settings["factor"])(capture.light, capture.system.optics.psf_bank(), noise)
+
+
 CLOSED_FORMS = {
     "capture": ClosedForm(lambda capture, _: capture.light, start=lambda _: {"color": 0.05, "space": 1.0}),
     "Tikhonov": ClosedForm(_tikhonov, {"weight": WEIGHTS}, _weight),
+    "Wiener": ClosedForm(_wiener, {"factor": FACTORS}, lambda _: {"factor": 1.0}),
 }
 BY_DEPTH = "Tikhonov by estimated depth"
 CLOSED_FORMS_WITH_DEPTH = {BY_DEPTH: ClosedForm(_tikhonov_by_depth, {"weight": WEIGHTS}, _weight)}
@@ -107,7 +116,7 @@ def restorations_for(system: System) -> dict[str, Restoration]:
 
 def takes_noise(system: System) -> bool:
     """Return whether a system's network takes the noise level."""
-    return system.head is not None and "noise" in inspect.signature(system.head.forward).parameters
+    return system.head is not None and head.takes_noise(system.head)
 
 
 def _inverted(name: str, form: ClosedForm, capture: Capture, settings: Settings) -> Tensor:
