@@ -167,8 +167,8 @@ class TestTimeAverageOrBurst(BaseTester):
 @pytest.mark.parametrize("example", ["design_masks"], indirect=True)
 class TestDesignMasks(BaseTester):
     def test_feature_each_design_is_the_best_at_its_task(self, example, tmp_path, monkeypatch):
-        monkeypatch.setattr(example, "FIDELITY", example.FIDELITY.replace(window=23, layer_spacing=2.0))
-        scores = example.main(["--limit", "6", "--iterations", "40", "--output", str(tmp_path)])
+        monkeypatch.setattr(example, "FIDELITY", example.FIDELITY.replace(layer_spacing=2.0))
+        scores = example.main(["--iterations", "60", "--output", str(tmp_path)])
         assert min(scores, key=lambda name: scores[name][0]) == "depth design"
         assert min(scores, key=lambda name: scores[name][1]) == "EDoF design"
         assert picture(tmp_path / "design_masks.png").float().std() > 20

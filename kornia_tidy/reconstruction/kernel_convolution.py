@@ -33,7 +33,7 @@ def convolve_kernels(image: Tensor, kernels: Tensor) -> Tensor:
         >>> shift = torch.zeros(1, 1, 3, 3)
         >>> shift[0, 0, 1, 2] = 1.0  # moves the image to the right
         >>> convolve_kernels(torch.tensor([[[[1.0, 2.0, 3.0]]]]), shift).round(decimals=4).flatten()
-        tensor([2., 1., 2.])
+        tensor([1., 1., 2.])
     """
     radius = kernels.shape[-1] // 2
     padded = pad_border(image, radius, "reflect" if radius < min(image.shape[-2:]) else "replicate")

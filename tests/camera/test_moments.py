@@ -11,6 +11,7 @@ from torch import nn
 
 import kornia_tidy.optics  # noqa: F401 (all modulators are defined)
 from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
+from kornia_tidy.augmentation.drawn_camera import PhaseJitter
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moment_times, moving_capture, state_times
 from kornia_tidy.modulator.modulator import DiffractionEfficiency, Modulator, SpatialLightModulator, timeline_of
@@ -47,6 +48,7 @@ MODULATORS = {
     ),
     "diffraction, switching": SpatialLightModulator(DiffractionEfficiency(EFFICIENCY), Switching(8e-3)),
     "dwell, panel": SpatialLightModulator(DwellTimes((1, 2, 1)), GreyLevels(4), PixelCrosstalk(0.3)),
+    "jitter": PhaseJitter(DwellTimes((1, 2, 1)), 0.3, seed=1),
     "foreign, diffraction": SpatialLightModulator(Foreign(), DiffractionEfficiency(EFFICIENCY)),
     "twice": SpatialLightModulator(DiffractionEfficiency(0.8), DwellTimes((1, 2, 1)), DiffractionEfficiency(0.9)),
 }

@@ -30,7 +30,7 @@ from tests.forks import fork, wait
 
 SETTINGS = TrainingSettings(
     task="joint", masks=2, width=4, size=64, scenes=20, validation_scenes=2, batch=2, accumulate=2, epochs=3,
-    pretrain_epochs=1, window=23, head="dropout", lr=1e-3, seed=3,
+    pretrain_epochs=1, window=23, head="tests.training.killed_runs:DropoutHead", lr=1e-3, seed=3,
 )  # fmt: skip
 
 
@@ -70,7 +70,6 @@ def die_at(owner: Any, name: str, call: int) -> None:
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DeprecationWarning)  # of fork in a process that has threads
-    heads.HEADS["dropout"] = "__main__:DropoutHead"
     assert child(folder / "whole") == 0
     chance = random.Random(time.time_ns())
     moments = {
