@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import Any
 
 from torch import Tensor, nn
@@ -43,6 +44,30 @@ got 'nafnett'
         raise ValueError(
             f"head must be one of {', '.join(map(repr, known))}, or the path of a class such as "
             f"my_package.networks:Network, got {name!r:.80}"
+        )
+
+
+def check_imported(name: str) -> None:
+    """Raise ``ValueError`` for a head by import path whose module is not imported yet.
+
+    To import a module runs its code, and which one it is may not be for a file to say.
+
+    Args:
+        name: of a head, as a checkpoint tells it.
+
+    Example:
+        >>> check_imported("nafnet")
+        >>> check_imported("antigravity:Network")
+        Traceback (most recent call last):
+        ...
+        ValueError: the head 'antigravity:Network' is a class of a module that is not imported: if you trust the file, \
+import antigravity before it is loaded
+    """
+    module, colon, _ = name.partition(":")
+    if colon and module not in sys.modules:
+        raise ValueError(
+            f"the head {name!r:.80} is a class of a module that is not imported: if you trust the file, import "
+            f"{module:.60} before it is loaded"
         )
 
 

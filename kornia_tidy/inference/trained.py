@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.inference.heads import CLOSED_FORMS, make_head
+from kornia_tidy.inference.heads import CLOSED_FORMS, check_imported, make_head
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.tasks import channels_of
@@ -152,6 +152,7 @@ def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> T
     try:
         known, run = SystemSettings.split(state["settings"])
         settings = SystemSettings(**known)
+        check_imported(settings.head)
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     _check_sizes(state, settings, str(path))

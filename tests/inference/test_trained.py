@@ -82,6 +82,15 @@ class TestLoadTrained(BaseTester):
         with pytest.raises(ValueError, match=f"cannot read {tmp_path / 'a'}: "):
             load_trained(tmp_path / "a")
 
+    def test_exception_a_file_does_not_choose_a_module_to_import(self, state, tmp_path, monkeypatch):
+        """Which would run its code."""
+        (tmp_path / "bad_module.py").write_text("raise SystemExit('it was run')")
+        monkeypatch.syspath_prepend(tmp_path)
+        settings = {**state["settings"], "head": "bad_module:Network"}
+        write_state(tmp_path / "a", {**state, "settings": settings})
+        with pytest.raises(ValueError, match="if you trust the file, import bad_module before it is loaded"):
+            load_trained(tmp_path / "a")
+
     def test_exception_every_flipped_bit_of_the_settings_is_read_or_refused(self, state, tmp_path):
         text = json.dumps(SETTINGS.as_dict()).encode()
         generator = torch.Generator().manual_seed(0)
