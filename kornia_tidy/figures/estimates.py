@@ -81,7 +81,8 @@ def draw_estimates(
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12 / height, top=1 - 0.75 / height, wspace=0.03, hspace=0.12)
     figure.text(0.02, 1 - 0.28 / height, "From one coded capture: everything in focus, and how far it is", fontsize=14)
     legend = (
-        "K: masks shown in turn during the exposure; plain: none; EDoF: learnt for the image alone; x3: times three"
+        "K: masks shown in turn during the exposure; plain: a Fresnel lens; EDoF: learnt for the image alone; "
+        "x3: times three"
     )
     figure.text(0.98, 1 - 0.28 / height, legend, fontsize=LABEL, color=FAINT, ha="right")
     for y, estimate in enumerate(estimates):
