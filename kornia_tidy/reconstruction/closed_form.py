@@ -16,7 +16,6 @@ from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
-from kornia_tidy.reconstruction.refocused import inverse_filters
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -24,6 +23,7 @@ WEIGHTS = tuple(3e-3 * 10 ** (i / 2) for i in range(4))  # 0.003 to 0.095: the b
 NOISE, EXPONENT = 2e-3, 1.3  # the best weight is 0.003 (noise / 0.002) ** 1.3
 WINDOW, COLOR, SPACE = 7, 0.2, 2.0  # of the bilateral filter: px, difference of encoded colours, px
 LEAST_NOISE = 1e-5  # of full scale; its logarithm is finite
+LAYER_WEIGHT = 1e-2  # of the deconvolution for one depth
 NODES = 11  # depths over which PSFs are averaged
 
 
@@ -43,7 +43,7 @@ class Restoration(NamedTuple):
     image: Tensor
     """All-in-focus image, (B, 3, H, W) in [0, 1], in the colours of the capture."""
     maps: Tensor
-    """(B, N, H, W): capture, estimates by rising weight, ``image``, level of the noise, refocused brightness."""
+    """(B, N, H, W): capture, estimates by rising weight, ``image``, level of the noise, brightness by depth."""
 
 
 class ClosedForm(nn.Module):
@@ -57,8 +57,9 @@ class ClosedForm(nn.Module):
     linear light. The bilateral filter works on the encoded image.
 
     Args:
-        layers: number D of depths to which the brightness is refocused too, as input of a network that estimates depth;
-            see :func:`~kornia_tidy.reconstruction.refocused.inverse_filters`.
+        layers: number D of depths for each of which the brightness is deconvolved too, with a weight of 0.01 and the
+            mean PSF of the colours, as further inputs of a network: where PSFs differ between depths, the map of its
+            own depth restores a region best.
         bilateral: False leaves out the bilateral filter.
         encoded: captures are encoded as sRGB. False: they are linear light.
 
@@ -137,7 +138,7 @@ class ClosedForm(nn.Module):
         wide = psfs.to(torch.promote_types(psfs.dtype, torch.float32))
         self.kernels = tikhonov_kernels(wide.mean(0), WEIGHTS)
         if self.layers:
-            self.filters = inverse_filters(wide.mean(1))
+            self.filters = tikhonov_kernels(wide.mean(1), (LAYER_WEIGHT,)).transpose(0, 1)
 
     def set_noise(self, sensor: SensorNoise) -> None:
         """Take the noise of a sensor, by which captures are restored if no noise is given with them."""
@@ -184,7 +185,8 @@ class ClosedForm(nn.Module):
         maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True)]
         if self.layers:
             brightness = light.mean(1, keepdim=True)
-            maps.append(convolve_kernels(brightness, self.filters[:, None].to(light.dtype)).flatten(1, 2))
+            by_depth = convolve_kernels(brightness, self.filters.to(light.dtype))
+            maps.append(self._encode(by_depth.expand(-1, -1, 3, -1, -1))[:, :, 0])
         return Restoration(image, torch.cat(maps, 1))
 
     def _light(self, colors: Tensor) -> Tensor:

@@ -11,9 +11,8 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from kornia_tidy import SensorNoise
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.closed_form import NOISE, WEIGHTS, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form import LAYER_WEIGHT, NOISE, WEIGHTS, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
-from kornia_tidy.reconstruction.refocused import inverse_filters
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from tests.base import BaseTester
 
@@ -107,12 +106,16 @@ class TestClosedForm(BaseTester):
         found = closed_form()(capture, 0.01).image
         self.assert_close(found[0, :, 3:-3, 3:-3], bilateral(deconvolved[0]), atol=1e-6, rtol=0)
 
-    def test_feature_layers_are_the_brightness_refocused_in_linear_light(self):
+    @pytest.mark.parametrize("encoded", [True, False])
+    def test_feature_layers_are_the_brightness_deconvolved_for_each_depth(self, encoded):
         capture = photo(20, 24)
-        maps = closed_form(layers=3)(capture).maps
-        filters = inverse_filters(bank(3).psfs.mean(1))
-        brightness = rgb_to_linear_rgb(capture).mean(1, keepdim=True)
-        self.assert_close(maps[:, 19:], convolve_kernels(brightness, filters[:, None])[:, :, 0])
+        maps = closed_form(layers=3, encoded=encoded)(capture).maps
+        light = rgb_to_linear_rgb(capture) if encoded else capture
+        for layer, psf in enumerate(bank(3).psfs.mean(1, keepdim=True)):
+            brightness = light.mean(1, keepdim=True)
+            deconvolved = convolve_kernels(brightness, tikhonov_kernels(psf, (LAYER_WEIGHT,)))[:, 0].clamp(0, 1)
+            expected = linear_rgb_to_rgb(deconvolved.expand(-1, 3, -1, -1))[:, :1] if encoded else deconvolved
+            self.assert_close(maps[:, 19 + layer][:, None], expected)
 
     def test_feature_samples_and_pixels_have_their_own_noise(self):
         restore, capture = closed_form(bilateral=False), photo(12, 20)
