@@ -20,8 +20,9 @@ from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
+from kornia_tidy.training.design_folder import designed_camera, designed_settings
 from kornia_tidy.training.lightning_extra import require_lightning
-from kornia_tidy.training.settings import LEARN, NETWORK_RUN, PRECISIONS, SCHEDULES, TrainingSettings
+from kornia_tidy.training.settings import LEARN, NETWORK_RUN, PRECISIONS, SCHEDULES, TrainingSettings, usual_settings
 from kornia_tidy.training.task_loss import LOSSES
 
 CURVE = "learning_curve.png"
@@ -45,7 +46,10 @@ gain, noise level and noise are drawn anew for each step, which then costs what 
 costs. Its defaults are for a CPU:
 """
 DESCRIPTION += textwrap.fill(
-    " ".join(f"--{name.replace('_', '-')} {value}" for name, value in NETWORK_RUN.items() if name != "learn"),
+    " ".join(
+        f"--{name.replace('_', '-')}" + ("" if value is True else f" {value}")
+        for name, value in NETWORK_RUN.items() if name != "learn" and value is not None
+    ),
     88, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False,
 )  # fmt: skip
 
@@ -67,11 +71,17 @@ examples:
     kornia-tidy train --task edof --start "focal sweep" --design 120 --refocus 5 --width 8 \\
       --residual --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 \\
       -o outputs/swept
-  A network behind five designed masks, in an hour on a CPU; then both together:
-    kornia-tidy train --learn network --start "focal sweep" --design 120 --width 8 \\
-      -o outputs/network
-    kornia-tidy train --learn both --start "focal sweep" --design 120 --width 8 \\
-      --head-from outputs/network/best.safetensors --lr 2e-4 --size 128 --batch 4 -o outputs/both
+  A network behind five designed masks, in hours on a CPU; then both together:
+    kornia-tidy train --learn network --start "focal sweep" --design 120 -o outputs/network
+    kornia-tidy train --learn both --start "focal sweep" --design 120 --head nafnet --width 16 \\
+      --closed-form --head-from outputs/network/best.safetensors --lr 2e-4 --size 128 --batch 4 \\
+      -o outputs/both
+  A network for the camera that `kornia-tidy design` recommends, and one for a lens without
+  masks at f/48, both for 500 to 57,000 electrons of white at f/17.6 in the same time:
+    kornia-tidy train --learn network --design-from outputs/design --electrons 500 57000 \\
+      -o outputs/designed
+    kornia-tidy train --learn network --masks 1 --start flat --f-number 48 \\
+      --electrons 500 57000 -o outputs/flat
   Depth with its uncertainty, and the image, in some minutes on a CPU:
     kornia-tidy train --task joint --start "like fishers" --depth-classes 32 --refocus 11 --width 8 \\
       --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 -o outputs/uncertain
@@ -98,7 +108,14 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="go on with the run in FOLDER, if there is one")
     parser.add_argument("--head-from", metavar="CHECKPOINT", help="begin with the network of another run")
-    parser.add_argument("--masks-from", metavar="CHECKPOINT", help="begin with the masks of another run")
+    parser.add_argument(
+        "--masks-from", metavar="FILE", help="begin with the masks of another run, or of a camera that was saved"
+    )
+    parser.add_argument(
+        "--design-from",
+        metavar="FOLDER",
+        help="lens, depth range and masks that kornia-tidy design recommends in FOLDER; options given here go first",
+    )
 
     system = parser.add_argument_group("what is learnt")
     _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
@@ -109,7 +126,12 @@ def add_parser(subparsers: Any) -> None:
         help="both: masks and network together; network: behind fixed masks, with captures rendered once",
     )
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
-    _setting(system, "start", choices=STARTS, help="heights of the masks at first; Fisher suits depth, sweep edof")
+    _setting(
+        system,
+        "start",
+        choices=STARTS,
+        help="heights of the masks at first; Fisher suits depth, sweep edof; flat, with --masks 1: a lens alone",
+    )
     _setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
     _setting(
         system,
@@ -154,14 +176,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(data, "scenes", type=int, metavar="N", help="number for training, of patches and scenes made here")
     _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation, at most")
     _setting(data, "crop", type=int, metavar="PX", help="side of what a step sees of a scene; --learn network only")
-    _setting(
-        data,
-        "noise_range",
-        type=float,
-        nargs=2,
-        metavar=("LEAST", "LARGEST"),
-        help="read noise, of full scale, drawn for half of the captures; --learn network only",
-    )
+    _add_noise_settings(data)
     data.add_argument(
         "--captures",
         metavar="FOLDER",
@@ -200,6 +215,28 @@ def add_parser(subparsers: Any) -> None:
     )
 
 
+def _add_noise_settings(group: Any) -> None:
+    """Add the options of the noise in training of the network alone."""
+    _setting(
+        group,
+        "noise_range",
+        type=float,
+        nargs=2,
+        metavar=("LEAST", "LARGEST"),
+        help="read noise, of full scale, drawn for half of the captures; --learn network only",
+    )
+    _setting(
+        group,
+        "electrons",
+        type=float,
+        nargs=2,
+        metavar=("LEAST", "LARGEST"),
+        help="of white at --reference-f-number, drawn for the other half, which has shot noise: a smaller aperture "
+        "gets fewer in the same exposure time; default: 500 to 60000 at any f-number; --learn network only",
+    )
+    _setting(group, "reference_f_number", type=float, metavar="F", help="f-number of --electrons")
+
+
 def add_scene_options(group: Any) -> None:
     """Add the options of scenes, with defaults from stored settings."""
     _setting(group, "data", choices=tuple(SCENES), help="where scenes come from")
@@ -216,6 +253,14 @@ def add_camera_settings(group: Any) -> None:
         nargs=2,
         metavar=("NEAR", "FAR"),
         help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
+    )
+    _setting(group, "f_number", type=float, metavar="F", help="of the lens; default: 17.6, or by --depth-range")
+    _setting(
+        group,
+        "focus",
+        type=float,
+        metavar="M",
+        help="distance in focus, metres or inf; default: the middle of the range of 1/depth",
     )
     _setting(group, "focal_length", type=float, metavar="M", help="metres")
     _setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
@@ -248,13 +293,18 @@ def run(args: argparse.Namespace) -> None:
             f"--devices must be the number of processes that torchrun started, WORLD_SIZE={started}, got {args.devices}"
         )
     folder = Path(args.output)
-    stored = args.resume and (folder / SETTINGS).exists()
     given = given_settings(args)
-    usual = NETWORK_RUN if given.get("learn") == "network" else {}
-    settings = TrainingSettings.read(folder / SETTINGS) if stored else TrainingSettings(**usual)
-    settings = settings.replace(**given)
+    if args.design_from is not None:
+        given = {**designed_settings(args.design_from), **given}
+    if args.resume and (folder / SETTINGS).exists():
+        settings = TrainingSettings.read(folder / SETTINGS).replace(**given)
+    else:
+        settings = TrainingSettings(**{**usual_settings(given), **given})
     if args.captures is not None and settings.learn != "network":
         raise ValueError(f"--captures is for --learn network, got --learn {settings.learn}")
+    masks_from = args.masks_from
+    if args.design_from is not None and masks_from is None and settings.masks:
+        masks_from = designed_camera(args.design_from)
     say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # only one process prints
     many = {"strategy": "ddp"} if args.devices > 1 else {}
     say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
@@ -267,7 +317,7 @@ def run(args: argparse.Namespace) -> None:
             folder,
             resume=args.resume,
             head_from=args.head_from,
-            masks_from=args.masks_from,
+            masks_from=masks_from,
             captures=args.captures,
             save_every=args.save_every,
             workers=args.workers,

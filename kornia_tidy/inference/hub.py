@@ -172,6 +172,8 @@ def _state(config: Mapping[str, Any], weights: Mapping[str, Tensor], name: str) 
         known |= value
     if isinstance(ends := known.get("depth_range"), list):
         known["depth_range"] = [math.inf if end == "inf" else end for end in ends]
+    if known.get("focus") == "inf":
+        known["focus"] = math.inf
     return {"settings": known, "global_step": config.get("global_step"), "state_dict": dict(weights)}
 
 

@@ -82,10 +82,10 @@ def model_card(system: TrainedSystem, title: str, license: str | None = None) ->
     )
     sections = [
         _metadata(settings, license),
-        f"# {title}\n\nA simulated camera with {_masks(settings)} and a network that reconstructs {estimates} from one "
+        f"# {title}\n\nA simulated camera with {_masks(system)} and a network that reconstructs {estimates} from one "
         f"of its captures. Camera and network belong together. Both were made with kornia_tidy.",
         f"## Use\n\n{_USE.format(title=title, maps=', '.join(MAPS[settings.task]))}",
-        f"## Camera and network\n\n{_table(('setting', 'value'), _camera(settings))}",
+        f"## Camera and network\n\n{_table(('setting', 'value'), _camera(system))}",
         f"## Training\n\n{_training(system)}",
         f"## Scores\n\n{_scores(system.record.get('scores'))}",
         f"## Intended use\n\n{_INTENDED}",
@@ -128,21 +128,30 @@ def _metadata(settings: SystemSettings, license: str | None) -> str:  # noqa: A0
     return "\n".join(["---", *lines, *(f"- {tag}" for tag in tags), "---"])
 
 
-def _masks(settings: SystemSettings) -> str:
+def _masks(system: TrainedSystem) -> str:
+    settings = system.settings
     if not settings.masks:
         return "a fixed Fresnel lens"
+    if _is_flat(system):
+        return "a lens without masks"
     return f"{settings.masks} learnt phase mask{'s shown during one exposure' if settings.masks > 1 else ''}"
 
 
-def _camera(settings: SystemSettings) -> list[tuple[str, str]]:
+def _is_flat(system: TrainedSystem) -> bool:
+    """Return whether the camera is a lens alone: masks of zero height that were not trained."""
+    return system.settings.start == "flat" and system.run.get("learn") == "network"
+
+
+def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
+    settings = system.settings
     camera = settings.camera()
     near, far = camera.depth_range
     return [
         ("task", settings.task),
-        ("phase masks", str(settings.masks)),
+        ("phase masks", "none" if _is_flat(system) else str(settings.masks)),
         ("lens", f"{camera.focal_length * 1e3:.4g} mm, f/{camera.focal_length / camera.aperture_diameter:.3g}"),
-        ("focused at", f"{camera.focus_distance:.4g} m"),
-        ("range of depth", f"{near:.4g} m to {'infinity' if math.isinf(far) else f'{far:.4g} m'}"),
+        ("focused at", _distance(float(camera.focus_distance))),
+        ("range of depth", f"{near:.4g} m to {_distance(far)}"),
         ("pixel pitch", f"{camera.pixel_pitch * 1e6:.4g} µm"),
         ("read noise", f"{settings.sigma:.4g} of full scale"),
         ("PSFs", f"fidelity {settings.fidelity!r}, window {settings.window} pixels"),
@@ -151,6 +160,10 @@ def _camera(settings: SystemSettings) -> list[tuple[str, str]]:
         ("estimates the difference to the capture", "yes" if settings.residual else "no"),
         ("depths refocused to before the network", str(settings.refocus)),
     ]
+
+
+def _distance(metres: float) -> str:
+    return "infinity" if math.isinf(metres) else f"{metres:.4g} m"
 
 
 def _training(system: TrainedSystem) -> str:

@@ -16,12 +16,13 @@ from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.inference.heads import CLOSED_FORMS, check_head
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
-from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 
+Distance = float  # metres, may be infinite
 MOST = 1024  # masks, or depths to refocus to: more would take days
 
 
@@ -40,6 +41,8 @@ class SystemSettings:
         pixel_pitch: of the sensor in metres.
         depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default
             lens, from 0.298 m to infinity.
+        f_number: focal length over the diameter of the aperture. None: f/17.6, or as chosen for ``depth_range``.
+        focus: distance in focus in metres; may be ``inf``. None: the middle of the range of inverse depth.
         sigma: read noise of the sensor, in units of full scale.
         fidelity: name of the preset by which PSFs are computed.
         window: side of the PSFs in pixels. None: measured on the initial masks, then fixed.
@@ -75,6 +78,8 @@ class SystemSettings:
     focal_length: float = 50e-3
     pixel_pitch: float = 8e-6
     depth_range: tuple[float, float] | None = None
+    f_number: float | None = None
+    focus: Distance | None = None
     sigma: float = 0.01
     fidelity: str = "balanced"
     window: int | None = None
@@ -100,6 +105,7 @@ class SystemSettings:
             check_choice("stray_light", self.stray_light, STRAY_LIGHT)
         for name in ("focal_length", "pixel_pitch"):
             check_positive(name, getattr(self, name))
+        self._check_lens()
         for name in ("masks", "refocus", "depth_classes", "seed"):
             check_count(name, getattr(self, name), 0)
         for name in ("masks", "refocus", "depth_classes"):
@@ -119,6 +125,14 @@ class SystemSettings:
             self._check_distribution()
         if self.depth_range is not None:
             object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
+
+    def _check_lens(self) -> None:
+        if self.f_number is not None and self.f_number < FASTEST:
+            raise ValueError(f"f_number must be {FASTEST} or more, got {self.f_number}")
+        if self.focus is not None and not self.focus > self.focal_length:
+            raise ValueError(
+                f"focus must be metres beyond the focal length of {self.focal_length:g} m, got {self.focus}"
+            )
 
     def _check_distribution(self) -> None:
         if self.task != "joint" or self.residual:
@@ -140,6 +154,17 @@ class SystemSettings:
     def camera(self) -> ThinLensCamera:
         """Return the lens and the sensor's pixels."""
         lens: dict[str, Any] = {"focal_length": self.focal_length, "pixel_pitch": self.pixel_pitch}
+        if self.f_number is None and self.focus is None:
+            return self._chosen_camera(lens)
+        near, far = ThinLensCamera().depth_range if self.depth_range is None else self.depth_range
+        diameter = (
+            self._chosen_camera(lens).aperture_diameter if self.f_number is None else self.focal_length / self.f_number
+        )
+        focus = 2 / (1 / near + 1 / far) if self.focus is None else self.focus
+        return ThinLensCamera(aperture_diameter=diameter, focus_distance=focus, depth_range=(near, far), **lens)
+
+    def _chosen_camera(self, lens: dict[str, Any]) -> ThinLensCamera:
+        """Return the lens whose focus and aperture follow from the depth range, or the default one."""
         return (
             ThinLensCamera(**lens) if self.depth_range is None else ThinLensCamera.for_scene(self.depth_range, **lens)
         )
@@ -208,6 +233,7 @@ _KINDS = {
     "bool": "true or false",
     "int": "a whole number",
     "float": "a finite number",
+    "Distance": "a number of metres",
     "tuple[float, float]": "two numbers",
 }
 
@@ -217,6 +243,8 @@ def _is_a(kind: str, value: Any) -> bool:
         return isinstance(value, (tuple, list)) and len(value) == 2 and all(_is_number(end) for end in value)
     if kind == "float":
         return _is_number(value) and math.isfinite(value)
+    if kind == "Distance":
+        return _is_number(value)
     if kind == "int":
         return isinstance(value, int) and not isinstance(value, bool)
     return isinstance(value, {"str": str, "bool": bool}[kind])

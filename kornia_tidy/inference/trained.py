@@ -13,7 +13,7 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.heads import CLOSED_FORMS, check_imported, make_head
 from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.inference.state_file import WHAT, read_state
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.masks.fresnel import FresnelLens
@@ -26,6 +26,7 @@ from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointH
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.tensor_files import read_tensors
 
 
 class TrainedSystem(NamedTuple):
@@ -216,17 +217,19 @@ def load_weights(
 
 
 def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
-    """Load the masks of a checkpoint into a camera, which may differ from the checkpoint's in all else.
+    """Load the masks of a checkpoint or of a camera into a camera, which may differ in all else.
 
     Args:
-        checkpoint: path of a file that ``kornia-tidy train`` wrote.
+        checkpoint: path of a file that ``kornia-tidy train`` wrote, or of a camera's state, such as
+            ``camera.safetensors`` of ``kornia-tidy design``.
         optics: camera with as many masks of the same family and size. Its PSF window stays as it is.
 
     Raises:
         ValueError: if the masks do not fit. Nothing is then loaded.
     """
-    prefix = "optics.masks."
-    own = below(read_state(checkpoint)["state_dict"], prefix)
+    tensors, header = read_tensors(checkpoint, WHAT)
+    prefix = "masks." if header.get("format") is None else "optics.masks."
+    own = below(tensors if prefix == "masks." else read_state(checkpoint)["state_dict"], prefix)
     check_weights(optics.masks, own, f"{checkpoint}, {prefix.removesuffix('.')}")
     optics.masks.load_state_dict(own)
 

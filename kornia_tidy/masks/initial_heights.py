@@ -14,7 +14,7 @@ from kornia_tidy.masks.zernike import ZernikeMask
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 CLEAN = {"noisy fishers": 0, "fisher, noisy fishers": 1, "3 fishers, 2 noisy": 3}  # Fisher masks without noise
-STARTS = ("noise", "fisher, noise", *CLEAN, "like fishers", "focal sweep")
+STARTS = ("noise", "fisher, noise", *CLEAN, "like fishers", "focal sweep", "flat")
 
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
 SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; defocus at which each of the five masks is in focus
@@ -66,7 +66,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     """Return the initial heights of a sequence of five masks.
 
     Args:
-        start: name of the initialisation. The first five are the paper's, the last two our own:
+        start: name of the initialisation. The first five are the paper's, the others our own:
 
             - ``"noise"``: noise uniform on [0, 1.2e-6] m.
             - ``"fisher, noise"``: the Fisher mask, and four masks of such noise.
@@ -78,6 +78,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
               deviation 6e-8 m. Rotated masks would blur the average PSF.
             - ``"focal sweep"``: for extended depth of field, lenses in focus at a defocus of 0, -8, 8, -16 and 16 rad,
               with normal noise of standard deviation 6e-8 m.
+            - ``"flat"``: zero everywhere, the lens alone.
         generator: source of the noise.
 
     Returns:
@@ -108,6 +109,8 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(5, 23, 23, generator=generator, dtype=torch.float64)
     if start == "noise":
         return uniform
+    if start == "flat":
+        return torch.zeros_like(uniform)
     fisher = fisher_mask()
     if start == "fisher, noise":
         return torch.cat([fisher[None], uniform[1:]])

@@ -69,8 +69,8 @@ class TidyTraining(pl.LightningModule):
     global generator). Batches of :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`, which hold captures, are for
     ``learn="network"``.
 
-    A network whose ``forward`` has an argument ``noise`` is given the standard deviation of each capture's noise,
-    (B, 1, 1, 1), in linear light with full scale 1.
+    A network whose ``forward`` has an argument ``noise`` is given the standard deviation of the captures' noise in each
+    pixel, (B, 3, H, W), in linear light with full scale 1.
 
     Args:
         optics: the camera. Its PSF window stays the same during training; checkpoints hold it.
@@ -172,7 +172,7 @@ class TidyTraining(pl.LightningModule):
 
         Args:
             coded: captures, (B, 3, H, W).
-            noise: standard deviation of their noise, (B, 1, 1, 1), for a network that is conditioned on it. None: that
+            noise: standard deviation of their noise, (B, 3, H, W), for a network that is conditioned on it. None: that
                 of the camera's sensor.
         """
         network = self.head if self.training or self.average is None else self.average

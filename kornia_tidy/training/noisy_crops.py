@@ -11,6 +11,7 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
+from kornia_tidy.sensor.exposure import electrons_at
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 
@@ -32,7 +33,7 @@ class NoisyCrops(Dataset):
     No value exceeds full scale, as g is limited to the reciprocal of the crop's brightest value in each channel.
 
     Half of the captures have read noise alone, with a standard deviation uniform in its logarithm. The others have shot
-    noise, of a full well of 500 to 60,000 electrons, and a read noise of 2.4 electrons.
+    noise, of a full well uniform in its logarithm, and a read noise of 2.4 electrons.
 
     All draws are from torch's global generator, which
     :class:`~kornia_tidy.training.scenes.RepeatableScenes` seeds by epoch and index.
@@ -40,19 +41,21 @@ class NoisyCrops(Dataset):
     Args:
         captures: of fixed optics.
         optics: their camera, for the encoding of the sensor's values.
-        crop: side of the crop in pixels. None: the whole capture, with a gain of one.
+        crop: side of the crop in pixels. None: the whole capture.
         noise_range: least and largest standard deviation of the read noise, in linear light, full scale 1.
+        electrons: least and largest full well of the captures with shot noise, see :func:`electrons_of`.
+        gain: draw gains. False: the gain is one, as for validation.
 
     Raises:
-        ValueError: if the range is not 0 < least <= largest, or a capture is smaller than the crop.
+        ValueError: if a range is not 0 < least <= largest, or a capture is smaller than the crop.
 
     Convention:
         Items are mappings of
 
         - ``"coded"``: the capture (3, H, W), and ``"image"``: the all-in-focus image, both encoded as the camera does;
         - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True where depth is known;
-        - ``"noise"``: (1, 1, 1), standard deviation of the noise in linear light, full scale 1. Of shot noise it is the
-          root mean square over the crop.
+        - ``"noise"``: (3, H, W), standard deviation of the noise in linear light, full scale 1, by the sensor's model
+          and the noisy capture, as for a capture whose scene is unknown.
 
     Source: Foi et al., Practical Poissonian-Gaussian noise modeling (TIP 2008), for the noise; training over a range of
     noise levels as in Zhang et al., FFDNet (TIP 2018).
@@ -64,10 +67,15 @@ class NoisyCrops(Dataset):
         optics: TiDyOptics,
         crop: int | None = None,
         noise_range: tuple[float, float] = (1e-3, 0.03),
+        electrons: tuple[float, float] = FULL_WELL,
+        *,
+        gain: bool = True,
     ) -> None:
         check_noise_range(noise_range)
+        check_electrons(electrons)
         check_part("captures", captures, NoiseFreeCaptures, "NoiseFreeCaptures")
-        self.captures, self.encode, self.crop, self.noise_range = captures, optics.encode, crop, noise_range
+        self.captures, self.encode, self.crop, self.gain = captures, optics.encode, crop, gain
+        self.noise_range, self.electrons = noise_range, electrons
 
     def __len__(self) -> int:
         """Return the number of captures."""
@@ -79,16 +87,17 @@ class NoisyCrops(Dataset):
         if self.crop is not None:
             window = random_window(light.shape[-2], light.shape[-1], self.crop)
             light, image, inverse_depth, mask = (plane[window] for plane in (light, image, inverse_depth, mask))
+        if self.gain:
             gain = random_gain(torch.maximum(light.amax((1, 2)), image.amax((1, 2))))
             light, image = light * gain, image * gain
-        sensor = random_sensor(self.noise_range)
+        sensor = random_sensor(self.noise_range, self.electrons)
         coded = sensor(light[None])[0]
         return {
             "coded": self.encode(coded[None])[0],
             "image": self.encode(image[None])[0],
             "inverse_depth": inverse_depth,
             "mask": mask,
-            "noise": sensor.std(light).square().mean().sqrt().view(1, 1, 1),
+            "noise": sensor.std(coded),
         }
 
 
@@ -97,6 +106,34 @@ def check_noise_range(noise_range: tuple[float, float]) -> None:
     least, largest = noise_range
     if not 0 < least <= largest < 1:
         raise ValueError(f"noise_range must be 0 < least <= largest < 1 of full scale, got {least} and {largest}")
+
+
+def check_electrons(electrons: tuple[float, float]) -> None:
+    """Raise ``ValueError`` unless a range of electrons is finite, positive and ordered."""
+    least, largest = electrons
+    if not 0 < least <= largest < math.inf:
+        raise ValueError(f"electrons must be 0 < least <= largest, got {least} and {largest}")
+
+
+def electrons_of(
+    f_number: float, electrons: tuple[float, float] | None, reference_f_number: float
+) -> tuple[float, float]:
+    """Return the range of the full well in training, the same exposure time and light for every aperture.
+
+    Args:
+        f_number: of the camera.
+        electrons: least and largest number of electrons of a white pixel at the reference f-number. None: ``FULL_WELL``
+            for every aperture.
+        reference_f_number: f-number at which they are counted.
+
+    Example:
+        >>> electrons_of(35.2, (500, 57000), 17.6)
+        (125.0, 14250.0)
+    """
+    if electrons is None:
+        return FULL_WELL
+    least, largest = (electrons_at(f_number, count, reference_f_number) for count in electrons)
+    return least, largest
 
 
 def random_window(height: int, width: int, side: int) -> tuple[slice, slice, slice]:
@@ -129,18 +166,19 @@ def random_gain(peak: Tensor) -> Tensor:
     return torch.minimum(gain, 1 / peak.clamp(min=1e-6))[:, None, None]
 
 
-def random_sensor(noise_range: tuple[float, float]) -> SensorNoise:
+def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, float] = FULL_WELL) -> SensorNoise:
     """Return a sensor with a noise drawn by torch's global generator; see :class:`NoisyCrops`.
 
     Args:
         noise_range: least and largest standard deviation of read noise without shot noise.
+        electrons: least and largest full well of sensors with shot noise.
 
     Example:
         >>> 0.001 <= random_sensor((0.001, 0.03)).sigma <= 0.03
         True
     """
     with_shot, place = torch.rand(2).tolist()
-    least, largest = FULL_WELL if with_shot < SHOT_SHARE else noise_range
+    least, largest = electrons if with_shot < SHOT_SHARE else noise_range
     level = least * (largest / least) ** place
     if with_shot < SHOT_SHARE:
         return SensorNoise(READ_ELECTRONS / level, full_well=level)

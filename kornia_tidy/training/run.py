@@ -27,7 +27,7 @@ from kornia_tidy.training.data_module import SceneData
 from kornia_tidy.training.data_sets import PAINTED, make_scenes
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
-from kornia_tidy.training.noisy_crops import NoisyCrops
+from kornia_tidy.training.noisy_crops import NoisyCrops, electrons_of
 from kornia_tidy.training.settings import TrainingSettings, differences
 
 SETTINGS = "settings.json"
@@ -57,7 +57,8 @@ def train(
             with ``pretrain_epochs`` the same files of that stage in ``pretrain/``.
         resume: resume the run in the folder, if there is one.
         head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens.
-        masks_from: checkpoint with the initial masks, such as those of a shipped system.
+        masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
+            as ``camera.safetensors`` of ``kornia-tidy design``.
         captures: folder of the noise-free captures, for ``learn="network"``. Runs with the same camera and scenes may
             share it. Default: ``captures/`` in the folder of the run.
         save_every: steps between checkpoints within an epoch.
@@ -172,8 +173,10 @@ def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path)
     if settings.data not in PAINTED:  # of files, the number decides which are drawn
         about["scenes"] = len(cast("Any", scenes))
     captures = NoiseFreeCaptures(scenes, module.optics, folder, about)
-    crop = settings.crop if split == "train" else None
-    return NoisyCrops(captures, module.optics, crop, settings.noise_range)
+    training = split == "train"
+    electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
+    crop = settings.crop if training else None
+    return NoisyCrops(captures, module.optics, crop, settings.noise_range, electrons, gain=training)
 
 
 def _is_first_process() -> bool:

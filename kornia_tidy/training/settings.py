@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.inference.heads import CLOSED_FORMS, FIXED
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.head import check_count
-from kornia_tidy.training.noisy_crops import check_noise_range
+from kornia_tidy.training.noisy_crops import check_electrons, check_noise_range
 from kornia_tidy.training.task_loss import LOSSES
 
 SCHEDULES = ("constant", "cosine")
@@ -18,8 +19,8 @@ PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics alw
 LEARN = ("both", "network")
 
 NETWORK_RUN: dict[str, Any] = {
-    "learn": "network", "width": 8, "size": 256, "crop": 128, "scenes": 1000, "validation_scenes": 24, "batch": 4,
-    "lr": 2e-3, "schedule": "cosine", "loss": "charbonnier", "epochs": 24,
+    "learn": "network", "head": "nafnet", "closed_form": True, "width": 16, "size": 256, "crop": None, "scenes": 1000,
+    "validation_scenes": 24, "batch": 4, "lr": 2e-3, "schedule": "cosine", "loss": "charbonnier", "epochs": 24,
 }  # fmt: skip
 """Settings of a run of the network alone that differ from the defaults, which are the paper's for both."""
 
@@ -43,6 +44,10 @@ class TrainingSettings(SystemSettings):
         crop: side of the crops of the captures in pixels, for ``learn="network"``. None: whole captures.
         noise_range: least and largest standard deviation of read noise, in units of full scale, for
             ``learn="network"``; the sensor's own noise is that of scores afterwards.
+        electrons: least and largest number of electrons of a white pixel at the reference f-number, for the captures
+            with shot noise of ``learn="network"``. A smaller aperture gets fewer in the same exposure time. None: 500
+            to 60,000 at every f-number.
+        reference_f_number: f-number at which the electrons are counted.
         scenes: number of training scenes, for data whose number of scenes is not fixed.
         validation_scenes: largest number of validation scenes.
         augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for ``learn="network"``.
@@ -79,6 +84,8 @@ class TrainingSettings(SystemSettings):
     size: int = 278
     crop: int | None = None
     noise_range: tuple[float, float] = (1e-3, 0.03)
+    electrons: tuple[float, float] | None = None
+    reference_f_number: float = 17.6
     scenes: int = 5077
     validation_scenes: int = 64
     augment: bool = True
@@ -103,7 +110,7 @@ class TrainingSettings(SystemSettings):
         check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
         check_choice("schedule", self.schedule, SCHEDULES)
-        for name in ("lr", "lr_metres"):
+        for name in ("lr", "lr_metres", "reference_f_number"):
             check_positive(name, getattr(self, name))
         for name in ("size", "scenes", "validation_scenes", "batch", "accumulate", "epochs"):
             check_count(name, getattr(self, name), 1)
@@ -115,6 +122,9 @@ class TrainingSettings(SystemSettings):
             raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
         object.__setattr__(self, "noise_range", tuple(self.noise_range))  # JSON has no tuples
         check_noise_range(self.noise_range)
+        if self.electrons is not None:
+            object.__setattr__(self, "electrons", tuple(self.electrons))
+            check_electrons(self.electrons)
         if self.crop is not None:
             check_count("crop", self.crop, 1)
             if self.crop > self.size:
@@ -133,6 +143,29 @@ class TrainingSettings(SystemSettings):
             return cls.from_dict({**system.settings.as_dict(), **system.run})
         except ValueError as error:
             raise ValueError(f"the checkpoint's settings of its run cannot be used: {error}") from error
+
+
+def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the defaults of a training run in which only the network learns; an empty dictionary for other runs.
+
+    They are those of :data:`NETWORK_RUN`, without the closed form where the head cannot have it or has its own:
+    networks of three channels, heads without a network, ``residual`` and ``depth_classes``.
+
+    Args:
+        given: settings that the user chose, by name.
+
+    Example:
+        >>> usual_settings({"learn": "network"})["width"], usual_settings({"learn": "both"})
+        (16, {})
+    """
+    if given.get("learn") != "network":
+        return {}
+    usual = dict(NETWORK_RUN)
+    if given.get("head") in (*FIXED, *CLOSED_FORMS):
+        del usual["closed_form"], usual["width"]
+    elif given.get("residual") or given.get("depth_classes"):
+        del usual["closed_form"]
+    return usual
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

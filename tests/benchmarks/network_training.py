@@ -39,7 +39,8 @@ from kornia_tidy.training.task_loss import LOSSES, task_loss
 from tests.benchmarks.scene_likeness import half_a
 from tests.scenes import ENTRIES, load_scene
 
-HEAD: dict[str, Any] = {"head": "attention-unet", "width": 8, "residual": True, "refocus": 5}
+HEAD: dict[str, Any] = {"head": "attention-unet", "width": 8, "closed_form": False, "residual": True, "refocus": 5}
+HEAD["crop"] = 128
 SETTINGS = TrainingSettings(**{**NETWORK_RUN, **HEAD, "sigma": 0.002})
 STEPS = 12
 NOISES = (0.002, 0.01, 0.03)

@@ -54,12 +54,21 @@ class TestTrain(BaseTester):
         assert main(["train", *SMALL, *options, "-o", str(run)]) == 0
         assert "the network behind fixed optics" in capsys.readouterr().out
         settings = TrainingSettings.read(run / "settings.json")
-        given = {"width": 4, "size": 40, "crop": 32, "scenes": 4, "validation_scenes": 1, "batch": 2, "epochs": 2}
+        given = {
+            "head": "plain",
+            "width": 4,
+            "size": 40,
+            "crop": 32,
+            "scenes": 4,
+            "validation_scenes": 1,
+            "batch": 2,
+            "epochs": 2,
+        }
         assert {name: getattr(settings, name) for name in NETWORK_RUN} == {**NETWORK_RUN, **given}
         assert len(list((run / "captures" / "train").glob("*.npy"))) == 4
         assert read_image(run / "learning_curve.png").shape[-1] == 1575
         assert load_trained(run / "best.safetensors").step in (2, 4)
-        both = ["--head-from", str(run / "best.safetensors"), "--epochs", "1", "--fidelity", "draft"]
+        both = ["--closed-form", "--head-from", str(run / "best.safetensors"), "--epochs", "1", "--fidelity", "draft"]
         assert main(["train", *SMALL, *both, "-o", str(tmp_path / "both")]) == 0
 
     @pytest.mark.parametrize(
@@ -74,6 +83,10 @@ class TestTrain(BaseTester):
             (["--batch", "8"], "4 scenes do not fill a batch of 8"),
             (["--head-from", "none.safetensors"], "cannot read none.safetensors: there is no such file"),
             (["--save-every", "0"], "--save-every must be 1 or more, got 0"),
+            (["--f-number", "0"], "f_number must be 0.5 or more, got 0.0"),
+            (["--focus", "0.05"], "focus must be metres beyond the focal length of 0.05 m, got 0.05"),
+            (["--electrons", "9", "2"], "electrons must be 0 < least <= largest, got 9.0 and 2.0"),
+            (["--design-from", "nowhere"], "nowhere/report.json"),
         ],
     )
     def test_exception_is_one_sentence(self, options, sentence, tmp_path, capsys):

@@ -42,7 +42,10 @@ class TestInitialHeights(BaseTester):
         self.assert_close(masks.heights().double(), heights, rtol=1e-5, atol=1e-12)
         assert heights.shape == (5, 23, 23)
         assert torch.equal(heights, drawn(start))
-        assert not torch.equal(heights, drawn(start, seed=1))
+        assert torch.equal(heights, drawn(start, seed=1)) == (start == "flat")
+
+    def test_feature_flat_masks_have_no_height(self):
+        assert not drawn("flat").any()
 
     def test_feature_noise_is_uniform(self):
         noise = drawn("noise")

@@ -15,7 +15,15 @@ from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.data import DeadLeaves
 from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.training.noise_free import LEVELS, NoiseFreeCaptures
-from kornia_tidy.training.noisy_crops import FULL_WELL, GAIN, NoisyCrops, random_gain, random_sensor, random_window
+from kornia_tidy.training.noisy_crops import (
+    FULL_WELL,
+    GAIN,
+    NoisyCrops,
+    electrons_of,
+    random_gain,
+    random_sensor,
+    random_window,
+)
 from kornia_tidy.training.scenes import SceneLoader
 from tests.base import BaseTester
 
@@ -145,7 +153,7 @@ class TestNoisyCrops(BaseTester):
             truth = captures[seed % 4]
             gain = sample["image"].sum((1, 2)) / truth.image.sum((1, 2))
             self.assert_close(sample["image"], gain[:, None, None] * truth.image, rtol=1e-4, atol=1e-6)
-            if sample["noise"] < 2e-6:  # no shot noise
+            if sample["noise"].max() < 2e-6:  # no shot noise
                 self.assert_close(sample["coded"], gain[:, None, None] * truth.light, rtol=0, atol=1e-5)
             assert sample["image"].max() <= 1 + 1e-6
             gains.append(gain)
@@ -157,16 +165,43 @@ class TestNoisyCrops(BaseTester):
         """Of 12,288 samples of one light: within five standard errors, 1 / sqrt(2 n) of it."""
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 0.0 if read_only else 1.0)
         captures, optics = grey
-        crops, told = NoisyCrops(captures, optics), []
+        crops, told = NoisyCrops(captures, optics, gain=False), []
         for seed in range(20):
             torch.manual_seed(seed)
             sample = crops[seed]
-            noise = float(sample["noise"])
-            assert sample["noise"].shape == (1, 1, 1)
+            noise = float(sample["noise"].square().mean().sqrt())
+            assert sample["noise"].shape == sample["coded"].shape
             assert float((sample["coded"] - 0.25).std()) == pytest.approx(noise, rel=5 / math.sqrt(2 * 12288))
             told.append(noise)
         assert 1e-3 <= min(told) < 3.3e-3
         assert 9e-3 < max(told) <= 0.03
+
+    def test_feature_shot_noise_is_told_by_the_light_of_each_pixel(self, leaves, monkeypatch):
+        """It is the root of read noise and of the noisy capture's own light, both in parts of the full well."""
+        monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 1.0)
+        captures, _ = leaves
+        linear = TiDyOptics(sensor=None, fidelity="draft", color_space="linear")
+        sample = NoisyCrops(captures, linear, electrons=(200.0, 200.0))[0]
+        expected = ((2.4 / 200) ** 2 + sample["coded"] / 200).sqrt()
+        self.assert_close(sample["noise"], expected, rtol=1e-5, atol=1e-7)
+        assert sample["noise"].std() > 1e-3
+
+    def test_feature_without_crop_the_whole_capture_is_seen_and_its_gain_varies_unless_it_is_for_scores(self, leaves):
+        captures, optics = leaves
+        torch.manual_seed(0)
+        whole = NoisyCrops(captures, optics)
+        light = [whole[0]["image"].mean() for _ in range(4)]
+        assert whole[0]["image"].shape == (3, 32, 32)
+        assert torch.stack(light).std() > 0.01
+        scored = NoisyCrops(captures, optics, gain=False)[0]["image"]
+        assert torch.equal(scored, optics.encode(captures[0].image[None])[0])
+
+    def test_feature_electrons_fall_with_the_square_of_the_f_number(self):
+        assert electrons_of(35.2, (500.0, 57e3), 17.6) == (125.0, 14250.0)
+        assert electrons_of(50.0, None, 17.6) == FULL_WELL
+        torch.manual_seed(0)
+        wells = [random_sensor((1e-3, 0.03), (125.0, 250.0)).full_well for _ in range(50)]
+        assert all(125 <= well <= 250 for well in wells if well is not None)
 
     def test_feature_read_noise_is_uniform_in_its_logarithm(self, monkeypatch):
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 0.0)
@@ -204,7 +239,7 @@ class TestNoisyCrops(BaseTester):
         other.load_state_dict({"epoch": 0, "batches": 1})
         (rest,) = list(other)
         assert set(rest) == {"coded", "image", "inverse_depth", "mask", "noise", "index", "name", "noise_seed"}
-        assert rest["noise"].shape == (2, 1, 1, 1)
+        assert rest["noise"].shape == (2, 3, 16, 16)
         for name in ("coded", "image", "inverse_depth", "mask", "noise"):
             assert torch.equal(rest[name], whole[1][name])
         other._batches.set_epoch(1)
@@ -218,5 +253,7 @@ class TestNoisyCrops(BaseTester):
         captures, optics = leaves
         with pytest.raises(ValueError, match="noise_range must be 0 < least <= largest < 1 of full scale, got 0 and"):
             NoisyCrops(captures, optics, 8, (0, 0.1))
+        with pytest.raises(ValueError, match="electrons must be 0 < least <= largest, got 9 and 2"):
+            NoisyCrops(captures, optics, 8, electrons=(9, 2))
         with pytest.raises(ValueError, match="the crop must not exceed the captures of 32 x 32 pixels, got 33"):
             NoisyCrops(captures, optics, 33)[0]

@@ -28,7 +28,7 @@ from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
-from kornia_tidy.training.settings import TrainingSettings
+from kornia_tidy.training.settings import NETWORK_RUN, TrainingSettings, usual_settings
 from kornia_tidy.training.task_loss import LOSSES, task_loss
 from tests.base import BaseTester
 
@@ -170,7 +170,9 @@ class TestTasks(BaseTester):
 
 class TestSettings(BaseTester):
     def test_feature_json_brings_back_what_was_written(self, tmp_path):
-        settings = TrainingSettings(task="joint", depth_range=(0.5, float("inf")), patience=3, width=8)
+        settings = TrainingSettings(
+            task="joint", depth_range=(0.5, float("inf")), f_number=48.0, focus=float("inf"), electrons=(500.0, 57e3)
+        )
         settings.write(tmp_path / "a.json")
         assert TrainingSettings.read(tmp_path / "a.json") == settings
 
@@ -179,6 +181,35 @@ class TestSettings(BaseTester):
         assert (settings.lr, settings.lr_metres, settings.batch, settings.masks) == (1e-4, 1e-8, 32, 5)
         assert (settings.depth_weight, settings.image_weight, settings.size) == (1, 1, 278)
         assert (settings.head, settings.width, settings.loss) == ("attention-unet", None, "mse")
+
+    @pytest.mark.parametrize("depth_range", [None, (0.5, 4.0)])
+    def test_feature_a_lens_has_the_aperture_and_the_focus_that_are_given(self, depth_range):
+        """What is not given is as without both; the focus then is that of the middle of the range of inverse depth."""
+        usual = SystemSettings(depth_range=depth_range).camera()
+        slow = SystemSettings(depth_range=depth_range, f_number=48.0).camera()
+        far = SystemSettings(depth_range=depth_range, f_number=48.0, focus=float("inf")).camera()
+        near = SystemSettings(depth_range=depth_range, focus=0.6).camera()
+        assert slow.f_number == far.f_number == pytest.approx(48)
+        assert far.focus_distance == float("inf")
+        assert near.focus_distance == 0.6
+        assert near.aperture_diameter == usual.aperture_diameter
+        assert slow.focus_distance == pytest.approx(usual.focus_distance)
+        assert {lens.depth_range for lens in (usual, slow, far, near)} == {usual.depth_range}
+
+    @pytest.mark.parametrize(
+        ("given", "changes"),
+        [
+            ({"learn": "both"}, None),
+            ({"learn": "network"}, set()),
+            ({"learn": "network", "head": "midas-small"}, {"closed_form", "width"}),
+            ({"learn": "network", "residual": True}, {"closed_form"}),
+            ({"learn": "network", "task": "joint", "depth_classes": 8, "refocus": 2}, {"closed_form"}),
+        ],
+    )
+    def test_feature_defaults_of_the_network_alone_fit_what_is_given(self, given, changes):
+        usual = usual_settings(given)
+        assert TrainingSettings(**{**usual, **given}).learn == given["learn"]
+        assert set(usual) == (set() if changes is None else set(NETWORK_RUN) - changes)
 
     def test_feature_settings_stored_before_there_was_a_choice_of_loss_are_read(self):
         values = TrainingSettings(head="plain").as_dict()
@@ -206,6 +237,10 @@ class TestSettings(BaseTester):
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
             ({"learn": "masks"}, "learn must be one of 'both', 'network', got 'masks'"),
             ({"size": 64, "crop": 65}, "crop must be at most the size of the scenes, 64, got 65"),
+            ({"f_number": 0.4}, "f_number must be 0.5 or more, got 0.4"),
+            ({"focus": float("nan")}, "focus must be a number of metres, got nan"),
+            ({"focus": 0.05}, "focus must be metres beyond the focal length of 0.05 m, got 0.05"),
+            ({"electrons": [10.0, float("inf")]}, "electrons must be 0 < least <= largest, got 10.0 and inf"),
             ({"noise_range": [0.1, 0.01]}, "noise_range must be 0 < least <= largest < 1 of full scale, got 0.1 and 0"),
         ],
     )
