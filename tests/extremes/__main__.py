@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import datetime
+import datetime as dt
 import platform
 from pathlib import Path
 
@@ -34,20 +34,20 @@ def main() -> None:
                 failures.append(f"{row.name}: {error}")
             progress.update()
     for name in failures:
-        print(f"beyond its bound: {name}")  # noqa: T201
+        print(f"beyond its bound: {name}")
     if failures:
         raise SystemExit(1)
     if arguments.quick or arguments.only:
         for name, found in results.items():
-            print(f"{name} | {found}")  # noqa: T201
+            print(f"{name} | {found}")
         return
     with tqdm(total=sum(len(curve.values) for curve in growth.CURVES), unit="point") as progress:
         curves = growth.measured(progress)
     growth.draw(curves, DOCS / "images" / "extremes_growth.png")
     made = (
-        f"Measured on {datetime.datetime.now(tz=datetime.UTC):%d %B %Y}, {platform.machine()}, "
-        f"{torch.backends.cpu.get_cpu_capability()}, one thread, torch {torch.__version__.split('+')[0]}. Errors differ "
-        f"in their digits between machines; the bounds hold on all."
+        f"Measured on {dt.datetime.now(tz=dt.UTC):%d %B %Y}, {platform.machine()}, "
+        f"{torch.backends.cpu.get_cpu_capability()}, one thread, torch {torch.__version__.split('+')[0]}. "
+        f"Errors differ in their digits between machines; the bounds hold on all."
     )
     (DOCS / "extremes.md").write_text(page(results, curves, made), encoding="utf-8")
 

@@ -52,11 +52,11 @@ def rows() -> list[Row]:
     wide = {"clip": False}
     standard = "exact mean and variance, in standard errors of 200,000 samples"
     return [
-        Row(GROUP, "light, electrons", "0 (full well 1e4)", lambda: _statistics(SensorNoise(0.0, full_well=1e4), 0.0), 0.0,
-            "no electrons"),
+        Row(GROUP, "light, electrons", "0 (full well 1e4)",
+            lambda: _statistics(SensorNoise(0.0, full_well=1e4), 0.0), 0.0, "no electrons"),
         Row(GROUP, "light, electrons", "-2e-5, round-off of a transform", _negative, 0.0, "no electrons"),
-        *(Row(GROUP, "light, electrons", text, lambda well=well: _statistics(SensorNoise(0.0, full_well=well, **wide), 0.5),
-              SIGMAS, standard)
+        *(Row(GROUP, "light, electrons", text,
+              lambda well=well: _statistics(SensorNoise(0.0, full_well=well, **wide), 0.5), SIGMAS, standard)
           for text, well in (("0.5 (full well 1)", 1.0), ("5", 10.0), ("5e4", 1e5), ("5e6", 1e7), ("5e11", 1e12))),
         Row(GROUP, "light, full scale", "1e-30, 1e6, 1e30 (HDR)",
             lambda: _finite(SensorNoise(0.01, full_well=1e4, **wide), 1e-30, 1e6, 1e30), 0.0, "finite"),

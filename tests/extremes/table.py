@@ -15,8 +15,8 @@ INTRODUCTION = """\
 How exact captures are far from usual settings, and what happens beyond what is allowed. Every row was measured by
 `make extremes`, which writes this page; `tests/extremes/test_extremes.py` checks the quick rows in every test run.
 
-* **Error**: the largest over all values of the row. Where it says float64, the same capture was computed in float64 with
-  otherwise the same settings; images are random, depths jump between 0.3 m and infinity.
+* **Error**: the largest over all values of the row. Where it says float64, the same capture was computed in float64
+  with otherwise the same settings; images are random, depths jump between 0.3 m and infinity.
 * **Allowed**: what the test admits. Captures in float32 must be within 1e-4 of full scale.
 * **Refused**: `ValueError` or `TypeError` with one sentence, before any work. The table shows the first one.
 """
