@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from kornia_tidy.checks import check_choice, check_part, check_positive
 
 LAYERS = ("nearest", "linear", "cubic", "bandlimited")
+WIDEST_WINDOW = 4095  # pixels; a PSF of three colours then takes 0.19 GiB
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,11 @@ class Fidelity:
         for name, side in (("window", self.window), ("max_window", self.max_window)):
             if side is not None and (side < 1 or side % 2 == 0):
                 raise ValueError(f"{name} must be an odd number of pixels, got {side}")
+            if side is not None and side > WIDEST_WINDOW:
+                raise ValueError(
+                    f"{name} must be at most {WIDEST_WINDOW} pixels, got {side}: a PSF of three colours would take "
+                    f"{3 * 4 * side**2 / 2**30:.3g} GiB, at each depth"
+                )
 
     @classmethod
     def preset(cls, name: str) -> Fidelity:

@@ -37,6 +37,8 @@ class TestFidelity(BaseTester):
             ("wavelengths", 0),
             ("window", 22),
             ("max_window", 0),
+            ("window", 100001),
+            ("max_window", 4097),
         ],
     )
     def test_exception_names_knob_and_value(self, knob, value):

@@ -1,0 +1,168 @@
+"""Rows of images: sizes, values, types, memory layouts, threads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kornia_tidy import TiDyOptics
+from tests.extremes.exposure import camera
+from tests.extremes.lens import BOUND, CAPTURE
+from tests.extremes.row import Row, difference, refusals, rounding, scene, worst
+
+GROUP = "Images"
+SAME = "the contiguous float32 capture"
+
+
+def _size(height: int, width: int, batch: int = 1) -> float:
+    image, depth = scene(max(height, 1), max(width, 1))
+    image, depth = image.expand(batch, -1, -1, -1), depth.expand(batch, -1, -1, -1)
+    return rounding(camera(border="replicate"), image, depth)
+
+
+def _large(side: int) -> float:
+    """Crops at a corner and in the middle of a large capture, against float64 captures of their neighbourhoods."""
+    optics = camera()
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(1, 3, side, side, generator=generator)
+    depth = 1 / (3.3 * torch.rand(1, 1, side, 1, generator=generator)).expand(1, 1, side, side)
+    reach, errors = optics.window, []
+    with torch.no_grad():
+        whole = optics(image, depth)
+        for start in (0, side // 2):
+            part = slice(start, start + 64 + 2 * reach)
+            double = optics(image[..., part, part].double(), depth[..., part, part].double())
+            inner = slice(0 if start == 0 else reach, 64 + reach)
+            errors.append(difference(whole[..., part, part][..., inner, inner], double[..., inner, inner]))
+    return worst(errors)
+
+
+def _scaled(factor: float) -> float:
+    """Images of a constant factor, relative to it."""
+    image, depth = scene()
+    optics = camera()
+    with torch.no_grad():
+        single = optics((factor * image).float(), depth.float())
+        double = optics((factor * image).float().double(), depth.float().double())
+    return difference(single / factor, double / factor)
+
+
+def _linear() -> float:
+    """Negative light: the capture is linear, so it is minus that of the image."""
+    image, depth = scene()
+    optics = camera()
+    with torch.no_grad():
+        return difference(optics(-image, depth), -optics(image, depth))
+
+
+def _srgb(value: float) -> float:
+    image, depth = scene()
+    return rounding(camera(color_space="srgb"), value * torch.ones_like(image), depth)
+
+
+def _broken(value: float, **options: str) -> Callable[[], object]:
+    def attempt() -> object:
+        image, depth = scene()
+        image[..., 3, 4] = value
+        return camera(**options)(image, depth)
+
+    return attempt
+
+
+def _half(dtype: torch.dtype) -> float:
+    """In units of the type's rounding at full scale."""
+    image, depth = scene()
+    optics = camera()
+    with torch.no_grad():
+        found = optics(image.to(dtype), depth.float())
+        single = optics(image.to(dtype).float(), depth.float())
+    assert found.dtype == dtype
+    return difference(found, single) / (torch.finfo(dtype).eps / 2)
+
+
+def _layout(change: Callable[[Tensor], Tensor]) -> float:
+    image, depth = (part.float() for part in scene())
+    optics = camera()
+    with torch.no_grad():
+        return difference(optics(change(image), change(depth)), optics(image, depth))
+
+
+def _strided(tensor: Tensor) -> Tensor:
+    return tensor.repeat_interleave(2, -1)[..., ::2]
+
+
+def _threads(optics: TiDyOptics | None = None) -> float:
+    image, depth = (part.float() for part in scene(200, 210))
+    optics, before = optics or camera(masks=2), torch.get_num_threads()
+    captures = []
+    try:
+        for threads in (1, 4):
+            torch.set_num_threads(threads)
+            with torch.no_grad():
+                captures.append(optics(image, depth))
+    finally:
+        torch.set_num_threads(before)
+    return difference(*captures)
+
+
+def _deterministic() -> float:
+    """Two runs with torch's deterministic algorithms, gradients included."""
+    image, depth = (part.float() for part in scene())
+    results = []
+    torch.use_deterministic_algorithms(mode=True)
+    try:
+        for _ in range(2):
+            optics = camera(compositing="scatter")
+            leaf = image.clone().requires_grad_()
+            optics(leaf, depth).square().sum().backward()
+            assert leaf.grad is not None
+            assert optics.masks.phase.grad is not None
+            results.append(torch.cat([leaf.grad.flatten(), optics.masks.phase.grad.flatten()]))
+    finally:
+        torch.use_deterministic_algorithms(mode=False)
+    return difference(*results)
+
+
+def _empty() -> float:
+    image, depth = scene()
+    captured = camera()(image[:0], depth[:0])
+    return float(captured.numel())
+
+
+def rows() -> list[Row]:
+    """Return the rows of images."""
+    return [
+        Row(GROUP, "size, px", "1x1, 1x50, 50x1, 31x47, 97x101", lambda: worst([
+            _size(1, 1), _size(1, 50), _size(50, 1), _size(31, 47), _size(97, 101)]), BOUND, CAPTURE,
+            "border 'replicate'; 'reflect' needs half a window and says so"),
+        Row(GROUP, "size, px", "1024x1024, crops", lambda: _large(1024), BOUND, CAPTURE, slow=True),
+        Row(GROUP, "size, px", "4096x4096, crops", lambda: _large(4096), BOUND, CAPTURE, slow=True),
+        Row(GROUP, "batch", "0", _empty, 0.0, "no value"),
+        Row(GROUP, "batch", "3", lambda: _size(40, 44, 3), BOUND, CAPTURE),
+        Row(GROUP, "values, linear", "0", lambda: _srgb(0.0), 0.0, "black stays 0"),
+        Row(GROUP, "values, linear", "to 1e-30, 1e-3, 1e6, 1e30", lambda: worst(
+            [_scaled(factor) for factor in (1e-30, 1e-3, 1e6, 1e30)]), BOUND, "float64, relative to the factor",
+            "HDR passes; the camera is linear up to the sensor"),
+        Row(GROUP, "values, linear", "negative", _linear, 1e-12, "minus the capture, float64"),
+        Row(GROUP, "values, sRGB", "0.5, 1, 16", lambda: worst([_srgb(value) for value in (0.5, 1.0, 16.0)]), BOUND,
+            CAPTURE),
+        Row(GROUP, "values", "NaN; inf; 1e30 in sRGB", refusals(
+            _broken(math.nan), _broken(math.nan, color_space="srgb"), _broken(1e30, color_space="srgb"),
+            _broken(math.inf, color_space="srgb")), None),
+        Row(GROUP, "type", "float16", lambda: _half(torch.float16), 1.0, "rounding of float16 at 1",
+            "computed in float32, rounded once"),
+        Row(GROUP, "type", "bfloat16", lambda: _half(torch.bfloat16), 1.0, "rounding of bfloat16 at 1",
+            "computed in float32, rounded once"),
+        Row(GROUP, "type", "uint8, int64, complex, bool", refusals(*(
+            lambda dtype=dtype: camera()(torch.ones(1, 3, 40, 44).to(dtype), torch.ones(1, 1, 40, 44))
+            for dtype in (torch.uint8, torch.int64, torch.complex64, torch.bool))), None),
+        Row(GROUP, "memory layout", "channels_last, every second column, expanded",
+            lambda: max(_layout(lambda part: part.contiguous(memory_format=torch.channels_last)), _layout(_strided)),
+            2e-6, SAME, "the same to rounding: sums may run in another order"),
+        Row(GROUP, "threads", "1 and 4", _threads, 1e-6, "one another, full scale 1",
+            "last digits: transforms divide the work by the number of threads"),
+        Row(GROUP, "deterministic algorithms", "twice, with gradients", _deterministic, 0.0, "one another"),
+    ]  # fmt: skip
