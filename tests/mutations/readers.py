@@ -27,8 +27,8 @@ from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.picture_header import check_header
 from kornia_tidy.data.rgbd_folder import described_folder
-from kornia_tidy.files import read_json
 from kornia_tidy.figures.learning_curve import draw_learning_curve
+from kornia_tidy.files import read_json
 from kornia_tidy.inference.hub import from_pretrained, save_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
@@ -223,7 +223,7 @@ def _runs(folder: Path) -> list[Case]:
 
 
 def _draw(path: Path) -> None:
-    import matplotlib.pyplot as plt  # noqa: PLC0415
+    import matplotlib.pyplot as plt
 
     plt.close(draw_learning_curve(path.parent))
 

@@ -48,14 +48,15 @@ BY_STRUCTURE = BY_KIND | {
 }
 
 
-
 def main() -> int:
     """Run, and return 0 if all readers behaved."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutations.reading", description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=100_000, help="files (default: 100000)")
     parser.add_argument("--seed", type=int, default=0, help="(default: 0)")
     parser.add_argument("--kind", help="of this kind only")
-    parser.add_argument("--guided", action="store_true", help="damage files further that reach new lines of the package")
+    parser.add_argument(
+        "--guided", action="store_true", help="damage files further that reach new lines of the package"
+    )
     parser.add_argument("--keep", type=Path, default=Path("outputs/mutations"), help="where failures are kept")
     args = parser.parse_args()
     torch.set_num_threads(1)  # threads do not live on in a fork
@@ -104,7 +105,7 @@ def read_all(cases: list[Case], seed: int, chosen: range, folder: Path, guided: 
             _child(cases, seed, chosen, folder, write, guided)
         os.close(write)
         last = chosen.start - 1
-        for last, result, said, data in _received(read):  # noqa: B007
+        for last, result, said, data in _received(read):
             yield last, result, said, data
         os.close(read)
         os.kill(process, 9)

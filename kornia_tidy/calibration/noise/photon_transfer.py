@@ -384,5 +384,5 @@ def _numbers(kind: type, entry: dict[str, Any]) -> Any:
     """Convert a JSON object to a dataclass, and raise if a field other than the channel's name is not a number."""
     for name, value in entry.items():
         if name != "channel" and (isinstance(value, bool) or not isinstance(value, (int, float))):
-            raise ValueError(f"{name} must be a number, got {value!r}")
+            raise ValueError(f"{name:.80} must be a number, got {value!r:.80}")
     return kind(**entry)
