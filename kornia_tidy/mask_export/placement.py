@@ -185,7 +185,7 @@ class PanelPlacement:
         return (size[1], size[0]) if self.rotate % 180 else (size[0], size[1])
 
     def _orient(self, values: Tensor) -> Tensor:
-        return torch.rot90(self._mirror(values), self.rotate // 90, (-2, -1))
+        return torch.rot90(self._mirror(values), int(self.rotate) // 90, (-2, -1))
 
     def _orient_back(self, values: Tensor) -> Tensor:
         return self._mirror(torch.rot90(values, -self.rotate // 90, (-2, -1)))

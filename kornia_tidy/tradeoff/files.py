@@ -60,7 +60,7 @@ def read_json(path: str | os.PathLike[str]) -> TradeRun:
         conditions = Conditions(**_checked("conditions", Conditions, document["conditions"]))
         return TradeRun(conditions, tuple(_row(entry) for entry in document["rows"]))
     except ValueError as error:  # includes errors of JSON and Unicode
-        raise ValueError(f"{path} is not a readable sweep: {error}") from None
+        raise ValueError(f"{path} is not a readable sweep: {error!s:.500}") from None
 
 
 def write_csv(path: str | os.PathLike[str], rows: Iterable[TradeRow]) -> None:
@@ -92,7 +92,7 @@ def read_csv(path: str | os.PathLike[str]) -> list[TradeRow]:
         _check_names("the header", dict.fromkeys(reader.fieldnames or ()), set(_columns()))
         return [_row(_typed(cells)) for cells in map(_whole, reader)]
     except (ValueError, csv.Error) as error:
-        raise ValueError(f"{path} is not a readable sweep: {error}") from None
+        raise ValueError(f"{path} is not a readable sweep: {error!s:.500}") from None
 
 
 def markdown(rows: Sequence[TradeRow]) -> str:

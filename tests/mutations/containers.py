@@ -13,8 +13,8 @@ from tests.mutations.damage import NUMBERS, TEXTS, Generator, pick
 
 WORDS = (
     *(str(number) for number in (*NUMBERS, -1, 10**12, 10**30)), *TEXTS, "1e400", "-inf", "/etc/passwd", "a.tar:0:9",
-    "00000.tar:0:1000000000000", "00000.tar:-5:3", f"00000.tar:{10**30}:{10**30}", "/dev/zero:0:99", ".", "..", "\ufeff",
-    "\u0661", '"', "'", ",", "\r", "#", "[1 2", "0x10", "1_0", "\U0001f600",
+    "00000.tar:0:1000000000000", "00000.tar:-5:3", f"00000.tar:{10**30}:{10**30}", "/dev/zero:0:99", ".", "..",
+    "\ufeff", "\u0661", '"', "'", ",", "\r", "#", "[1 2", "0x10", "1_0", "\U0001f600",
 )  # fmt: skip
 
 

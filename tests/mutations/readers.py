@@ -123,14 +123,19 @@ def _systems(folder: Path) -> list[Case]:
     torch.save({"conv.weight": torch.zeros(3, 4)}, folder / "midas.pt")
     hub = save_pretrained(load_trained(plain), folder / "hub", record={})
     load_trained(plain).settings.write(folder / "settings.json")
+    wrapped = folder / "refocused.safetensors"
     return [
-        *(Case("checkpoint", "checkpoint", folder / f"{name}.safetensors", load_trained) for name in ("plain", "refocused")),
+        *(Case("checkpoint", "checkpoint", path, load_trained) for path in (plain, wrapped)),
         *(Case("state", "checkpoint", plain, read_state) for _ in range(2)),
-        Case("checkpoint", "json", hub / "config.json", lambda path: from_pretrained(path.parent), (), hub),
-        Case("checkpoint", "safetensors", hub / "model.safetensors", lambda path: from_pretrained(path.parent), (), hub),
+        Case("checkpoint", "json", hub / "config.json", _from_folder, (), hub),
+        Case("checkpoint", "safetensors", hub / "model.safetensors", _from_folder, (), hub),
         Case("run", "json", folder / "settings.json", SystemSettings.read),
         Case("weights", "raw", folder / "midas.pt", load_midas_small),
     ]  # fmt: skip
+
+
+def _from_folder(path: Path) -> object:
+    return from_pretrained(path.parent)
 
 
 def _calibrations(folder: Path) -> list[Case]:

@@ -253,8 +253,8 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         line = _numbers(TransferLine, document.pop("line"))
         result = PhotonTransfer(line=line, channels=channels, points=points, **document)
         result.sensor_noise()
-    except (AttributeError, KeyError, TypeError, ValueError) as error:  # json's and Unicode's errors are ValueErrors
-        raise ValueError(f"{path} is not a readable noise calibration: {error}") from None
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON's are ValueErrors
+        raise ValueError(f"{path} is not a readable noise calibration: {error!s:.200}") from None
     return result
 
 
