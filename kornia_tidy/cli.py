@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import signal
 import sys
@@ -58,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: from argparse, after ``--help`` (0) or arguments that it cannot read (2).
     """
+    _print_any_name()
     args = build_parser().parse_args(argv)
     with warnings.catch_warnings(), _termination_raised():
         warnings.showwarning = _print_warning  # ty: ignore[invalid-assignment]
@@ -76,6 +78,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         except Exception as error:
             return _told(error)
     return DONE
+
+
+def _print_any_name() -> None:
+    """Let standard output escape file names that are not UTF-8, as standard error does, instead of failing on them."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 class _Terminated(KeyboardInterrupt):

@@ -188,7 +188,7 @@ class PanelPlacement:
         return torch.rot90(self._mirror(values), int(self.rotate) // 90, (-2, -1))
 
     def _orient_back(self, values: Tensor) -> Tensor:
-        return self._mirror(torch.rot90(values, -self.rotate // 90, (-2, -1)))
+        return self._mirror(torch.rot90(values, -int(self.rotate) // 90, (-2, -1)))
 
     def _mirror(self, values: Tensor) -> Tensor:
         return values if self.flip == "none" else values.flip(-1 if self.flip == "left-right" else -2)

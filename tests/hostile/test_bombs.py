@@ -43,7 +43,17 @@ def png(width, height, data, *more):
 
 
 def tiff(width, height, samples=3):
-    fields = ((256, width), (257, height), (258, 8), (259, 1), (262, 2), (273, 8), (277, samples), (278, height), (279, 99))
+    fields = (
+        (256, width),
+        (257, height),
+        (258, 8),
+        (259, 1),
+        (262, 2),
+        (273, 8),
+        (277, samples),
+        (278, height),
+        (279, 99),
+    )
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in fields)
     return b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(fields)) + entries + bytes(120)
 
@@ -61,7 +71,9 @@ def npy(shape, kind="<f8"):
 def hdf5(shape, chunks=None, maxshape=None):
     file = io.BytesIO()
     with h5py.File(file, "w") as root:
-        root.create_dataset("dataset", shape, "<f4", chunks=chunks, maxshape=maxshape, compression="gzip" if chunks else None)
+        root.create_dataset(
+            "dataset", shape, "<f4", chunks=chunks, maxshape=maxshape, compression="gzip" if chunks else None
+        )
     return file.getvalue()
 
 
@@ -125,7 +137,9 @@ def nyu(folder, kind):
 def splits(folder):
     write_nyu(folder, 1)
     zeros_ = zeros()
-    (folder / "splits.mat").write_bytes((folder / "splits.mat").read_bytes()[:128] + struct.pack("<II", 15, 1 << 20) + zeros_)
+    (folder / "splits.mat").write_bytes(
+        (folder / "splits.mat").read_bytes()[:128] + struct.pack("<II", 15, 1 << 20) + zeros_
+    )
     return NYUDepthV2(folder, "train")
 
 
@@ -188,6 +202,7 @@ class TestBombs(BaseTester):
 
     def check(self, read, folder, *, refused=True):
         """Read in a fork with little memory: a sentence that is not of memory, or (None) one or none."""
+
         def child():
             limit_memory(ROOM)
             code = 0

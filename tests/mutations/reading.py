@@ -60,7 +60,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, default=Path("outputs/mutations"), help="where failures are kept")
     args = parser.parse_args()
     torch.set_num_threads(1)  # threads do not live on in a fork
-    begin, counts = time.perf_counter(), {}
+    begin, counts, spent = time.perf_counter(), {}, {}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "whole").mkdir()
@@ -70,7 +70,7 @@ def main() -> int:
         numbers = shared_out(args.count, list(readers))
         bar = tqdm(total=sum(numbers.values()), unit="file")
         for kind, number in numbers.items():
-            counts[kind] = Counter()
+            counts[kind], since = Counter(), time.perf_counter()
             for first in range(0, number, BATCH):
                 chosen = range(first, min(number, first + BATCH))
                 for index, result, said, data in read_all(readers[kind], args.seed, chosen, folder, args.guided):
@@ -78,8 +78,9 @@ def main() -> int:
                     bar.update()
                     if result == "failed":
                         tell(args.keep, kind, args.seed, index, said, data)
+            spent[kind] = time.perf_counter() - since
         bar.close()
-    _table(counts)
+    _table(counts, spent)
     seconds, total = time.perf_counter() - begin, sum(numbers.values())
     print(f"{total} files in {seconds:.0f} s, {total / seconds:.0f} a second, seed {args.seed}")
     return int(any(count["failed"] for count in counts.values()))
@@ -248,10 +249,11 @@ def tell(keep: Path, kind: str, seed: int, number: int, said: str, data: bytes) 
     tqdm.write(f"{keep}/{kind}-{seed}-{number}: {said}")
 
 
-def _table(counts: dict[str, Counter[str]]) -> None:
-    print(f"{'kind':<12}{'files':>8}" + "".join(f"{name:>10}" for name in RESULTS))
+def _table(counts: dict[str, Counter[str]], spent: dict[str, float]) -> None:
+    print(f"{'kind':<12}{'files':>8}{''.join(f'{name:>10}' for name in RESULTS)}{'seconds':>10}")
     for kind, count in [*counts.items(), ("all", sum(counts.values(), Counter()))]:
-        print(f"{kind:<12}{sum(count.values()):>8}" + "".join(f"{count[name]:>10}" for name in RESULTS))
+        results = "".join(f"{count[name]:>10}" for name in RESULTS)
+        print(f"{kind:<12}{sum(count.values()):>8}{results}{spent.get(kind, sum(spent.values())):>10.1f}")
 
 
 if __name__ == "__main__":
