@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable sanitize mutations lint bench targets clean
+.PHONY: help demo test test-portable sanitize mutations fuzz lint bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "              ARGS='--list' shows them, ARGS='--only aten' runs some, ARGS=--quick a share of each"
 	@echo "make sanitize the C sources under address and undefined-behaviour sanitizers: minutes, ARGS='--shapes 100' less"
 	@echo "make mutations  damaged files through the command: 200 of them, or ARGS='--count 5000 --seed 1 --kind png'"
+	@echo "make fuzz     damaged files through every reading function: 2000, or ARGS='--count 100000 --seed 1 --guided'"
 	@echo "make lint     style, spelling and types"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
@@ -40,6 +41,9 @@ sanitize: $(READY)
 # What fails is kept in outputs/mutations.
 mutations: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutations $(or $(ARGS),--count 200)
+
+fuzz: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutations.reading $(or $(ARGS),--count 2000)
 
 lint: $(READY)
 	@$(BIN)/ruff check
