@@ -56,7 +56,8 @@ class DesignMemory:
         if name in self.entries:
             stored = self.entries[name]
             try:
-                return Candidate(**{**stored, "phase": _tensor(stored["phase"])})
+                values: dict[str, Any] = {**stored, "phase": _tensor(stored["phase"])}
+                return Candidate(**values)
             except (KeyError, TypeError, ValueError) as error:
                 raise ValueError(f"cannot read {self.path}: {name:.80} is no candidate ({error!s:.200})") from error
         candidate = design()
