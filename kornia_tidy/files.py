@@ -124,7 +124,7 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can replace what is at a path, if anything is.
+    """Check that a file can be written to a path: the folder exists, and no device, pipe or folder has the name.
 
     Raises:
         FileNotFoundError: if the folder does not exist.

@@ -67,5 +67,5 @@ def stored_numbers(file: Any, name: str) -> Any:
 
 
 def _rows_and_columns(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Return two numbers whose product is the number of values of a shape."""
+    """Return the first axis of a shape, and the product of the others."""
     return (shape[0] if shape else 1), math.prod(shape[1:])
