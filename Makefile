@@ -7,6 +7,7 @@ READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-portable sanitize mutations extremes lint bench targets clean
+.PHONY: help demo test test-portable sanitize mutations fuzz lint bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -18,6 +19,7 @@ help:
 	@echo "make sanitize the C sources under address and undefined-behaviour sanitizers: minutes, ARGS='--shapes 100' less"
 	@echo "make mutations  damaged files through the command: 200 of them, or ARGS='--count 5000 --seed 1 --kind png'"
 	@echo "make extremes   how exact captures are at the extremes, as docs/extremes.md: minutes; ARGS=--quick a part of it"
+	@echo "make fuzz     damaged files through every reading function: 2000, or ARGS='--count 100000 --seed 1 --guided'"
 	@echo "make lint     style, spelling and types"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
@@ -44,6 +46,8 @@ mutations: $(READY)
 
 extremes: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.extremes $(ARGS)
+fuzz: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutations.reading $(or $(ARGS),--count 2000)
 
 lint: $(READY)
 	@$(BIN)/ruff check

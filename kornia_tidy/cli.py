@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
+import signal
 import sys
+import threading
 import traceback
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TextIO
 
 import torch
@@ -33,7 +36,8 @@ from kornia_tidy.commands import (
 # Each has add_parser(subparsers), which sets run(args).
 COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, info)
 
-DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS = 0, 2, 70, 130, 141  # exit statuses; 70 is EX_SOFTWARE of sysexits.h
+# Exit statuses; 70 is EX_SOFTWARE of sysexits.h, those above 128 are 128 and the number of the signal.
+DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS, TERMINATED = 0, 2, 70, 130, 141, 143
 DEBUG = "KORNIA_TIDY_DEBUG"  # environment variable; if set, tracebacks are printed
 
 DESCRIPTION = """\
@@ -50,17 +54,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         Exit status: 0 after success, 2 for a mistake of the user or of a file, 70 for a fault of the library, 130 if
-        interrupted, 141 if the reader of the output has closed its pipe.
+        interrupted, 141 if the reader of the output has closed its pipe, 143 if terminated.
 
     Raises:
         SystemExit: from argparse, after ``--help`` (0) or arguments that it cannot read (2).
     """
+    _print_any_name()
     args = build_parser().parse_args(argv)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _termination_raised():
         warnings.showwarning = _print_warning  # ty: ignore[invalid-assignment]
         try:
             args.run(args)
             sys.stdout.flush()  # raises here if the disk is full or the pipe is closed
+        except _Terminated:
+            print("kornia-tidy: terminated", file=sys.stderr)
+            return TERMINATED
         except KeyboardInterrupt:
             print("kornia-tidy: interrupted", file=sys.stderr)
             return INTERRUPTED
@@ -70,6 +78,35 @@ def main(argv: Sequence[str] | None = None) -> int:
         except Exception as error:
             return _told(error)
     return DONE
+
+
+def _print_any_name() -> None:
+    """Let standard output escape file names that are not UTF-8, as standard error does, instead of failing on them."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, raised as Ctrl-C is, so that temporary files are removed and locks released."""
+
+
+@contextmanager
+def _termination_raised() -> Generator[None]:
+    """Raise :class:`_Terminated` on SIGTERM within a block, in the main thread and where nobody handles it."""
+
+    def end(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one would interrupt the clearing up
+        raise _Terminated
+
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _told(error: Exception) -> int:

@@ -107,13 +107,13 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
     Raises:
         FileNotFoundError: if the folder does not exist.
         OSError: if it cannot be written, for example on a full disk; the message names ``path``.
-        ValueError: if the path is a folder.
+        ValueError: if the path is a folder, or no regular file.
+
+    Convention:
+        A symbolic link at ``path`` is replaced by the file; the file that it leads to is left alone.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise ValueError(f"cannot write {path}: it is a folder")
+    check_writable(path)
     temporary = path.with_name(f".{uuid4().hex}.tmp")
     try:
         with _named(path):
@@ -121,6 +121,21 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
             temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Check that a file can be written to a path: the folder exists, and no device, pipe or folder has the name.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+        ValueError: if the path is a folder; or a device or a pipe, which a renamed file would replace, even /dev/null.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ValueError(f"cannot write {path}: it is a folder")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"cannot write {path}: it is not a regular file")
 
 
 def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], replace: bool = False) -> None:

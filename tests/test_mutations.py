@@ -1,15 +1,22 @@
-"""A few damaged files of each kind through the command; `make mutations` takes more, see tests/mutations."""
+"""A few damaged files of each kind; `make mutations` and `make fuzz` take more, see tests/mutations."""
 
 from __future__ import annotations
+
+import os
+import signal
+import time
 
 import numpy as np
 import pytest
 import torch
 
 from tests.base import BaseTester
+from tests.mutations import reading
 from tests.mutations.damage import damaged
 from tests.mutations.forked import prepare, run
-from tests.mutations.pristine import make_cases
+from tests.mutations.pristine import Case, make_cases
+from tests.mutations.readers import SHARES, make_readers
+from tests.mutations.reading import damaged_case, read_all, shared_out
 
 KINDS = ("npy", "png", "tiff", "pfm", "jpeg", "safetensors", "checkpoint", "rgbd.json", "sidecar")
 
@@ -17,6 +24,11 @@ KINDS = ("npy", "png", "tiff", "pfm", "jpeg", "safetensors", "checkpoint", "rgbd
 @pytest.fixture(scope="module")
 def cases(tmp_path_factory):
     return make_cases(tmp_path_factory.mktemp("whole"))
+
+
+@pytest.fixture(scope="module")
+def readers(tmp_path_factory):
+    return make_readers(tmp_path_factory.mktemp("readers"))
 
 
 @pytest.fixture(autouse=True)
@@ -45,3 +57,44 @@ class TestMutations(BaseTester):
             folder = tmp_path / str(number)
             outcome = run(case, prepare(case, data, folder), folder)
             assert outcome.faults == (), (how, outcome.told)
+
+
+class TestReaders(BaseTester):
+    """In forks that read many files each; a command takes a fork for each file."""
+
+    def test_smoke_whole_files_are_accepted(self, readers):
+        for kind, cases in readers.items():
+            for case in cases:
+                if kind != "weights":  # those of a network of 21 million numbers are no small file
+                    case.command(case.source)
+
+    def test_feature_damaged_files_are_read_or_refused_in_a_sentence(self, readers, tmp_path):
+        quick = [kind for kind in readers if SHARES.get(kind, 1) >= 1]
+        for kind, count in shared_out(100, quick).items():
+            results = list(read_all(readers[kind], 11, range(count), tmp_path))
+            assert [number for number, *_ in results] == list(range(count))
+            assert not [read[:3] for read in results if read[1] == "failed"], kind
+
+    def test_feature_a_reader_that_dies_hangs_or_raises_anything_else_is_told(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(reading, "SECONDS", 1.0)
+        whole = tmp_path / "a.json"
+        whole.write_text("{}")
+
+        def misbehave(path):
+            which = len(path.read_bytes()) % 4
+            if which == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+            elif which == 1:
+                time.sleep(60)
+            elif which == 2:
+                raise KeyError(which)
+            raise ValueError("a sentence")
+
+        case = Case("json", "raw", whole, misbehave)
+        results = list(read_all([case], 0, range(12), tmp_path))
+        assert [number for number, *_ in results] == list(range(12))
+        for number, result, said, _ in results:
+            size = len(damaged_case([case], 0, number)[2]) % 4
+            expected = ("status -15", "status", "KeyError", "")[size]
+            assert (result == "failed") == (size < 3)
+            assert expected in said

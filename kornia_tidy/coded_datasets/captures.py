@@ -72,5 +72,5 @@ class CodedCaptures(Dataset[dict[str, Any]]):
                 for field in self._fields
             }
         except (ValueError, OSError) as error:
-            raise UnreadableItemError(f"capture {entry['key']}, {entry['name']}: {error}") from error
+            raise UnreadableItemError(f"capture {entry['key']}, {entry['name']:.100}: {error!s:.500}") from error
         return {**maps, "index": index, "name": entry["name"]}

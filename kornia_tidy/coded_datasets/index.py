@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import tarfile
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 from kornia_tidy.coded_datasets.item_files import ABOUT
 from kornia_tidy.coded_datasets.layout import Layout, Part
-from kornia_tidy.files import parse_json, read_bytes, read_json
+from kornia_tidy.files import check_file, parse_json, read_bytes, read_json
 
 INDEX = "index.csv"
 Entry = dict[str, str]
+_PLACE = re.compile(r"([^:\0]+)(?::(\d{1,15}):(\d{1,15}))?", re.ASCII)
+_REMEDY = "delete it to have it rendered again"
 
 
 def encode_index(folder: Path, parts: Iterable[Part], layout: Layout) -> bytes:
@@ -48,7 +52,7 @@ def read_index(folder: Path) -> list[Entry]:
         entries = list(csv.DictReader(io.StringIO(read_bytes(path).decode()), strict=True))
     except (csv.Error, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
-    if not entries or not {"key", "name", "coded"} <= set(entries[0]) or any(None in e.values() for e in entries):
+    if not entries or not {"key", "name", "coded"} <= set(entries[0]) or any(map(_is_ragged, entries)):
         raise ValueError(f"cannot read {path}: it is no index of captures, or is damaged")
     return entries
 
@@ -58,32 +62,47 @@ def read_place(folder: Path, place: str) -> bytes:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file ends too early.
+        ValueError: if the place lies outside the folder or is none, or the file ends too early.
     """
-    name, *window = place.split(":")
-    if not window:
-        return read_bytes(folder / name)
-    offset, size = map(int, window)
-    with (folder / name).open("rb") as file:
+    match = _PLACE.fullmatch(place)
+    if match is None or PurePosixPath(match[1]).is_absolute() or ".." in PurePosixPath(match[1]).parts:
+        raise ValueError(f"a place must be a path in {folder}, or shard:offset:size, got {place!r:.80}")
+    path = folder / match[1]
+    if match[2] is None:
+        return read_bytes(path)
+    offset, size = int(match[2]), int(match[3])
+    there = check_file(path).stat().st_size  # before memory is allocated
+    if offset + size > there:
+        raise ValueError(f"cannot read {path}: it should hold {size} bytes at {offset}, it has {there} in all")
+    with path.open("rb") as file:
         file.seek(offset)
-        data = file.read(size)
-    if len(data) != size:
-        raise ValueError(f"cannot read {folder / name}: it should hold {size} bytes at {offset}, there are {len(data)}")
-    return data
+        return file.read(size)
+
+
+def _is_ragged(entry: Mapping[str | None, Any]) -> bool:
+    """Return whether a line of CSV has cells without a heading, or too few cells."""
+    return None in entry or None in entry.values()
 
 
 def _folder_entry(path: Path) -> Entry:
     about = read_json(path / ABOUT)
+    if not isinstance(about, dict):
+        raise ValueError(f"cannot read {path / ABOUT}: it does not describe a capture; {_REMEDY}")
     return {"key": path.name, **about, **{file.stem: f"{path.name}/{file.name}" for file in path.iterdir()}}
 
 
 def _shard_entries(path: Path) -> list[Entry]:
     entries: dict[str, Entry] = {}
-    with tarfile.open(path, "r:") as shard:
-        for member in shard:
-            key, _, name = member.name.partition(".")
-            entry = entries.setdefault(key, {"key": key})
-            entry[name.partition(".")[0]] = f"{path.name}:{member.offset_data}:{member.size}"
-    for entry in entries.values():
-        entry.update(parse_json(read_place(path.parent, entry["scene"])))
+    try:
+        with tarfile.open(path, "r:") as shard:
+            for member in shard:
+                key, _, name = member.name.partition(".")
+                entry = entries.setdefault(key, {"key": key})
+                entry[name.partition(".")[0]] = f"{path.name}:{member.offset_data}:{member.size}"
+        for entry in entries.values():
+            entry.update(parse_json(read_place(path.parent, entry["scene"])))
+    except (KeyError, TypeError, ValueError, tarfile.TarError) as error:
+        raise ValueError(
+            f"cannot read {path}: it is no shard of captures, or is damaged ({error!s:.200}); {_REMEDY}"
+        ) from error
     return list(entries.values())

@@ -47,7 +47,7 @@ def decode_sample(sample: Mapping[str, Any]) -> dict[str, Any]:
     try:
         about = parse_json(sample[ABOUT])
         own = {"index": int(about["index"]), "name": str(about["name"])}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise UnreadableItemError(f"cannot read {place}: it has no {ABOUT} of a capture, or it is damaged") from error
     decoded: dict[str, Any] = {}
     for file, data in sample.items():

@@ -11,6 +11,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.image_files import SUFFIXES
 from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.files import check_writable
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 MOST_PROCESSES = 1024  # more would exhaust a machine
@@ -193,9 +194,6 @@ def check_output(path: str, *inputs: str | None, bits: int = 8) -> None:
     suffix = target.suffix.lower()
     check_choice("the suffix of an image file", suffix, SUFFIXES)
     check_choice(f"bits of a {suffix} file", bits, (8,) if suffix in {".jpg", ".jpeg"} else (8, 16))
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: there is no folder {target.parent}")
-    if target.is_dir():
-        raise ValueError(f"cannot write {path}: it is a folder")
+    check_writable(target)
     if target.exists() and any(other and Path(other).exists() and target.samefile(other) for other in inputs):
         raise ValueError(f"cannot write {path}: it is the input")

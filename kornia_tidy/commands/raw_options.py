@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from kornia_tidy.files import check_writable
 from kornia_tidy.raw.capture import RawCapture
 
 DUMP_OPTIONS = ("size", "pattern", "black", "white", "dtype", "byte_order")
@@ -70,10 +71,7 @@ def check_outputs(outputs: Sequence[str | Path | None], inputs: Sequence[str | P
     """
     there = [Path(other) for other in inputs if other is not None and Path(other).exists()]
     for path in (Path(output) for output in outputs if output is not None):
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
-        if path.is_dir():
-            raise ValueError(f"cannot write {path}: it is a folder")
+        check_writable(path)
         if path.exists() and any(path.samefile(other) for other in there):
             raise ValueError(f"cannot write {path}: it is an input")
 

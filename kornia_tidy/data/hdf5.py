@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import io
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_tidy.data.picture_header import check_pixels
+
+DAMAGE = (OSError, OverflowError, RuntimeError, KeyError, TypeError, AttributeError)  # of h5py on damaged files
 MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -19,7 +23,7 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
 
     Raises:
         ImportError: if h5py is missing.
-        ValueError: if the file is damaged, or holds no data set or several.
+        ValueError: if the file is damaged, or holds no data set or several, or one that is no map of numbers in it.
     """
     try:
         import h5py  # noqa: PLC0415 - an extra, and slow to import
@@ -28,8 +32,40 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
     try:
         with h5py.File(io.BytesIO(data), "r") as file:
             names = list(file)
-            if len(names) != 1 or not isinstance(file[names[0]], h5py.Dataset):
+            dataset = stored_numbers(file, names[0]) if len(names) == 1 else None
+            if dataset is None:
                 raise ValueError(f"its HDF5 must hold one data set alone, found {', '.join(names)[:80] or 'none'}")
-            return np.asarray(file[names[0]][()])
-    except (OSError, RuntimeError, KeyError) as error:
+            check_pixels("the map", *_rows_and_columns(dataset.shape))
+            return np.asarray(dataset[()])
+    except DAMAGE as error:
         raise ValueError(f"its HDF5 is damaged: {error!s:.200}") from error
+
+
+def stored_numbers(file: Any, name: str) -> Any:
+    """Return a data set of numbers that lie in an open HDF5 file, None if the name is not that of a data set.
+
+    Links to other files, and values in other files, are refused: a file could show what its sender may not read. So are
+    chunks with more numbers than a picture has pixels, which would be decompressed as a whole.
+
+    Raises:
+        ValueError: if the data set is such a one, or its values are not numbers.
+    """
+    import h5py  # noqa: PLC0415 - an extra, and slow to import
+
+    link = file.get(name, getlink=True) if name in file else None
+    if link is not None and not isinstance(link, h5py.HardLink):
+        raise ValueError(f"{name:.80} in its HDF5 is a link")
+    dataset = file[name] if link is not None else None
+    if not isinstance(dataset, h5py.Dataset):
+        return None
+    if dataset.external or dataset.is_virtual:
+        raise ValueError(f"the values of {name:.80} in its HDF5 lie in other files")
+    if dataset.dtype.kind not in "biuf":
+        raise ValueError(f"the values of {name:.80} in its HDF5 must be numbers, not {dataset.dtype}")
+    check_pixels(f"a chunk of {name:.80}", *_rows_and_columns(dataset.chunks or ()))
+    return dataset
+
+
+def _rows_and_columns(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the first axis of a shape, and the product of the others."""
+    return (shape[0] if shape else 1), math.prod(shape[1:])

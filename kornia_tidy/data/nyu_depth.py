@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from kornia_tidy.data.depth_files import fill_holes
+from kornia_tidy.data.hdf5 import DAMAGE, stored_numbers
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import read_bytes
@@ -20,6 +21,7 @@ SOURCES = {
     LABELED: "http://horatio.cs.nyu.edu/mit/silberman/nyu_depth_v2/nyu_depth_v2_labeled.mat (2.8 GB)",
     SPLITS: "http://horatio.cs.nyu.edu/mit/silberman/indoor_seg_sup/splits.mat",
 }
+LARGEST_SPLITS = 1 << 16  # bytes; a compressed file may hold a thousand times as many
 FRAME = (480, 640)
 INSIDE = slice(44, 471), slice(40, 601)  # rows and columns that the toolbox evaluates, MATLAB's 45:471 and 41:601
 
@@ -82,8 +84,8 @@ class NYUDepthV2(SceneDataset):
         with _open(self.path) as file:
             try:
                 image, depth = file["images"][row], file[self.depths][row]
-            except OSError as error:
-                raise ValueError(f"cannot read {self.path}: {error}") from error
+            except DAMAGE as error:
+                raise ValueError(f"cannot read {self.path}: {error!s:.200}") from error
         # MATLAB stores columns, HDF5 rows: (480, 640, 3) is read as (3, 640, 480).
         window = INSIDE if self.crop_border else (slice(None), slice(None))
         image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
@@ -99,7 +101,10 @@ class NYUDepthV2(SceneDataset):
     def _count(self) -> int:
         """Return the number of frames; raise ``ValueError`` if images or depths are missing or of another shape."""
         with _open(self.path) as file:
-            shapes = {key: getattr(file.get(key), "shape", None) for key in ("images", self.depths)}
+            try:
+                shapes = {key: getattr(stored_numbers(file, key), "shape", None) for key in ("images", self.depths)}
+            except (*DAMAGE, ValueError) as error:
+                raise ValueError(f"cannot read {self.path}: {error!s:.200}") from error
         images = shapes["images"]
         count = images[0] if images else 0
         height, width = FRAME
@@ -160,7 +165,9 @@ def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
             f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text "
             "file with the numbers of the frames, one per line"
         ) from None
+    if path.stat().st_size > LARGEST_SPLITS:
+        raise ValueError(f"cannot read {path}: it must have at most {LARGEST_SPLITS} bytes, got {path.stat().st_size}")
     try:
-        return loadmat(path)[key].ravel().astype(int)
+        return loadmat(path, variable_names=[key])[key].ravel().astype(int)
     except Exception as error:  # of any type, for damaged files
         raise ValueError(f"cannot read {path}: it should hold trainNdxs and testNdxs: {error!r}") from error

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF_LITTLE, TIFF_BIG = (b"II*\0", b"II+\0"), (b"MM\0*", b"MM\0+")
 LARGEST = 1 << 28  # pixels
+MOST_SAMPLES = 4
 VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
 FORMATS = "PNG, JPEG, TIFF, PGM, PPM, PFM, BMP, WebP or NPY"
 
@@ -119,13 +120,13 @@ def _segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _tiff(data: bytes) -> Size:
-    """Return the size in the first directory of a TIFF, which is the one decoded."""
+    """Return the size in the first directory of a TIFF, which is the one decoded; refuse more than four channels."""
     order, big = "<" if data[:2] == b"II" else ">", data[2 if data[:2] == b"II" else 3] == 0x2B
     count_form, entry_form, entry_size = ("Q", "HHQ", 20) if big else ("H", "HHI", 12)
     (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
     (count,) = struct.unpack_from(order + count_form, data, place)
     place += struct.calcsize(order + count_form)
-    sizes = {0x0100: 0, 0x0101: 0}
+    sizes = {0x0100: 0, 0x0101: 0, 0x0115: 1}  # columns, rows, samples a pixel
     for entry in range(place, min(place + count * entry_size, len(data)), entry_size):
         tag, kind, _ = struct.unpack_from(order + entry_form, data, entry)
         if tag in sizes:
@@ -133,6 +134,8 @@ def _tiff(data: bytes) -> Size:
             if form is None:
                 raise ValueError("the file is damaged: its size is of no whole numbers")
             (sizes[tag],) = struct.unpack_from(order + form, data, entry + struct.calcsize(order + entry_form))
+    if sizes[0x0115] > MOST_SAMPLES:
+        raise ValueError(f"it has {sizes[0x0115]} samples a pixel, more than {MOST_SAMPLES}")
     return sizes[0x0101], sizes[0x0100]
 
 

@@ -72,7 +72,7 @@ class SceneDataset(Dataset[Any]):
         try:
             image, depth, valid = self.read(index)
         except (ValueError, OSError) as error:
-            raise UnreadableItemError(f"item {index} of {type(self).__name__}, {name}: {error}") from error
+            raise UnreadableItemError(f"item {index} of {type(self).__name__}, {name:.100}: {error!s:.500}") from error
         if image.shape[0] == 1:
             image = image.repeat(3, 1, 1)
         sample = {"image": image, "depth": depth, "mask": valid, "index": index, "name": name}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, open_chart, require_matplotlib
 
@@ -59,23 +61,31 @@ def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
     Raises:
         ImportError: if matplotlib is missing.
         FileNotFoundError: if the folder has no logs.
-        ValueError: if they have no lines.
+        ValueError: if they have no lines, or are damaged.
     """
     losses, scores = (_rows(Path(folder) / name) for name in ("training.csv", "validation.csv"))
     if not losses or not scores:
         raise ValueError(f"there is nothing to draw: the run in {folder} has no validated epoch yet")
     require_matplotlib()
+    try:
+        numbers = np.array([[float(row["step"]), float(row["loss"])] for row in losses])
+        name, decibels = _decibels(scores)
+        steps = [int(row["step"]) for row in scores]
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"the logs of the run in {folder} are damaged: {error!s:.200}") from error
+    return _drawn(Path(folder), numbers, name, decibels, steps)
+
+
+def _drawn(folder: Path, losses: NDArray[np.float64], name: str, decibels: list[float], steps: list[int]) -> Figure:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     figure = Figure(figsize=(WIDTH, HEIGHT), facecolor="white")
     left, right = figure.add_axes((0.08, 0.14, 0.39, 0.66)), figure.add_axes((0.57, 0.14, 0.41, 0.66))
-    parts = np.array_split(np.array([[float(row["step"]), float(row["loss"])] for row in losses]), SMOOTHING)
+    parts = np.array_split(losses, SMOOTHING)
     means = np.array([part.mean(0) for part in parts if len(part)])
     left.plot(means[:, 0], means[:, 1], color=INK, linewidth=1.3)
     left.set_yscale("log")
     left.set_ylabel("training loss", fontsize=LABEL, color=INK)
-    name, decibels = _decibels(scores)
-    steps = [int(row["step"]) for row in scores]
     plateau = plateau_step(steps, decibels)
     right.plot(steps, decibels, color=BLUE, linewidth=1.3, marker="o", markersize=3)
     right.axvline(plateau, color=ACCENT, linewidth=1, linestyle=(0, (4, 3)))
@@ -83,7 +93,7 @@ def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
     for axes in (left, right):
         open_chart(axes, LABEL)
         axes.set_xlabel("step", fontsize=LABEL, color=INK)
-    figure.text(0.02, 0.92, f"Learning curve: {Path(folder).name}", fontsize=TITLE, color=INK, weight="bold")
+    figure.text(0.02, 0.92, f"Learning curve: {folder.name}", fontsize=TITLE, color=INK, weight="bold")
     level = f"within {TOLERANCE:g} dB of it at step {plateau:,} of {steps[-1]:,}"
     if plateau == steps[-1] and len(steps) > 1:
         level = "still rising at the end"
@@ -102,5 +112,8 @@ def _decibels(scores: list[dict[str, str]]) -> tuple[str, list[float]]:
 def _rows(path: Path) -> list[dict[str, str]]:
     if not path.exists():
         raise FileNotFoundError(f"cannot read {path}: there is no such file")
-    with path.open(newline="") as file:
-        return [row for row in csv.DictReader(file) if None not in row.values()]
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(), newline="")))
+    except (csv.Error, ValueError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    return [row for row in rows if None not in row and None not in row.values()]

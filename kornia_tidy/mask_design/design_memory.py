@@ -43,7 +43,9 @@ class DesignMemory:
         if self.path is not None and self.path.exists():
             stored = read_json(self.path)
             if isinstance(stored, dict) and stored.get("about") == self.about:
-                self.entries = dict(stored["entries"])
+                self.entries = stored.get("entries", {})
+                if not isinstance(self.entries, dict):
+                    raise ValueError(f"cannot read {self.path}: entries must be values by name")
 
     def __len__(self) -> int:
         """Return the number of entries."""
@@ -53,9 +55,11 @@ class DesignMemory:
         """Return the candidate of a name, designed if it is not there."""
         if name in self.entries:
             stored = self.entries[name]
-            return Candidate(
-                **{name: stored[name] for name in stored if name != "phase"}, phase=_tensor(stored["phase"])
-            )
+            try:
+                values: dict[str, Any] = {**stored, "phase": _tensor(stored["phase"])}
+                return Candidate(**values)
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"cannot read {self.path}: {name:.80} is no candidate ({error!s:.200})") from error
         candidate = design()
         values = {field.name: getattr(candidate, field.name) for field in fields(candidate)}
         self._add(name, {**values, "phase": None if candidate.phase is None else _text(candidate.phase)})

@@ -185,10 +185,10 @@ class PanelPlacement:
         return (size[1], size[0]) if self.rotate % 180 else (size[0], size[1])
 
     def _orient(self, values: Tensor) -> Tensor:
-        return torch.rot90(self._mirror(values), self.rotate // 90, (-2, -1))
+        return torch.rot90(self._mirror(values), int(self.rotate) // 90, (-2, -1))
 
     def _orient_back(self, values: Tensor) -> Tensor:
-        return self._mirror(torch.rot90(values, -self.rotate // 90, (-2, -1)))
+        return self._mirror(torch.rot90(values, -int(self.rotate) // 90, (-2, -1)))
 
     def _mirror(self, values: Tensor) -> Tensor:
         return values if self.flip == "none" else values.flip(-1 if self.flip == "left-right" else -2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import zipfile
 from typing import Any
 
 import torch
@@ -169,6 +170,7 @@ def load_midas_small(path: str | os.PathLike[str]) -> MiDaSSmall:
     """
     data = read_bytes(path)
     try:
+        _check_archive(data)
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # of any type, for damaged archives and refused pickles
         raise ValueError(
@@ -180,6 +182,15 @@ def load_midas_small(path: str | os.PathLike[str]) -> MiDaSSmall:
     _check_state(path, state, head.state_dict())
     head.load_state_dict(state)
     return head
+
+
+def _check_archive(data: bytes) -> None:
+    """Raise ``ValueError`` for an archive with compressed parts, which torch.save never writes: they may be bombs."""
+    if not zipfile.is_zipfile(io.BytesIO(data)):
+        return  # the older format of torch.save
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+            raise ValueError("its parts are compressed")
 
 
 def _check_state(path: str | os.PathLike[str], state: Any, wanted: dict[str, Tensor]) -> None:

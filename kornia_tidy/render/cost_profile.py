@@ -7,7 +7,7 @@ user's machine, see :mod:`kornia_tidy.render.tuning`.
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from typing import Any, Self
@@ -235,7 +235,7 @@ class CostProfile:
         if not isinstance(document, dict) or set(document) != {field.name for field in fields(cls)}:
             raise ValueError(f"a cost profile has the fields {', '.join(field.name for field in fields(cls))}")
         if not isinstance(document["name"], str):
-            raise ValueError(f"the name of a cost profile must be a string, got {document['name']!r}")
+            raise ValueError(f"the name of a cost profile must be a string, got {document['name']!r:.80}")
         rates: dict[str, Any] = {name: _rates(name, document[name]) for name in RATES}
         return cls(document["name"], **rates)
 
@@ -246,9 +246,9 @@ def _rates(name: str, numbers: Any) -> Rates:
     if not isinstance(numbers, dict) or set(numbers) != set(names):
         raise ValueError(f"{name} of a cost profile has the numbers {', '.join(names)}")
     for key, number in numbers.items():
-        usable = isinstance(number, (int, float)) and not isinstance(number, bool) and math.isfinite(number)
-        if not usable or number < 0 or (key == "shared" and number > 1):
-            raise ValueError(f"{name}.{key} of a cost profile must be a finite number from 0, got {number!r}")
+        usable = isinstance(number, (int, float)) and not isinstance(number, bool)
+        if not usable or not 0 <= number <= (1 if key == "shared" else sys.float_info.max):  # integers may be larger
+            raise ValueError(f"{name}.{key} of a cost profile must be a finite number from 0, got {number!r:.80}")
     return kind(**numbers)
 
 

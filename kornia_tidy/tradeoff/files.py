@@ -60,7 +60,7 @@ def read_json(path: str | os.PathLike[str]) -> TradeRun:
         conditions = Conditions(**_checked("conditions", Conditions, document["conditions"]))
         return TradeRun(conditions, tuple(_row(entry) for entry in document["rows"]))
     except ValueError as error:  # includes errors of JSON and Unicode
-        raise ValueError(f"{path} is not a readable sweep: {error}") from None
+        raise ValueError(f"{path} is not a readable sweep: {error!s:.500}") from None
 
 
 def write_csv(path: str | os.PathLike[str], rows: Iterable[TradeRow]) -> None:
@@ -90,9 +90,9 @@ def read_csv(path: str | os.PathLike[str]) -> list[TradeRow]:
     try:
         reader = csv.DictReader(io.StringIO(data.decode()))
         _check_names("the header", dict.fromkeys(reader.fieldnames or ()), set(_columns()))
-        return [_row(_typed(cells)) for cells in reader]
+        return [_row(_typed(cells)) for cells in map(_whole, reader)]
     except (ValueError, csv.Error) as error:
-        raise ValueError(f"{path} is not a readable sweep: {error}") from None
+        raise ValueError(f"{path} is not a readable sweep: {error!s:.500}") from None
 
 
 def markdown(rows: Sequence[TradeRow]) -> str:
@@ -179,7 +179,7 @@ def _checked(what: str, kind: type, entry: Any) -> dict[str, Any]:
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed and name != "value"):
             if float in allowed and type(value) is int:  # other programs write 2.0 as 2
                 continue
-            raise ValueError(f"{name} in {what} must be {hints[name]}, got {value!r}")
+            raise ValueError(f"{name} in {what} must be {hints[name]}, got {value!r:.80}")
     return entry
 
 
@@ -188,12 +188,19 @@ def _check_names(what: str, entry: Any, names: set[str]) -> None:
         raise ValueError(f"{what} must hold {', '.join(sorted(names))}, got {type(entry).__name__}")
     if wrong := names ^ set(entry):
         kinds = [f"{'no' if name in names else 'an unknown'} {name}" for name in sorted(map(str, wrong))]
-        raise ValueError(f"{what} has {', '.join(kinds)}")
+        raise ValueError(f"{what} has {', '.join(kinds):.400}")
 
 
 def _columns() -> list[str]:
     plain = [field.name for field in fields(TradeRow) if field.name != "fidelity"]
     return plain + [_KNOB + field.name for field in fields(Fidelity)]
+
+
+def _whole(cells: dict[str, str]) -> dict[str, str]:
+    """Return a line of CSV that has a cell for each column, and no more."""
+    if None in cells or None in cells.values():
+        raise ValueError("a line has more or fewer cells than the header")
+    return cells
 
 
 def _typed(cells: dict[str, str]) -> dict[str, Any]:
@@ -212,7 +219,7 @@ def _parsed(text: str, hint: Any) -> Any:
         return None
     if bool in kinds:
         if text not in ("True", "False"):
-            raise ValueError(f"expected True or False, got {text!r}")
+            raise ValueError(f"expected True or False, got {text!r:.80}")
         return text == "True"
     for kind in (int, float):
         if kind in kinds:

@@ -190,10 +190,11 @@ def _fit(trainer: pl.Trainer, module: TidyTraining, data: SceneData, checkpoint:
     handler = signal.getsignal(signal.SIGINT)
     try:
         trainer.fit(module, data, ckpt_path=checkpoint)
-    except SystemExit:
+    except SystemExit as left:
         if not trainer.interrupted:
             raise
-        raise KeyboardInterrupt from None
+        cause = left.__context__
+        raise (cause if isinstance(cause, KeyboardInterrupt) else KeyboardInterrupt) from None
     finally:
         if in_main_thread:
             signal.signal(signal.SIGINT, handler)

@@ -253,8 +253,8 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         line = _numbers(TransferLine, document.pop("line"))
         result = PhotonTransfer(line=line, channels=channels, points=points, **document)
         result.sensor_noise()
-    except (AttributeError, KeyError, TypeError, ValueError) as error:  # json's and Unicode's errors are ValueErrors
-        raise ValueError(f"{path} is not a readable noise calibration: {error}") from None
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON's are ValueErrors
+        raise ValueError(f"{path} is not a readable noise calibration: {error!s:.200}") from None
     return result
 
 
@@ -384,5 +384,5 @@ def _numbers(kind: type, entry: dict[str, Any]) -> Any:
     """Convert a JSON object to a dataclass, and raise if a field other than the channel's name is not a number."""
     for name, value in entry.items():
         if name != "channel" and (isinstance(value, bool) or not isinstance(value, (int, float))):
-            raise ValueError(f"{name} must be a number, got {value!r}")
+            raise ValueError(f"{name:.80} must be a number, got {value!r:.80}")
     return kind(**entry)

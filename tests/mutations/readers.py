@@ -1,0 +1,246 @@
+"""Every function that reads files, with small whole files for it; `tests.mutations.reading` damages them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import torch
+
+from kornia_tidy import TiDyOptics
+from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
+from kornia_tidy.calibration.noise.photon_transfer import read_json as read_noise
+from kornia_tidy.calibration.noise.transfer_curve import CurvePoint
+from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs, PointReport
+from kornia_tidy.coded_datasets import CodedCaptures, render_scenes
+from kornia_tidy.coded_datasets.index import encode_index
+from kornia_tidy.coded_datasets.layout import Layout
+from kornia_tidy.coded_datasets.shard_samples import decode_sample
+from kornia_tidy.data import NYUDepthV2, TUMSequence, read_depth, read_image
+from kornia_tidy.data.calibration_files import read_calibration
+from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data.picture_header import check_header
+from kornia_tidy.data.rgbd_folder import described_folder
+from kornia_tidy.figures.learning_curve import draw_learning_curve
+from kornia_tidy.files import read_json
+from kornia_tidy.inference.hub import from_pretrained, save_pretrained
+from kornia_tidy.inference.settings import SystemSettings
+from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.mask_design.candidates import Candidate
+from kornia_tidy.mask_design.design_memory import DesignMemory
+from kornia_tidy.mask_export import read_heights, read_slm_frames
+from kornia_tidy.mask_export.mask_files import read_dwell_shares
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.raw.tags import black_tile, camera_tags, filter_array_fault, kodak_matrix, missing_bytes, white_levels
+from kornia_tidy.reconstruction.midas_small import load_midas_small
+from kornia_tidy.render.cost_profile import EPYC, CostProfile
+from kornia_tidy.tradeoff import TradeRun
+from kornia_tidy.tradeoff import files as trade_files
+from kornia_tidy.training.callbacks import drop_rows_after
+from kornia_tidy.training.noise_free import NoiseFreeCaptures
+from kornia_tidy.training.record import training_record
+from tests.data.published import write_nyu
+from tests.mutations.pristine import Case, make_cases
+from tests.raw.dng import dng
+from tests.tradeoff.samples import CONDITIONS, ROW
+
+SHARES = {"checkpoint": 0.1, "nyu": 0.1, "raw": 0.005, "weights": 0.02, "figure": 0.02, "index": 2, "header": 3}
+"""Of slow readers fewer cases are tried than of the others, which count 1."""
+
+CANDIDATE = Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3))
+
+
+def make_readers(folder: Path) -> dict[str, list[Case]]:
+    """Write whole files into an empty folder; return the readers of each kind of file."""
+    made = make_cases(folder)
+    cases = [*_pictures(made), *_numbers(folder), *_systems(folder), *_calibrations(folder / "calibrations"),
+             *_folders(folder, made), *_runs(folder / "run"), *_raw_files(folder)]  # fmt: skip
+    by_kind: dict[str, list[Case]] = {}
+    for case in cases:
+        by_kind.setdefault(case.kind, []).append(case)
+    return by_kind
+
+
+def _pictures(made: dict[str, list[Case]]) -> list[Case]:
+    """Pictures and depth maps in every format."""
+    folder = made["png"][0].source.parent
+    rows = np.rint(255 * np.load(folder / "image.npy")).astype(np.uint8)
+    for suffix in ("bmp", "webp", "ppm"):
+        cv2.imwrite(str(folder / f"image.{suffix}"), rows)
+    cv2.imwrite(str(folder / "image.pgm"), rows[..., 0])
+    depth = np.load(folder / "depth.npy")
+    with h5py.File(folder / "depth.hdf5", "w") as file:
+        file.create_dataset("dataset", data=depth, chunks=(16, 16), compression="gzip")
+    with h5py.File(folder / "plain.hdf5", "w") as file:
+        file.create_dataset("dataset", data=depth)
+    cases = []
+    for path in sorted(folder.iterdir()):
+        kind = {".tif": "tiff", ".jpg": "jpeg", ".pgm": "ppm", ".hdf5": "hdf5"}.get(path.suffix, path.suffix[1:])
+        if kind not in {"png", "tiff", "jpeg", "pfm", "npy", "ppm", "bmp", "webp", "hdf5"} or path.stem == "heights":
+            continue
+        damage = {"ppm": "pfm", "bmp": "raw", "webp": "raw", "hdf5": "hdf5"}.get(kind, kind)
+        depth_file = path.stem in {"depth", "plain"}
+        cases.append(Case(kind, damage, path, read_depth if depth_file else read_image))
+        if kind in {"png", "tiff", "jpeg", "bmp", "webp", "ppm"}:
+            cases.append(Case("header", damage, path, lambda path: check_header(path.read_bytes())))
+    return cases
+
+
+def _numbers(folder: Path) -> list[Case]:
+    """Masks, PSFs and frames."""
+    bank = PSFBank.load(folder / "bank.safetensors")
+    distances = torch.linspace(2, 0.4, len(bank.defocus))
+    reports = (PointReport(0.5, 1.0, 2.0, 1.0, None, None),)
+    MeasuredPSFs(bank, torch.zeros_like(bank.psfs), distances, reports).save(folder / "measured.safetensors")
+    frames = folder / "frames"
+
+    def read_frames(path: Path) -> object:
+        return read_slm_frames(path.parent)
+
+    return [
+        Case("npy", "npy", folder / "heights.npy", read_heights),
+        Case("safetensors", "safetensors", folder / "heights.safetensors", read_heights),
+        Case("safetensors", "safetensors", folder / "heights.safetensors", read_dwell_shares),
+        Case("safetensors", "safetensors", folder / "bank.safetensors", PSFBank.load),
+        Case("safetensors", "safetensors", folder / "measured.safetensors", MeasuredPSFs.load),
+        Case("frames", "json", frames / "frames.json", read_frames, (), frames),
+        Case("frames", "npy", frames / "turns.npy", read_frames, (), frames),
+        Case("frames", "png", frames / "frame_000.png", read_frames, (), frames),
+    ]
+
+
+def _systems(folder: Path) -> list[Case]:
+    """Checkpoints, settings and weights."""
+    plain = folder / "plain.safetensors"
+    torch.save({"conv.weight": torch.zeros(3, 4)}, folder / "midas.pt")
+    hub = save_pretrained(load_trained(plain), folder / "hub", record={})
+    load_trained(plain).settings.write(folder / "settings.json")
+    wrapped = folder / "refocused.safetensors"
+    return [
+        *(Case("checkpoint", "checkpoint", path, load_trained) for path in (plain, wrapped)),
+        *(Case("state", "checkpoint", plain, read_state) for _ in range(2)),
+        Case("checkpoint", "json", hub / "config.json", _from_folder, (), hub),
+        Case("checkpoint", "safetensors", hub / "model.safetensors", _from_folder, (), hub),
+        Case("run", "json", folder / "settings.json", SystemSettings.read),
+        Case("weights", "raw", folder / "midas.pt", load_midas_small),
+    ]  # fmt: skip
+
+
+def _from_folder(path: Path) -> object:
+    return from_pretrained(path.parent)
+
+
+def _calibrations(folder: Path) -> list[Case]:
+    """Calibrations, noise profiles, trade-offs, cost profiles and design records."""
+    folder.mkdir()
+    (folder / "calib.txt").write_text("cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n")
+    (folder / "calib.json").write_text('{"focal_px": 3997.5, "baseline_m": 0.1935, "doffs_px": 131.25}')
+    line = TransferLine(2.0, 0.01, 6.0, 0.1, 0.0, 0.999, 10000)
+    names = CurvePoint.__dataclass_fields__
+    point = CurvePoint(**{name: "G" if "str" in str(names[name].type) else 2 for name in names})
+    noise = PhotonTransfer("a", 100.0, "flats", 64.0, 4095.0, line, {"G": line}, (point,))
+    write_json(folder / "noise.json", noise)
+    trade_files.write_json(folder / "trade.json", TradeRun(CONDITIONS, (ROW,)))
+    trade_files.write_csv(folder / "trade.csv", [ROW])
+    (folder / "costs.json").write_text(json.dumps(EPYC.as_json()))
+    DesignMemory(folder / "design.json", {"f_number": 4}).candidate("a", lambda: CANDIDATE)
+    return [
+        Case("calibration", "text", folder / "calib.txt", read_calibration),
+        Case("calibration", "json", folder / "calib.json", read_calibration),
+        Case("noise", "json", folder / "noise.json", lambda path: read_noise(path).sensor_noise()),
+        Case("trade", "json", folder / "trade.json", trade_files.read_json),
+        Case("trade", "text", folder / "trade.csv", trade_files.read_csv),
+        Case("costs", "json", folder / "costs.json", _cost_profile),
+        Case("design", "json", folder / "design.json", _design),
+    ]
+
+
+def _cost_profile(path: Path) -> CostProfile:
+    return CostProfile.from_json(read_json(path))
+
+
+def _design(path: Path) -> object:
+    return DesignMemory(path, {"f_number": 4}).candidate("a", lambda: CANDIDATE)
+
+
+def _folders(folder: Path, made: dict[str, list[Case]]) -> list[Case]:
+    """Data sets in folders."""
+    rgbd, captures, shards = folder / "rgbd", folder / "captures", folder / "shards"
+    optics, scenes = TiDyOptics(fidelity="draft"), DeadLeaves(2, 24, 24, num_leaves=20)
+    layout, packed = Layout(beside=("depth",)), Layout(shard_items=2)
+    render_scenes(optics, scenes, captures, layout)
+    render_scenes(optics, scenes, shards, packed)
+    parts = packed.parts(2)
+    tum, nyu, frozen = folder / "tum", folder / "nyu", folder / "frozen"
+    tum.mkdir()
+    shutil.copy(rgbd / "lamp.png", tum / "a.png")
+    shutil.copy(rgbd / "lamp_depth.png", tum / "b.png")
+    for name, file in (("rgb", "a"), ("depth", "b")):
+        (tum / f"{name}.txt").write_text(f"# time file\n1.5 {file}.png\n")
+    nyu.mkdir()
+    write_nyu(nyu, 2)
+    NoiseFreeCaptures(scenes, optics, frozen)[0]
+    (shards / "sample.json").write_bytes(b'{"index": 3, "name": "lamp"}')
+
+    def first(path: Path, of: Callable[[Path], Any]) -> object:
+        return of(path.parent)[0]
+
+    def sample(path: Path) -> object:
+        return decode_sample({"scene.json": path.read_bytes(), "coded.npy": (folder / "depth.npy").read_bytes()})
+
+    return [
+        Case("folder", "json", rgbd / "rgbd.json", lambda path: first(path, described_folder), (), rgbd),
+        Case("folder", "text", tum / "rgb.txt", lambda path: first(path, TUMSequence), (), tum),
+        *(Case("index", "text", place / "index.csv", lambda path: first(path, CodedCaptures), (), place)
+          for place in (captures, shards)),
+        Case("index", "raw", shards / parts[0].name, lambda path: first(path, CodedCaptures), (), shards),
+        Case("index", "tar", shards / parts[0].name, lambda path: encode_index(path.parent, parts, packed)),
+        Case("index", "json", shards / "sample.json", sample),
+        Case("nyu", "hdf5", nyu / "nyu_depth_v2_labeled.mat", lambda path: NYUDepthV2(path.parent, "all")[0], (), nyu),
+        Case("nyu", "raw", nyu / "splits.mat", lambda path: first(path, NYUDepthV2), (), nyu),
+        Case("npy", "npy", frozen / "000000.npy",
+             lambda path: NoiseFreeCaptures(scenes, optics, path.parent)[0], (), frozen),
+    ]  # fmt: skip
+
+
+def _runs(folder: Path) -> list[Case]:
+    """Logs and summaries of a training run."""
+    folder.mkdir()
+    (folder / "validation.csv").write_text("epoch,step,val_loss,val_image_psnr\n0,10,0.5,20.0\n1,20,0.4,21.5\n")
+    (folder / "training.csv").write_text("epoch,step,loss\n0,5,0.5\n0,10,0.45\n1,20,0.4\n")
+    (folder / "evaluation.json").write_text(
+        '{"settings": {"data": "nyu"}, "split": "test", "scenes": 3, "mean": {"image_psnr": 20.5, "depth_rmse": 0.1}}'
+    )
+    return [
+        *(Case("run", damage, folder / name, lambda path: training_record(path.parent), (), folder)
+          for name, damage in (("validation.csv", "text"), ("evaluation.json", "json"))),
+        Case("run", "text", folder / "training.csv", lambda path: drop_rows_after(path, 10)),
+        *(Case("figure", "text", folder / name, _draw, (), folder) for name in ("validation.csv", "training.csv")),
+    ]  # fmt: skip
+
+
+def _draw(path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    plt.close(draw_learning_curve(path.parent))
+
+
+def _raw_files(folder: Path) -> list[Case]:
+    """A DNG by its tags alone, which are read in this process; whole raw files take a process each."""
+    path = folder / "a.dng"
+    path.write_bytes(dng(np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) + 64))
+
+    def read_tags(path: Path) -> None:
+        data = path.read_bytes()
+        for read in (camera_tags, black_tile, white_levels, filter_array_fault, kodak_matrix, missing_bytes):
+            read(data)
+
+    return [Case("tags", "tiff", path, read_tags), Case("raw", "tiff", path, RawCapture.open)]
