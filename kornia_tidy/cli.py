@@ -14,6 +14,7 @@ from typing import TextIO
 import torch
 
 import kornia_tidy
+from kornia_tidy.app import command as app
 from kornia_tidy.commands import (
     demo,
     design,
@@ -31,7 +32,7 @@ from kornia_tidy.commands import (
 )
 
 # Each has add_parser(subparsers), which sets run(args).
-COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, info)
+COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, app, info)
 
 DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS = 0, 2, 70, 130, 141  # exit statuses; 70 is EX_SOFTWARE of sysexits.h
 DEBUG = "KORNIA_TIDY_DEBUG"  # environment variable; if set, tracebacks are printed
