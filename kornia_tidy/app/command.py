@@ -84,6 +84,7 @@ def run(args: argparse.Namespace) -> None:
                     prevent_thread_lock=True,
                     quiet=True,
                     footer_links=[],
+                    theme=page_module.THEME,
                     css=page_module.STYLE,
                     max_file_size="256mb",
                     ssr_mode=False,

@@ -101,10 +101,10 @@ CONTROLS = (
     ),
     Control(
         "f_number",
-        "f-number (focal length / aperture)",
+        "f-number",
         "slider",
         "own camera",
-        "Smaller is a wider aperture: more blur out of focus.",
+        "Focal length over aperture. Smaller is a wider aperture: more blur out of focus.",
         low=2,
         high=32,
         step=0.1,
@@ -126,7 +126,7 @@ CONTROLS = (
         "own camera",
         choices=[(STARTS_IN_WORDS.get(name, name), name) for name in (FLAT, *STARTS)],
     ),
-    Control("masks", "Number of masks K in one exposure", "slider", "own camera", low=1, high=MOST_MASKS, step=1),
+    Control("masks", "Masks in one exposure, K", "slider", "own camera", low=1, high=MOST_MASKS, step=1),
     Control(
         "compositing",
         "Compositing at depth edges",

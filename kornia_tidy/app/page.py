@@ -38,6 +38,7 @@ STYLE = """
 #status { border-left: 4px solid #c2410c; padding-left: 0.8rem; min-height: 1.6rem; }
 #intro h1 { font-size: 1.5rem; margin: 0 0 0.3rem 0; }
 """
+THEME = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
 CACHE = (3600, 86400)  # seconds: each hour uploaded files older than a day are removed; all of them at the end
 
 
@@ -125,7 +126,7 @@ def _component(control: Control) -> Any:
     """Return the Gradio component of a control."""
     common: dict[str, Any] = {"label": control.label, "elem_id": control.name, "interactive": True}
     if control.kind == "file":
-        return gr.File(**common, type="filepath", height=110)
+        return gr.File(**common, type="filepath", height=160)
     common |= {"info": control.info or None, "value": control.value}
     if control.kind == "choice":
         return gr.Dropdown(**common, choices=list(control.choices))
