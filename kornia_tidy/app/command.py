@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -72,6 +73,7 @@ def run(args: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="kornia-tidy-app-") as folder:
         with bar:
             progress(0.0, "Gradio")
+            os.environ["GRADIO_TEMP_DIR"] = folder  # uploaded files too are removed at the end
             from kornia_tidy.app import page as page_module  # noqa: PLC0415 it needs Gradio
 
             page = page_module.make_page(progress, Path(folder))
@@ -88,6 +90,7 @@ def run(args: argparse.Namespace) -> None:
                     css=page_module.STYLE,
                     max_file_size="256mb",
                     ssr_mode=False,
+                    _frontend=False,  # or it would look whether the page answers in 3 s, which a busy machine does not
                 )
             except OSError as error:
                 raise OSError(f"cannot open port {args.port or FIRST_PORT}: give another one by --port") from error

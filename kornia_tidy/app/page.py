@@ -39,7 +39,7 @@ STYLE = """
 #intro h1 { font-size: 1.5rem; margin: 0 0 0.3rem 0; }
 """
 THEME = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
-CACHE = (3600, 86400)  # seconds: each hour uploaded files older than a day are removed; all of them at the end
+CACHE = (3600, 86400)  # seconds: each hour uploaded files older than a day are removed
 
 
 def make_page(tell: Tell, folder: Path) -> Any:

@@ -98,7 +98,7 @@ class TestLegends(BaseTester):
         assert "5 masks, in turn; gather, noise 0.2 % of full scale" in words["capture"]
         assert f"by the network of joint-5. PSNR {scores['image_psnr']:.1f} dB" in words["image"]
         assert f"RMSE {scores['depth_rmse']:.2f} of the range" in words["estimate"]
-        assert "29 x 29 pixels" in words["psfs"]
+        assert f"{trained.optics.window} x {trained.optics.window} pixels" in words["psfs"]
 
     def test_feature_a_plain_lens_shows_no_masks_in_turn(self, own):
         words = legends(own)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import runpy
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -36,22 +38,24 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def address():
-    """The app in a process of its own, started by its command."""
+def address(tmp_path_factory):
+    """The app in a process of its own, started by its command and ended as by Ctrl+C."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "kornia_tidy", "app", "--port", str(port)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        assert process.stdout is not None
+    temporary = tmp_path_factory.mktemp("temporary")
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, env={**os.environ, "TMPDIR": str(temporary)}, **pipes) as process:
         try:
             line = process.stdout.readline()
             assert line.split() == ["open", f"http://127.0.0.1:{port}/"], line
             yield line.split()[1]
         finally:
-            process.terminate()
+            process.send_signal(signal.SIGINT)
             rest = process.stdout.read()
         assert "Traceback" not in rest
+    assert [path.name for path in temporary.iterdir() if not path.name.startswith("torch")] == []
 
 
 @pytest.fixture(scope="module")
