@@ -17,6 +17,7 @@ from typing import TextIO
 import torch
 
 import kornia_tidy
+from kornia_tidy.app import command as app
 from kornia_tidy.commands import (
     demo,
     design,
@@ -34,7 +35,7 @@ from kornia_tidy.commands import (
 )
 
 # Each has add_parser(subparsers), which sets run(args).
-COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, info)
+COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, app, info)
 
 # Exit statuses; 70 is EX_SOFTWARE of sysexits.h, those above 128 are 128 and the number of the signal.
 DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS, TERMINATED = 0, 2, 70, 130, 141, 143

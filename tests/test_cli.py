@@ -39,6 +39,7 @@ class TestMain(BaseTester):
             ["raw"],
             ["render"],
             ["tune"],
+            ["app"],
             ["info"],
         ],
     )

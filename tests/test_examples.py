@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from pathlib import Path
 from types import ModuleType
 
@@ -47,6 +48,29 @@ class TestEveryExample(BaseTester):
     def test_exception_unknown_options_are_refused(self, example):
         with pytest.raises(SystemExit):
             example.main(["--nonsense"])
+
+
+class TestStartNotebook(BaseTester):
+    @pytest.fixture
+    def cells(self):
+        notebook = json.loads((EXAMPLES / "start.ipynb").read_text(encoding="utf-8"))
+        return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+    def test_feature_its_cells_run_in_their_order_and_show_what_they_say(self, cells, capsys):
+        pyplot = pytest.importorskip("matplotlib.pyplot")
+        pyplot.switch_backend("agg")  # draws no window
+        names = {"__name__": "__main__"}
+        for number, cell in enumerate(cells):
+            exec(compile("".join(cell["source"]), f"start.ipynb, code cell {number}", "exec"), names)
+        assert len(pyplot.get_fignums()) == 6
+        pyplot.close("all")
+        told = dict(line.strip().split(": ") for line in capsys.readouterr().out.splitlines() if line.endswith(" dB"))
+        plain, coded, restored = (float(told[name].split()[0]) for name in ("its restoration", "coded", "restored"))
+        assert restored > max(plain, coded) + 2
+        assert names["losses"][-1] < 0.6 * names["losses"][0]
+
+    def test_feature_it_is_kept_without_outputs(self, cells):
+        assert [cell["id"] for cell in cells if cell["outputs"] or cell["execution_count"] is not None] == []
 
 
 @pytest.mark.parametrize("example", ["simulate_photo"], indirect=True)
