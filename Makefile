@@ -6,8 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable sanitize mutations extremes lint bench targets clean
-.PHONY: help demo test test-portable sanitize mutations fuzz lint bench targets clean
+.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint bench targets clean
 .DELETE_ON_ERROR:
 
 help:
