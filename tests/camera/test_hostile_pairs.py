@@ -223,6 +223,11 @@ class TestHostilePairs(BaseTester):
     def test_feature_extremes_in_pairs_are_exact_or_refused(self):
         assert not faults(random.Random(0).sample(PAIRS, SAMPLE))
 
+    @pytest.mark.parametrize("options", [{"aperture": one_pixel(23)}, {"masks": PixelwiseMask(1, 1)}], ids=["23", "1"])
+    def test_exception_bandlimited_layers_of_one_cell(self, options):
+        with pytest.raises(ValueError, match="layers='bandlimited' needs an aperture of several cells"):
+            TiDyOptics(fidelity=Fidelity(window=15, layers="bandlimited"), **options)
+
     @pytest.mark.slow
     def test_feature_all_pairs_of_extremes_are_exact_or_refused(self):
         assert not faults(PAIRS)
