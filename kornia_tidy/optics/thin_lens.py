@@ -15,6 +15,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 FASTEST = 0.5  # f-number at a numerical aperture of 1, the limit of a lens in air
 # Limits in metres: from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
 FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
+NEAREST_DEPTH = 1e-18  # metres
 
 
 def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: float | Tensor) -> Tensor:
@@ -34,6 +35,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
         - Positive is nearer than focus. At another wavelength multiply by 530 nm / wavelength.
         - The phase over the pupil is defocus * rho**2, with rho = 1 at the edge.
         - Depths are not checked here. :meth:`ThinLensCamera.defocus` checks them.
+        - Depths below 1e-18 m count as 1e-18 m, and have the gradient 0: the square of their inverse overflows float32.
 
     Source: Goodman, Introduction to Fourier Optics, section 6.4.
 
@@ -46,7 +48,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     focus = _at_least_float32(focus_distance) if isinstance(focus_distance, Tensor) else focus_distance
     wide = depth.to(torch.promote_types(depth.dtype, torch.float32))
     # Infinite depth has an inverse of exactly zero.
-    return (scale * (wide.reciprocal() - 1 / focus)).to(depth.dtype)
+    return (scale * (wide.clamp(min=NEAREST_DEPTH).reciprocal() - 1 / focus)).to(depth.dtype)
 
 
 def _depth_range(value: tuple[float, float]) -> tuple[float, float]:

@@ -33,7 +33,7 @@ In units of the rounding of float32 (2^-24 of full scale), by the largest error 
 The error hardly grows with anything, for these reasons:
 
 * Defocus reaches PSFs through integrals over the pixels of the mask, which are computed in float64 and rounded once; a
-  large defocus costs no digits. The phase of the masks keeps its own type: at heights of 943 waves float32 loses 4e-6.
+  large defocus costs no digits. Whole waves of the masks' phase are taken off in float64 before it meets them.
 * K masks are averaged: errors are weighted by 1/K each, and a sum of K terms in order adds at most K roundings of a
   value below 1, of which random ones cancel to about their square root.
 * PSFs sum to one, so a convolution is a weighted mean: its error is bounded by gamma(n) of

@@ -40,6 +40,15 @@ class TestThinLensDefocus(BaseTester):
         z = torch.tensor([0.5, 0.85, 6.0], dtype=torch.float64)
         self.assert_close(thin_lens_defocus(z, 1.470588e-3, 0.85), 12.81906 / z - 15.08125, atol=2e-5, rtol=0)
 
+    @pytest.mark.parametrize("depth", [1e-42, 1e-30, 1e-6, 1.0, 1e12, 3e38, float("inf")])
+    def test_feature_defocus_and_its_gradient_are_finite_where_it_is_clamped(self, depth):
+        """The square of an inverse depth overflows, and is multiplied by the 0 of the clamp: NaN."""
+        leaf = torch.tensor([depth], requires_grad=True)
+        defocus = thin_lens_defocus(leaf, 1.4175e-3, 0.595)
+        defocus.clamp(-20, 20).sum().backward()
+        assert bool(defocus.isfinite().all())
+        assert bool(leaf.grad.isfinite().all())
+
     def test_gradcheck_depth_and_focus(self):
         self.gradcheck(lambda z, f: thin_lens_defocus(z, 1.4e-3, f), (torch.tensor([0.3, 0.9]), torch.tensor(0.6)))
 

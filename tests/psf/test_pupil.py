@@ -12,7 +12,7 @@ from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, Spectrum, TiDyOptic
 from kornia_tidy.modulator.modulator import SpatialLightModulator
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.pupil import Pupil, gapped_cells
+from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 from tests.base import BaseTester
 
 
@@ -33,6 +33,22 @@ def brute_force(
     kernel = np.exp(-2j * np.pi * u[:, None] * x) * (2.3 / n)
     light = np.abs(kernel @ field @ kernel.T) ** 2 * (step / sub) ** 2
     return light.reshape(window, sub, window, sub).sum((1, 3)) / ((amplitude**2).sum() * (2.3 / len(amplitude)) ** 2)
+
+
+class TestPupilField(BaseTester):
+    @pytest.mark.parametrize("highest", [1.0, 1e2, 1e4])
+    @pytest.mark.parametrize("dispersion", [1.0, 0.8652, 1.1333])
+    def test_feature_thousands_of_waves_lose_no_digit(self, highest, dispersion):
+        """Angles of at most pi are rounded to float32 once, cosine and sine to at most two units of round-off."""
+        phase = (highest * torch.randn(1, 64, 64)).float()
+        found = pupil_field(phase, torch.ones(64, 64), dispersion)
+        angle = phase.double() * dispersion
+        error = (found - torch.complex(angle.cos(), angle.sin())).abs().max()
+        assert float(error) <= (math.pi + 2) * math.sqrt(2) * torch.finfo(torch.float32).eps / 2
+
+    def test_gradcheck_across_whole_waves(self):
+        phase = torch.tensor([[[math.pi - 1e-9, math.pi + 1e-9], [-3 * math.pi, 1e4]]], dtype=torch.float64)
+        self.gradcheck(lambda p: torch.view_as_real(pupil_field(p, torch.ones(2, 2), 1.1)), (phase.requires_grad_(),))
 
 
 class TestFillFactor(BaseTester):
