@@ -78,7 +78,7 @@ def form(value: Any) -> tuple[Any, ...]:
     """Type, number type and shape."""
     if isinstance(value, (torch.Tensor, np.ndarray)):
         return type(value).__name__, value.dtype, tuple(value.shape)
-    return type(value), value.mode, value.size
+    return "PIL", value.mode, value.size
 
 
 def draws_kept(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -113,13 +113,13 @@ def test_feature_runs_with_two_lines_changed(name, tmp_path, monkeypatch):
     finally:
         sys.modules.pop("scenes_of_user", None)
     if "image" in before:
-        same = "Tensor" if "monai" in name else form(before["image"])[0]
-        assert form(after["image"])[1:] == form(before["image"])[1:]
-        assert "monai" in name or form(after["image"])[0] == same or isinstance(after["image"], torch.Tensor)
+        assert form(after["image"]) == form(before["image"])
         assert not np.array_equal(plain(after["image"]), plain(before["image"]))
         assert np.isfinite(plain(after["image"])).all()
     if "depth" in before:
-        assert np.array_equal(plain(after["depth"]), plain(before["depth"]))
+        given, kept = plain(before["depth"]), plain(after["depth"])
+        assert kept.dtype == given.dtype
+        assert np.array_equal(kept[given > 0], given[given > 0])  # holes, which a warp leaves 0, may be filled
     if name in TRAINED:
         gradient = after["trained"].optics.masks.phase.grad
         assert gradient is not None
