@@ -93,7 +93,12 @@ class DepthTap(K.IntensityAugmentationBase2D):
                 f"{len(masks)} masks reach {name}: tell which of them is the depth with "
                 f"augmentation.depth_tap.mask = 0 for the first"
             )
-        depth = masks[self.mask or 0]
+        chosen = self.mask or 0
+        if not 0 <= chosen < len(masks):
+            raise ValueError(
+                f"augmentation.depth_tap.mask must be from 0 to {len(masks) - 1} for {len(masks)} masks, got {chosen}"
+            )
+        depth = masks[chosen]
         if depth.dtype in HALVES:
             raise ValueError(
                 f"depth reaches {name} in {depth.dtype}, since the container casts masks to the image's type: give "

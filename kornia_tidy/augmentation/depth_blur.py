@@ -109,6 +109,9 @@ def depth_blur(
     if not image.numel():
         return image
     check_choice("color_space", color_space, COLOR_SPACES)
+    for name, value in (("focus_distance", focus_distance), ("f_number", f_number)):
+        if isinstance(value, Tensor) and value.numel() not in (1, len(image)):
+            raise ValueError(f"{name} must be one number or one for each of {len(image)} images, got {value.numel()}")
     for name, value in (("f_number", f_number), ("focal_length", focal_length), ("pixel_pitch", pixel_pitch)):
         check_positive(name, float(value.min()) if isinstance(value, Tensor) else value)
     check_positive("max_radius", max_radius, "pixels")

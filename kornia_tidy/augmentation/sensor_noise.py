@@ -93,8 +93,9 @@ def _of_rows(name: str, value: float | Tensor, image: Tensor, dtype: torch.dtype
     rows = torch.as_tensor(value, device=image.device, dtype=dtype).reshape(-1, 1, 1, 1)
     if len(rows) not in (1, len(image)):
         raise ValueError(f"{name} must be one number or one for each of {len(image)} images, got {len(rows)}")
-    if not bool((rows >= 0).all()):
-        raise ValueError(f"{name} must be zero or positive electrons, got {float(rows.min())}")
+    allowed = (rows >= 0) & rows.isfinite()
+    if not bool(allowed.all()):
+        raise ValueError(f"{name} must be zero or positive electrons, and finite, got {float(rows[~allowed][0])}")
     return rows
 
 

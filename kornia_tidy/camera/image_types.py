@@ -30,6 +30,8 @@ def image_tensor(image: Any) -> Tensor:
         >>> image_tensor(np.full((4, 5, 3), 51, np.uint8))[:, 0, 0]
         tensor([0.2000, 0.2000, 0.2000])
     """
+    if type(image) is not Tensor and isinstance(image, Tensor):
+        image = image.as_subclass(Tensor)  # MONAI's MetaTensor lacks operators that a capture needs
     if not isinstance(image, Tensor):
         image = torch.from_numpy(_planes(_array("image", image)))
     if image.is_floating_point():
@@ -81,6 +83,8 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
         tensor([[[0.5000, 2.0000]]])
     """
     check_positive("depth_scale", scale, "metres")
+    if type(depth) is not Tensor and isinstance(depth, Tensor):
+        depth = depth.as_subclass(Tensor)
     if not isinstance(depth, Tensor):
         depth = torch.from_numpy(_planes(_array("depth", depth)))
         if depth.shape[-3] != 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path, PurePosixPath
 
@@ -107,6 +108,9 @@ def _associated(root: Path, max_difference: float) -> list[tuple[str, str, str]]
 
 def _seconds(path: Path, text: str) -> float:
     try:
-        return float(text)
+        seconds = float(text)
     except ValueError:
-        raise ValueError(f"cannot read {path}: a line should begin with a time in seconds, got {text!r:.80}") from None
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise ValueError(f"cannot read {path}: a line should begin with a time in seconds, got {text!r:.80}")
+    return seconds

@@ -65,6 +65,14 @@ class TestInAugmentationSequential(BaseTester):
         optics.depth_tap.mask = 1
         self.assert_close(sequence(image, torch.ones_like(depth), depth)[0], camera_of(optics)(image, depth))
 
+    @pytest.mark.parametrize("mask", [1, 5, -1])
+    def test_exception_a_mask_that_is_not_there(self, mask):
+        optics, (image, depth) = augmentation(), scene(2)
+        optics.depth_tap.mask = mask
+        sequence = K.AugmentationSequential(optics.depth_tap, optics, data_keys=["input", "mask"])
+        with pytest.raises(ValueError, match=rf"depth_tap.mask must be from 0 to 0 for 1 masks, got {mask}"):
+            sequence(image, depth)
+
     def test_exception_a_depth_that_passes_unwarped(self):
         optics, (image, depth) = augmentation(), scene(2)
         with pytest.raises(ValueError, match=r"under the key 'mask' or 'mask_depth' \('depth' passes unwarped\)"):

@@ -95,6 +95,10 @@ class TestDepthBlur(BaseTester):
             depth_blur(image, depth, 0.04, 2.0)
         with pytest.raises(ValueError, match="f_number must be positive"):
             depth_blur(image, depth, 1.0, 0.0)
+        with pytest.raises(ValueError, match="f_number must be one number or one for each of 1 images, got 3"):
+            depth_blur(image, depth, 1.0, torch.ones(3))
+        with pytest.raises(ValueError, match="focus_distance must be one number or one for each of 1 images, got 0"):
+            depth_blur(image, depth, torch.ones(0), 2.0)
         with pytest.raises(ValueError, match="depth must be positive metres, got 0"):
             depth_blur(image, torch.zeros_like(depth), 1.0, 2.0)
         with pytest.raises(ValueError, match="color_space must be one of 'srgb', 'linear'"):

@@ -68,8 +68,11 @@ class TestSensorNoise(BaseTester):
 
     def test_exception(self):
         image = torch.rand(2, 3, 4, 4)
-        with pytest.raises(ValueError, match="read_noise must be zero or positive electrons, got -1"):
+        with pytest.raises(ValueError, match="read_noise must be zero or positive electrons, and finite, got -1"):
             sensor_noise(image, 100.0, -1.0)
+        for name in ("full_well", "read_noise", "dark"):
+            with pytest.raises(ValueError, match=f"{name} must be zero or positive electrons, and finite, got inf"):
+                sensor_noise(image, **{"full_well": 100.0, name: float("inf")})
         with pytest.raises(ValueError, match="full_well must be positive and above dark"):
             sensor_noise(image, 100.0, dark=100.0)
         with pytest.raises(ValueError, match="full_well must be one number or one for each of 2 images, got 3"):

@@ -62,6 +62,7 @@ class TestTUMSequence(BaseTester):
             ("", r"cannot read .*rgb\.txt: .*"),
             ("# nothing\n", "should list times and files"),
             ("10.0\n", "should list times and files"),
+            ("nan rgb/1.png\n", "begin with a time in seconds, got 'nan'"),
             ("rgb/1.png 10.0\n", "begin with a time in seconds, got 'rgb/1.png'"),
             ("10.0 ../secret.png\n", r"files must lie in the folder, got \.\./secret\.png"),
             ("10.0 /etc/passwd\n", "files must lie in the folder, got /etc/passwd"),
