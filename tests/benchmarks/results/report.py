@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from tests.benchmarks.results.captures import FIXED, PHYSICAL
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
@@ -53,12 +53,12 @@ this page, and goes on where it was interrupted.
 """
 
 
-def page(results: Results, cells: Sequence[Measured]) -> str:
+def page(results: Results, cells: Sequence[Measured], recommended: Mapping[str, str] | None = None) -> str:
     """Return the whole page."""
     lines = [INTRODUCTION, _measured_where(cells), "", *_missing(results, cells), ""]
     lines += [f"![PSNR over noise and over f-number]({PICTURE})", "", "## Targets", ""]
     lines += ["On half B of the real scenes; what they ask for is in dB unless it says otherwise.", ""]
-    lines += [*in_words(verdicts(results)), ""]
+    lines += [*in_words(verdicts(results, recommended)), ""]
     for scenes in results.sets:
         title = SET_NAMES.get(scenes, scenes)
         for noise in (*FIXED, *PHYSICAL):
