@@ -461,6 +461,14 @@ class TestCommand(BaseTester):
         with pytest.raises(SystemExit, match=match):
             command.main([str(tmp_path), *arguments])
 
+    def test_feature_the_page_of_networks_alone_compares_with_the_best(self):
+        scenes = real_like()
+        scores = {("57000e", FLAT, NETWORK): scored(scenes, 25.0), ("57000e", FIVE, NETWORK): scored(scenes, 26.5)}
+        cell = Measured(Cell(REAL, "s0", FIVE, "", "57000e", NETWORK, ""), {"psnr": 26.5}, HERE)
+        text = page(synthetic(scores, [scenes]), [cell])
+        assert f"is the difference to *{NETWORK}* of `{FIVE}`." in text
+        assert "| -1.50 ± 0.00 |" in text
+
     def test_feature_the_page_says_what_is_missing(self):
         cell = Measured(Cell(REAL, "s0", FLAT, "", "0.01", "capture", ""), {"psnr": 20.0}, HERE)
         text = page(synthetic({("0.01", FLAT, "capture"): scored(real_like(), 20.0)}, [real_like()]), [cell])
