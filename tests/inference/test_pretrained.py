@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -41,6 +44,15 @@ class TestPretrained(BaseTester):
         assert abs(scores["image_psnr"] - told["image_psnr"]) < 2.5
         if "depth_rmse" in told:
             assert scores["depth_rmse"] < told["depth_rmse"] + 0.1
+
+    def test_feature_loading_does_not_import_the_compiler_of_torch(self):
+        """Its import takes longer than loading."""
+        code = (
+            "import sys; from kornia_tidy.inference.pretrained import load_pretrained; load_pretrained('edof-5'); "
+            "sys.exit('torch._dynamo' in sys.modules)"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
 
     def test_feature_all_are_small(self):
         assert sum(path.stat().st_size for path in FOLDER.iterdir() if path.is_file()) < MEGABYTES << 20

@@ -12,6 +12,7 @@ from typing import Any
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.inference.half_precision import halved
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
 
@@ -45,6 +46,18 @@ def load_pretrained(name: str) -> TrainedSystem:
     """
     check_choice("name", name, PRETRAINED)
     return load_trained(FOLDER / f"{name}.safetensors")
+
+
+def pretrained_settings(name: str) -> SystemSettings:
+    """Return the settings of camera and network of a shipped system, without building them.
+
+    Example:
+        >>> pretrained_settings("joint-1").masks
+        1
+    """
+    check_choice("name", name, PRETRAINED)
+    known, _ = SystemSettings.split(read_state(FOLDER / f"{name}.safetensors")["settings"])
+    return SystemSettings(**known)
 
 
 def about_pretrained() -> dict[str, Any]:
