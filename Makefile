@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make demo     coded captures and what networks make of them: outputs/demo.png, reconstruction.png"
+	@echo "make demo     captures with and without masks, and what is made of them: outputs/reconstruction.png, demo.png"
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
 	@echo "make test     the tests, a process for each core; ARGS='-k camera' runs some of them, ARGS='-n0' in one process"
 	@echo "make test-portable  the tests as on other machines: vector widths, compilers, none, threads; up to 20 minutes;"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import json
 import math
 import shutil
 
@@ -13,7 +14,11 @@ import torch
 from scipy import stats
 from torch import nn
 
+from kornia_tidy.inference.hub import save_pretrained
 from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.inference.settings import SystemSettings
+from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
+from kornia_tidy.mask_design.candidates import FLAT as FLAT_LENS
 from tests.base import BaseTester
 from tests.benchmarks.results import __main__ as command
 from tests.benchmarks.results import measure
@@ -26,7 +31,7 @@ from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contr
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
 from tests.benchmarks.results.systems import WINDOW, System, available, from_checkpoint, of_trained
 from tests.benchmarks.results.table import Key, Results, paired
-from tests.benchmarks.results.verdicts import FIVE, ONE, REAL, verdicts
+from tests.benchmarks.results.verdicts import FIVE, ONE, REAL, recommendations, verdicts
 from tests.scenes import halves
 
 HERE = Provenance("2026-11-22", "0000000", "a test")
@@ -127,8 +132,14 @@ class TestSystems(BaseTester):
         from kornia_tidy.inference.pretrained import FOLDER
 
         (tmp_path / "mine").mkdir()
-        shutil.copy(FOLDER / "edof-0.safetensors", tmp_path / "mine" / "best.ckpt")
-        assert from_checkpoint(tmp_path / "mine" / "best.ckpt").name == "mine"
+        shutil.copy(FOLDER / "edof-0.safetensors", tmp_path / "mine" / "best.safetensors")
+        assert from_checkpoint(tmp_path / "mine" / "best.safetensors").name == "mine"
+
+    def test_feature_a_folder_with_its_own_aperture_and_without_masks(self, tmp_path):
+        settings = SystemSettings(masks=1, start="flat", f_number=48.0, window=9, head="plain", width=2)
+        lens = TrainedSystem(build_optics(settings), build_head(settings), settings, 0)
+        system = from_checkpoint(save_pretrained(lens, tmp_path / "slow"))
+        assert (system.name, system.kind, system.title) == ("slow", "flat", "flat lens, f/48")
 
 
 GRID = {"a": tuple(2.0**power for power in range(9)), "b": (1.0, 3.0, 9.0)}
@@ -331,6 +342,28 @@ class TestResults(BaseTester):
         assert found[f"500 electrons, networks: {FIVE} over {FLAT}"].measured.startswith("-2.00 ± 0.00 (0 of 3")
         assert met["57,000 electrons, closed forms: coded over flat"] is None
 
+    def test_feature_what_a_design_recommends_may_lose_by_two_standard_errors(self, tmp_path):
+        scenes = real_like()
+        gains = dict(zip(scenes.names, (0.0, 0.6, -0.2) * len(scenes.names), strict=False))
+        scores = {}
+        for noise, sign in (("57000e", 1), ("2000e", -1)):
+            coded = {name: {"psnr": 26.0 + sign * gain, "ssim": 0.9} for name, gain in gains.items()}
+            scores |= {(noise, FLAT, NETWORK): scored(scenes, 26.0), (noise, FIVE, NETWORK): coded}
+        scores |= {("500e", FLAT, NETWORK): scored(scenes, 26.0), ("500e", FIVE, NETWORK): scored(scenes, 25.0)}
+        for noise, start in {"57000": FLAT_LENS, "2000": "focal sweep", "500": "focal sweep"}.items():
+            report = {"task": {"electrons": 4 * float(noise), "reference_f_number": 8.8}}
+            report["recommended"] = {"start": start}
+            (tmp_path / noise).mkdir()
+            (tmp_path / noise / "report.json").write_text(json.dumps(report))
+        recommended = recommendations([tmp_path / noise for noise in ("57000", "2000", "500")])
+        assert recommended == {"57000e": "flat", "2000e": "coded", "500e": "coded"}
+        rows = verdicts(synthetic(scores, [scenes]), recommended)
+        assert [row.met for row in rows if "design recommends" in row.claim] == [True, True, False]
+        report["task"]["electrons"] = 9
+        (tmp_path / "500" / "report.json").write_text(json.dumps(report))
+        with pytest.raises(ValueError, match=r"is a design for 2 electrons at f/17.6, not measured"):
+            recommendations([tmp_path / "500"])
+
     def test_feature_without_results_nothing_is_met(self):
         assert {row.met for row in verdicts(synthetic({}, [real_like()]))} == {None}
 
@@ -427,6 +460,14 @@ class TestCommand(BaseTester):
     def test_exception_one_sentence(self, arguments, match, tmp_path):
         with pytest.raises(SystemExit, match=match):
             command.main([str(tmp_path), *arguments])
+
+    def test_feature_the_page_of_networks_alone_compares_with_the_best(self):
+        scenes = real_like()
+        scores = {("57000e", FLAT, NETWORK): scored(scenes, 25.0), ("57000e", FIVE, NETWORK): scored(scenes, 26.5)}
+        cell = Measured(Cell(REAL, "s0", FIVE, "", "57000e", NETWORK, ""), {"psnr": 26.5}, HERE)
+        text = page(synthetic(scores, [scenes]), [cell])
+        assert f"is the difference to *{NETWORK}* of `{FIVE}`." in text
+        assert "| -1.50 ± 0.00 |" in text
 
     def test_feature_the_page_says_what_is_missing(self):
         cell = Measured(Cell(REAL, "s0", FLAT, "", "0.01", "capture", ""), {"psnr": 20.0}, HERE)

@@ -135,6 +135,7 @@ def as_json(raw: RawCapture) -> dict[str, Any]:
         "exposure": info.exposure,
         "aperture": info.aperture,
         "focal_length": info.focal_length,
+        "noise_profile": info.noise_profile,
         "timestamp": info.timestamp.isoformat() if info.timestamp else None,
         "width": width,
         "height": height,

@@ -20,6 +20,7 @@ from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
 from tqdm import tqdm
 
+from kornia_tidy.checks import check_positive
 from kornia_tidy.commands.raw_develop import SUFFIXES, add_white_balance_option, output_paths, parse_white_balance
 from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, open_raw
 from kornia_tidy.commands.report import tell
@@ -32,6 +33,9 @@ from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
+from kornia_tidy.raw.developed_noise import developed_noise
+from kornia_tidy.reconstruction.head import takes_noise
+from kornia_tidy.sensor.noise import SensorNoise
 
 if TYPE_CHECKING:
     from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
@@ -56,6 +60,8 @@ A network fits the camera that it was trained with, so HEAD must be trained with
 masks and lens of the captures. The library includes edof-5, edof-1 (five masks, one
 mask) and edof-0 (a plain lens) for the picture, and joint-5, joint-1, joint-0 for
 picture and depth, all for a 50 mm f/17.6 lens focused at 0.6 m with pixels of 8 um.
+A network that begins with the closed form takes the noise of each pixel: of raw files
+with a noise profile (DNG) from it, else as --noise says.
 """
 
 EXAMPLES = """\
@@ -112,6 +118,13 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--linear", action="store_true", help="FILES that are pictures hold linear light, not sRGB")
     add_white_balance_option(parser)
+    parser.add_argument(
+        "--noise",
+        type=float,
+        metavar="S",
+        help="standard deviation in linear light, of full scale, for a network that takes it (default: by the noise "
+        "profile of the raw file, else that of the simulated sensor)",
+    )
     parser.add_argument("--resume", action="store_true", help="skip files whose results are there and still right")
     parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)")
     parser.add_argument(
@@ -123,13 +136,17 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Reconstruct captures."""
-    from kornia_tidy.inference.light_head import LightHead, reconstruct_light  # noqa: PLC0415
+    from kornia_tidy.inference.light_head import LightHead, reconstruct_light, with_noise_of  # noqa: PLC0415
     from kornia_tidy.inference.trained import load_trained  # noqa: PLC0415
 
     parse_white_balance(args.white_balance)
+    if args.noise is not None:
+        check_positive("noise", args.noise, "in units of full scale")
     weights = head_file(args.head)
     system = load_trained(weights)
     head = LightHead(system).to(torch.device(args.device))
+    if args.noise is not None and not takes_noise(system.head):
+        raise ValueError(f"--noise is for a network that takes it, and that of {args.head} does not")
     suffixes = result_suffixes(system.settings.task, args.format, uncertain=head.uncertain)
     if "_depth_colors.png" in suffixes:
         require_matplotlib()
@@ -139,6 +156,7 @@ def run(args: argparse.Namespace) -> None:
         "weights": hashlib.sha256(read_bytes(weights)).hexdigest(),
         "depth_unit": args.depth_unit,
         "linear": args.linear,
+        "noise": args.noise,
         "white_balance": args.white_balance,
         "dump": {name: getattr(args, name) for name in DUMP_OPTIONS},
     }
@@ -154,11 +172,13 @@ def run(args: argparse.Namespace) -> None:
         paths = outputs[path]
         if args.resume and is_finished(paths, said):
             return Row(path, "kept")
-        light, upright, info = read_light(path, args)
-        result = reconstruct_light(head, light, memory_budget=(args.memory << 20) // args.jobs, progress=progress)
+        light, upright, info, noise = read_light(path, args)
+        own = with_noise_of(head, noise)  # no other thread's
+        result = reconstruct_light(own, light, memory_budget=(args.memory << 20) // args.jobs, progress=progress)
         del light
         size = write_results(paths, result, upright, info, head, args.depth_unit)
-        write_bytes(paths[-1], (json.dumps({**said, "size": size, **_in_words(head, args)}, indent=1) + "\n").encode())
+        words = _in_words(head, args) | ({} if noise is None else {"noise": noise.extra_repr()})
+        write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
         return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
 
     rows = work_on_all(list(outputs), work, args.jobs)
@@ -202,15 +222,22 @@ def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list
     return [*image, *depth, *deviation, ".json"]
 
 
-def read_light(path: str, args: argparse.Namespace) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any]]:
-    """Read a capture as linear light, with its upright orientation and its camera and exposure data."""
+def read_light(
+    path: str, args: argparse.Namespace
+) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any], SensorNoise | None]:
+    """Read a capture as linear light, with its upright orientation, its camera and exposure data, and its noise.
+
+    The noise is that of --noise, or else of the noise profile of a raw file; None where there is neither.
+    """
+    given = None if args.noise is None else SensorNoise(args.noise)
     if args.size is None and Path(path).suffix.lower() in PICTURES:
         picture = read_image(path)
-        return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}
+        return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}, given
     raw: RawCapture = open_raw(path, args)
-    light = develop(raw, white_balance=parse_white_balance(args.white_balance), encoded=False, upright=False)
+    white_balance = parse_white_balance(args.white_balance)
+    light = develop(raw, white_balance=white_balance, encoded=False, upright=False)
     bare = replace(raw, counts=torch.empty(0))  # keeps the orientation without the counts
-    return light, bare.upright, vars(raw.info)
+    return light, bare.upright, vars(raw.info), given or developed_noise(raw, white_balance)
 
 
 def write_results(
@@ -263,7 +290,7 @@ def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
 def work_on_all(paths: list[str], work: Callable[[str, Callable[[int, int], None]], Row], jobs: int) -> list[Row]:
     """Process all files, several at a time, and go on after errors; an interrupt ends all between two tiles.
 
-    Threads share one copy of the network in memory, and long operations release the interpreter lock.
+    Threads share the weights of the network in memory, and long operations release the interpreter lock.
     """
     stop = threading.Event()
     lock = threading.Lock()

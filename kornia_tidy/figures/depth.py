@@ -73,6 +73,14 @@ def depth_at(defocus: float, camera: ThinLensCamera) -> float:
     return depth if depth < 1e9 else math.inf
 
 
+def depth_colors(inverse_depth: Tensor) -> Tensor:
+    """Return normalised inverse depth (1, H, W) in the colours of depth maps, (3, H, W) in [0, 1]; bright is near."""
+    from matplotlib import colormaps  # noqa: PLC0415
+
+    colors = colormaps[DEPTH_COLORS](inverse_depth[0].cpu().clamp(0, 1).numpy())
+    return torch.from_numpy(colors[..., :3]).permute(2, 0, 1)
+
+
 def depth_bar(axes: Axes, camera: ThinLensCamera) -> None:
     """Draw the colour bar of a camera's depth range, far to near, with ticks in metres."""
     axes.imshow(np.linspace(0, 1, 256)[None], cmap=DEPTH_COLORS, aspect="auto", extent=(0, 1, 0, 1))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-import torch
 from torch import Tensor
 
-from kornia_tidy.figures.style import ACCENT, DEPTH_COLORS, FAINT, LABEL, TITLE, require_matplotlib
+from kornia_tidy.figures.depth import depth_colors
+from kornia_tidy.figures.style import ACCENT, FAINT, LABEL, TITLE, require_matplotlib
 from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def draw_estimates(
         ]
         if estimate.inverse_depth is not None:
             pictures += [
-                (_in_colors(estimate.inverse_depth), f"RMSE {scores['depth_rmse']:.3f} of the range"),
+                (depth_colors(estimate.inverse_depth), f"RMSE {scores['depth_rmse']:.3f} of the range"),
                 ((estimate.inverse_depth - inverse_depth).abs().expand(3, -1, -1) * ERROR_SCALE, ""),
             ]
         if estimate.deviation is not None:
@@ -114,20 +114,12 @@ def draw_estimates(
             transform=axes[y][1].transAxes,
             bbox={"facecolor": ACCENT, "linewidth": 0, "pad": 2},
         )
-        scene = (image, "") if y == 0 else (_in_colors(inverse_depth), "its depth; bright is near")
+        scene = (image, "") if y == 0 else (depth_colors(inverse_depth), "its depth; bright is near")
         if y < 2:
             _show(axes[y][0], *scene, headings[0] if y == 0 else "")
         else:
             axes[y][0].set_axis_off()
     return figure
-
-
-def _in_colors(inverse_depth: Tensor) -> Tensor:
-    from matplotlib import colormaps  # noqa: PLC0415
-
-    return torch.from_numpy(colormaps[DEPTH_COLORS](inverse_depth[0].cpu().clamp(0, 1).numpy())[..., :3]).permute(
-        2, 0, 1
-    )
 
 
 def _show(axes: Axes, picture: Tensor, words: str, heading: str) -> None:

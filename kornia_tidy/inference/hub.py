@@ -16,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.inference.half_precision import halved
 from kornia_tidy.inference.model_card import check_license, model_card
 from kornia_tidy.inference.trained import TrainedSystem, system_of_state
 from kornia_tidy.tensor_files import read_tensors
@@ -31,6 +32,7 @@ def save_pretrained(
     *,
     record: Mapping[str, Any] | None = None,
     license: str | None = None,  # noqa: A002 (the name in the card's metadata)
+    half: bool = False,
 ) -> Path:
     """Write a trained system as a folder that :func:`from_pretrained` loads and the Hugging Face Hub takes.
 
@@ -45,13 +47,15 @@ def save_pretrained(
             :func:`kornia_tidy.inference.pretrained.pretrained_record` from a shipped system.
         license: identifier of the weights' licence, such as ``"apache-2.0"``. Default: the card says that none is
             given.
+        half: write the network's weights as float16, in half the space; see
+            :func:`~kornia_tidy.inference.half_precision.halved`. They are loaded as float32.
 
     Returns:
         The folder.
 
     Raises:
-        ValueError: if the settings do not describe camera and network, or a value cannot be written as JSON; nothing is
-            then written.
+        ValueError: if the settings do not describe camera and network, a value cannot be written as JSON, or a weight
+            is beyond the range of float16 and that is asked for; nothing is then written.
         OSError: if a file cannot be written.
 
     Convention:
@@ -76,6 +80,8 @@ def save_pretrained(
         raise ValueError(f"cannot write into {folder}: it is not a folder")
     check_license(license)
     weights = _weights(system)
+    if half:
+        weights = halved(weights, [f"head.{name}" for name, _ in system.head.named_parameters()])
     config = {
         "library_name": LIBRARY,
         "format": FORMAT,

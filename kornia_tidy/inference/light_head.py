@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
@@ -15,10 +15,11 @@ from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.inference.tasks import MAPS, depth_logits, deviation_in_metres, metres, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.reconstruction.closed_form import whole_picture
+from kornia_tidy.reconstruction.closed_form import ClosedForm, whole_picture
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
-from kornia_tidy.reconstruction.tiled import reconstruct_tiled
+from kornia_tidy.reconstruction.tiled import reconstruct_tiled, shared_copy
+from kornia_tidy.sensor.noise import SensorNoise
 
 
 class Reconstruction(NamedTuple):
@@ -92,6 +93,22 @@ class LightHead(nn.Module):
         if (logits := depth_logits(self.task, output)) is not None:
             return (*maps.values(), depth_moments(logits)[1])
         return tuple(maps.values())
+
+
+def with_noise_of(head: LightHead, sensor: SensorNoise | None) -> LightHead:
+    """Return a copy of a head that takes its captures' noise for that of a sensor, in each pixel by its light.
+
+    The copy shares the weights, so that several threads may each have their own.
+
+    Args:
+        head: a network. One that is not conditioned on the noise takes no notice of it.
+        sensor: whose standard deviation is in units of the captures' full scale. None: the noise stays as it is.
+    """
+    copied = cast("LightHead", shared_copy(head))
+    for module in copied.modules():
+        if isinstance(module, ClosedForm) and sensor is not None:
+            module.set_noise(sensor)
+    return copied
 
 
 def reconstruct_light(

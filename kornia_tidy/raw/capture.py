@@ -31,6 +31,8 @@ class RawInfo:
         aperture: f-number.
         focal_length: in metres.
         timestamp: time of the exposure by the camera's clock.
+        noise_profile: scale S and offset O of the noise's variance S x + O, x from 0 (black) to 1 (white): one pair for
+            all colours, or one for each.
     """
 
     make: str | None = None
@@ -41,6 +43,7 @@ class RawInfo:
     aperture: float | None = None
     focal_length: float | None = None
     timestamp: datetime | None = None
+    noise_profile: tuple[tuple[float, float], ...] | None = None
 
     @property
     def camera(self) -> str:
@@ -286,6 +289,8 @@ def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
         raise ValueError(f"pixel aspect {header['pixel_aspect']}")
     if "timestamp" in info:
         info["timestamp"] = datetime.fromisoformat(info["timestamp"])
+    if "noise_profile" in info:
+        info["noise_profile"] = tuple((float(scale), float(offset)) for scale, offset in info["noise_profile"])
     different = len(set(colors))
     return RawCapture(
         counts,

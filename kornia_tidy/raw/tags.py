@@ -25,6 +25,7 @@ MOST_SHOWN = 8  # numbers in a message
 TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
 NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
 TIMES = (0x9003, 0x0132)
+NOISE_PROFILE = 0xC761
 SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL = 0x00FE, 0xC612, 0xC619, 0xC61A
 WHITE_LEVEL, KODAK_MATRIX = 0xC61D, 0x9218
 PHOTOMETRIC, FILTER_ARRAY = 0x0106, 32803  # the tag, and its value for a picture behind a filter array
@@ -38,7 +39,7 @@ CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
 # Tags that are read; a hostile file may hold 64 KiB behind each of the others.
 WANTED = frozenset(
     [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, *EXTENTS) for tag in tags]
-    + [SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, KODAK_MATRIX, PHOTOMETRIC]
+    + [NOISE_PROFILE, SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, KODAK_MATRIX, PHOTOMETRIC]
     + [FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT, *SUB_DIRECTORIES]
 )
 
@@ -61,6 +62,7 @@ def camera_tags(data: bytes) -> dict[str, Any]:
     if found["focal_length"] is not None:
         found["focal_length"] *= 1e-3
     found["timestamp"] = next((t for values in _values(directories, TIMES) if (t := _time(_text(values)))), None)
+    found["noise_profile"] = next((p for v in _values(directories, (NOISE_PROFILE,)) if (p := _noise_profile(v))), None)
     if data[6:14] == b"HEAPCCDR":
         found["make"], found["model"] = _ciff_names(data)
     if data[:4] in QUICKTAKE:
@@ -248,6 +250,13 @@ def _number(values: tuple[Any, ...]) -> float | None:
     if not values or isinstance(values[0], bytes):
         return None
     return float(values[0]) if 0 < values[0] < 1e9 else None
+
+
+def _noise_profile(values: tuple[Any, ...]) -> list[list[float]] | None:
+    """Return scale and offset of the noise's variance, a pair for all colours or for each, or None if they are none."""
+    if len(values) not in {2, 6, 8} or not all(isinstance(value, float) and 0 <= value < 1 for value in values):
+        return None
+    return [list(pair) for pair in zip(values[::2], values[1::2], strict=True)] if any(values) else None
 
 
 def _time(text: str | None) -> str | None:

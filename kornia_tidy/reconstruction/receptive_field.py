@@ -70,6 +70,12 @@ def receptive_field(head: nn.Module) -> int:
     return _found[head]
 
 
+def take_receptive_field(copied: nn.Module, head: nn.Module) -> None:
+    """Take the receptive field that was measured of a network, if it was, for that of its copy."""
+    if head in _found:
+        _found[copied] = _found[head]
+
+
 def maps_of(output: object) -> tuple[Tensor, ...]:
     """Return the maps of a network's output, which is one tensor or a tuple of tensors, as a tuple.
 

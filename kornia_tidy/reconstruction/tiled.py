@@ -12,7 +12,13 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.reconstruction.head_memory import head_bytes
-from kornia_tidy.reconstruction.receptive_field import input_channels, maps_of, receptive_field, total_stride
+from kornia_tidy.reconstruction.receptive_field import (
+    input_channels,
+    maps_of,
+    receptive_field,
+    take_receptive_field,
+    total_stride,
+)
 from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
 
@@ -85,6 +91,29 @@ def reconstruct_tiled(
     else:
         sides = grid.sides_within((tile, tile) if isinstance(tile, int) else tile)
     return _run(head, image, grid, sides, like, out, progress)
+
+
+def shared_copy(head: nn.Module) -> nn.Module:
+    """Return a copy of a network that shares its weights, for another picture at the same time.
+
+    The noise of a picture and its stray light are kept in the closed form of a network, so that two threads need two
+    copies. What was measured for tiles is not measured again.
+
+    Args:
+        head: the network.
+
+    Example:
+        >>> head = nn.Conv2d(3, 3, 1)
+        >>> copied = shared_copy(head)
+        >>> copied is head, copied.weight is head.weight
+        (False, True)
+    """
+    shared = {id(tensor): tensor for tensor in (*head.parameters(), *head.buffers())}
+    copied = copy.deepcopy(head, shared)
+    if head in _seamless:
+        _seamless.add(copied)
+        take_receptive_field(copied, head)
+    return copied
 
 
 def _run(

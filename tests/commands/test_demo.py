@@ -12,8 +12,14 @@ from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from tests.base import BaseTester
 
-NAMES = {"demo.png", "reconstruction.png", "scene.png", "depth.png", "coded_k1.png", "coded_k5.png"}
-NAMES |= {"coded_plain.png", "estimated_scene.png", "estimated_depth.png", "estimated_scene_alone.png"}
+NAMES = {"demo.png", "reconstruction.png", "scene.png", "depth.png", "joint_depth.png"}
+NAMES |= {f"{camera}_{step}.png" for camera in ("coded", "joint") for step in ("capture", "closed_form", "network")}
+NAMES |= {"flat_capture.png", "flat_closed_form.png"}
+
+
+@pytest.fixture(autouse=True)
+def small_pages(monkeypatch):
+    monkeypatch.setattr(demo, "DOTS_PER_INCH", 40)
 
 
 class TestDemo(BaseTester):
@@ -23,20 +29,29 @@ class TestDemo(BaseTester):
         for _ in range(2):
             assert main(["demo", "-o", str(folder), "--size", "80"]) == 0
             told = capsys.readouterr().out
-            assert all(str(folder / name) in told for name in NAMES)
-            assert {p.name for p in folder.iterdir()} == NAMES
+            written = {path.name for path in folder.iterdir()}
+            assert all(str(folder / name) in told for name in written)
+            assert written - {"flat_network.png"} == NAMES
             runs.append({name: read_image(folder / name) for name in NAMES})
-        assert runs[0]["demo.png"].shape == (3, 990, 1800)
-        assert runs[0]["coded_k5.png"].shape == (3, 80, 80)
+        assert runs[0]["demo.png"].shape == (3, 264, 480)
+        assert runs[0]["coded_capture.png"].shape == (3, 80, 80)
         assert all(torch.equal(runs[0][name], runs[1][name]) for name in NAMES)
 
-    def test_feature_tells_what_the_networks_gain(self, tmp_path, capsys):
+    def test_feature_tells_what_closed_forms_and_networks_gain_at_equal_light(self, tmp_path, capsys):
         assert main(["demo", "-o", str(tmp_path), "--size", "128"]) == 0
-        lines = [line for line in capsys.readouterr().out.splitlines() if " all in focus " in line]
-        assert [line[:9].strip() for line in lines] == ["plain", "K = 1", "K = 5", "K=5 EDoF"]
-        for line in lines:
-            capture, image = (float(value) for value in re.findall(r"([\d.]+) dB", line))
-            assert image > capture
+        told = {line[:9].strip(): line for line in capsys.readouterr().out.splitlines()}
+        numbers = {
+            name: [float(value) for value in re.findall(r"([\d.]+) dB", told[name])]
+            for name in ("coded", "flat", "joint")
+        }
+        for capture, *restored in numbers.values():
+            assert min(restored) > capture
+        gain = max(numbers["coded"][1:]) - max(numbers["flat"][1:])
+        assert float(re.search(r"([+-][\d.]+) dB", told["verdict"]).group(1)) == pytest.approx(gain, abs=0.15)
+        counts = re.findall(r"([\d,]+) electrons at f/([\d.]+)", told["light"])
+        (wide, fast), (narrow, slow) = [(float(n.replace(",", "")), float(f)) for n, f in counts]
+        assert wide / narrow == pytest.approx((slow / fast) ** 2, rel=0.06)  # of two digits each, 5 % at most
+        assert slow > fast
 
     def test_feature_a_scene_of_ones_own_is_stretched_over_the_range(self, tmp_path, capsys):
         write_image(tmp_path / "image.png", torch.rand(1, 64, 96))
@@ -44,7 +59,7 @@ class TestDemo(BaseTester):
         files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.pfm")]
         assert main(["demo", *files, "-o", str(tmp_path / "out")]) == 0
         assert "depth 0.2975 to inf m" in capsys.readouterr().out
-        assert read_image(tmp_path / "out" / "coded_k1.png").shape == (3, 64, 96)
+        assert read_image(tmp_path / "out" / "coded_capture.png").shape == (3, 64, 96)
         near = read_image(tmp_path / "out" / "depth.png")
         assert near.min() == 0
         assert near.max() == 1
@@ -62,6 +77,7 @@ class TestDemo(BaseTester):
         [
             (["--image", "a.png"], "--image and --depth belong together"),
             (["--size", "0"], "height must be a positive integer, got 0"),
+            (["--electrons", "-1"], "electrons must be positive and finite, got -1.0"),
         ],
     )
     def test_exception_is_one_sentence(self, arguments, sentence, tmp_path, monkeypatch, capsys):

@@ -27,9 +27,11 @@ from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
 from kornia_tidy.raw.dng_file import encode_dng
 from kornia_tidy.raw.simulation import simulate_raw
+from kornia_tidy.raw.tags import NOISE_PROFILE
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
+from tests.raw.dng import DOUBLE, dng
 
 FILES = 8  # in the batch that gets a signal
 ENDS = [".png", ".jpg", "_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png", ".json"]
@@ -232,12 +234,35 @@ class TestRawReconstruct(BaseTester):
             byte_order=None,
             linear=False,
             white_balance=None,
+            noise=None,
         )
-        light, _, _ = raw_reconstruct.read_light(str(tmp_path / "a.raw"), args)
+        light, _, _, _ = raw_reconstruct.read_light(str(tmp_path / "a.raw"), args)
         assert light.shape == (3, 64, 80)
         self.assert_close(light[:, 8:], torch.full((3, 56, 80), 0.25), atol=1e-3)
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
         assert reconstruct([str(tmp_path / "a.raw")], weights, tmp_path / "out", *options) == 0
+
+    def test_feature_the_noise_of_a_raw_file_is_told_to_its_network(self, tmp_path, capsys):
+        """By its noise profile, or as it is given; files of less noise get less of it taken away."""
+        system = checkpoint(tmp_path / "closed.safetensors", task="edof", closed_form=True)
+        counts = 64 + 400 * (np.indices((90, 110)).sum(0) // 24 % 2) + np.random.default_rng(0).normal(0, 20, (90, 110))
+        profiles = {"quiet": [1e-6, 1e-8], "loud": [1e-3, 1e-4]}
+        for name, values in profiles.items():
+            data = dng(counts.clip(0).round().astype(np.uint16), extra={NOISE_PROFILE: (DOUBLE, values)})
+            (tmp_path / f"{name}.dng").write_bytes(data)
+        files = [str(tmp_path / f"{name}.dng") for name in profiles]
+        assert reconstruct(files, system, tmp_path / "profile") == 0
+        quiet, loud = (read_image(tmp_path / "profile" / f"{name}.png") for name in profiles)
+        assert loud.diff().square().mean() < quiet.diff().square().mean()
+        told = json.loads((tmp_path / "profile" / "loud.json").read_text())["noise"]
+        assert told.startswith("read noise 0.0")
+        assert reconstruct(files, system, tmp_path / "given", "--noise", "0.03") == 0
+        given = [read_image(tmp_path / "given" / f"{name}.png") for name in profiles]
+        assert torch.equal(*given)
+        plain = checkpoint(tmp_path / "plain.safetensors", task="edof")
+        assert reconstruct(files, plain, tmp_path / "no", "--noise", "0.03") == 2
+        assert "--noise is for a network that takes it" in capsys.readouterr().err
+        assert reconstruct(files, system, tmp_path / "no", "--noise", "-1") == 2
 
     def test_feature_a_raw_file_keeps_camera_and_exposure(self, tmp_path):
         image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")

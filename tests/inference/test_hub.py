@@ -71,6 +71,14 @@ class TestSavePretrained(BaseTester):
         weights = load_file(tmp_path / "model.safetensors")
         assert {name.partition(".")[0] for name in weights} == {"optics", "head"}
 
+    def test_feature_half_precision_is_that_of_the_network_alone(self, system, tmp_path):
+        again = from_pretrained(save_pretrained(system, tmp_path, half=True))
+        stored = load_file(tmp_path / "model.safetensors")
+        assert {name.partition(".")[0] for name, value in stored.items() if value.dtype == torch.float16} == {"head"}
+        assert torch.equal(again.optics.masks.phase, system.optics.masks.phase)
+        for one, other in zip(system.head.parameters(), again.head.parameters(), strict=True):
+            assert torch.equal(one.half().float(), other)
+
     def test_feature_an_edited_card_is_kept_and_weights_are_replaced(self, system, tmp_path):
         (tmp_path / "README.md").write_text("mine")
         save_pretrained(system, tmp_path)

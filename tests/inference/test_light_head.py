@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import cv2
 import numpy as np
@@ -16,11 +17,13 @@ from kornia_tidy.inference.light_head import (
     UncertainReconstruction,
     reconstruct_light,
     reconstruct_opencv,
+    with_noise_of,
 )
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics, update_psfs
 from kornia_tidy.reconstruction import receptive_field
+from kornia_tidy.sensor.noise import SensorNoise
 from tests.base import BaseTester
 
 
@@ -128,6 +131,33 @@ class TestReconstructLight(BaseTester):
         self.assert_close(found.image, whole, atol=1e-5, rtol=0)
         dark = head(optics.encode(light[None, ..., :60]))[0]
         assert (dark - whole[..., :60])[..., :30].abs().max() > 0.01
+
+    def test_feature_pictures_at_the_same_time_have_copies_with_their_own_noise_and_stray_light(self, monkeypatch):
+        settings = SystemSettings(masks=1, window=9, stray_light="veil", head="tikhonov-bilateral")
+        optics, head = build_optics(settings), build_head(settings)
+        with torch.no_grad():
+            update_psfs(head, optics)
+        light_head = LightHead(TrainedSystem(optics, head, settings, 0))
+        ramp = torch.linspace(0, 1, 200)
+        light = torch.rand(2, 3, 30, 200, generator=torch.Generator().manual_seed(0))
+        pictures = light * torch.stack([ramp, 1 - ramp]).view(2, 1, 1, 200)
+
+        def images(heads, progress=None):
+            found = []
+            for own, picture in zip(heads, pictures, strict=True):
+                found.append(reconstruct_light(own, picture, memory_budget=2 << 20, progress=progress).image)
+            return found
+
+        alone = images([light_head, light_head])
+        measured = sys.modules["kornia_tidy.reconstruction.receptive_field"]
+        monkeypatch.setattr(measured, "_measure", lambda *_: pytest.fail("measured again"))
+        first, second, third = (with_noise_of(light_head, None) for _ in range(3))
+        between = images([first, second], lambda *_: images([third, third]))
+        assert all(torch.equal(one, expected) for one, expected in zip(between, alone, strict=True))
+        noisy = with_noise_of(light_head, SensorNoise(0.03))
+        assert not torch.equal(images([noisy, noisy])[1], alone[1])
+        assert torch.equal(images([light_head, light_head])[1], alone[1])
+        assert noisy.head.closed_form.kernels is light_head.head.closed_form.kernels
 
     def test_feature_a_distribution_of_depth_tells_its_uncertainty(self):
         """Half a range on each side of the focus: from the near end, 0.2975 m, to infinity."""

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, about_pretrained, load_pretrained, ship
 from kornia_tidy.inference.state_file import read_state, write_state
+from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.evaluation import evaluate, mean_row
 from tests.base import BaseTester
 
-MEGABYTES = 16  # that all of them may take
+MEGABYTES = 25  # that all of them may take
 
 
 class TestPretrained(BaseTester):
@@ -41,6 +45,15 @@ class TestPretrained(BaseTester):
         if "depth_rmse" in told:
             assert scores["depth_rmse"] < told["depth_rmse"] + 0.1
 
+    def test_feature_loading_does_not_import_the_compiler_of_torch(self):
+        """Its import takes longer than loading."""
+        code = (
+            "import sys; from kornia_tidy.inference.pretrained import load_pretrained; load_pretrained('edof-5'); "
+            "sys.exit('torch._dynamo' in sys.modules)"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
     def test_feature_all_are_small(self):
         assert sum(path.stat().st_size for path in FOLDER.iterdir() if path.is_file()) < MEGABYTES << 20
 
@@ -49,11 +62,22 @@ class TestPretrained(BaseTester):
         weights = dict(state["state_dict"])
         state["state_dict"] = {**weights, "head.extra": torch.ones(1000, 1000), "average.steps": torch.tensor(1)}
         write_state(tmp_path / "run.safetensors", {**state, "optimizer": {"lr": 1.0}})
-        ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors")
+        ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors", half=False)
         again = read_state(tmp_path / "small.safetensors")
         assert set(again) == {"settings", "global_step", "state_dict"}
         assert again["state_dict"].keys() == weights.keys()
         assert all(torch.equal(again["state_dict"][key], value) for key, value in weights.items())
+
+    def test_feature_networks_are_shipped_in_half_precision_and_loaded_in_single(self, tmp_path):
+        whole = load_trained(FOLDER / "edof-5.safetensors")
+        ship(FOLDER / "edof-5.safetensors", tmp_path / "half.safetensors")
+        weights = sum(weight.numel() for weight in whole.head.parameters())
+        others = sum(value.numel() for part in whole[:2] for value in part.state_dict().values()) - weights
+        assert (tmp_path / "half.safetensors").stat().st_size < 2 * weights + 4 * others + 2**16  # and a header
+        half = load_trained(tmp_path / "half.safetensors")
+        assert torch.equal(half.optics.masks.phase, whole.optics.masks.phase)
+        for one, other in zip(whole.head.parameters(), half.head.parameters(), strict=True):
+            assert torch.equal(one.half().float(), other)
 
     def test_exception_a_run_without_an_average(self, tmp_path):
         state = read_state(FOLDER / "edof-5.safetensors")

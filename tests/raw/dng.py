@@ -7,8 +7,8 @@ from fractions import Fraction
 
 import numpy as np
 
-BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
-LETTERS = {1: "B", 3: "H", 4: "I", 5: "I", 10: "i"}
+BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 10, 12
+LETTERS = {1: "B", 3: "H", 4: "I", 5: "I", 10: "i", 12: "d"}
 XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.inference.half_precision import halved
+from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
 
@@ -46,6 +48,18 @@ def load_pretrained(name: str) -> TrainedSystem:
     return load_trained(FOLDER / f"{name}.safetensors")
 
 
+def pretrained_settings(name: str) -> SystemSettings:
+    """Return the settings of camera and network of a shipped system, without building them.
+
+    Example:
+        >>> pretrained_settings("joint-1").masks
+        1
+    """
+    check_choice("name", name, PRETRAINED)
+    known, _ = SystemSettings.split(read_state(FOLDER / f"{name}.safetensors")["settings"])
+    return SystemSettings(**known)
+
+
 def about_pretrained() -> dict[str, Any]:
     """Return settings, steps, machine, date and scores of the shipped systems."""
     return json.loads((FOLDER / "heads.json").read_text())
@@ -63,19 +77,24 @@ def pretrained_record(name: str) -> dict[str, Any]:
     return {**about["systems"][name], **{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}}
 
 
-def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Write a checkpoint without the state of the run, in half the size, for shipping.
+def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, half: bool = True) -> None:
+    """Write a checkpoint for shipping: without the state of the run, the network's weights in half precision.
 
     Args:
         checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
         path: of the new file.
+        half: write the network's weights as float16, see :func:`~kornia_tidy.inference.half_precision.halved`. They
+            are loaded as float32. False: they stay as they are.
 
     Raises:
-        ValueError: if it is no checkpoint, or has no moving average.
+        ValueError: if it is no checkpoint, has no moving average, or a weight is beyond the range of float16.
     """
     state = read_state(checkpoint)
     wanted = ("optics.", "average.network.")
     weights = {name: value for name, value in state["state_dict"].items() if name.startswith(wanted)}
     if not any(name.startswith(wanted[1]) for name in weights):
         raise ValueError(f"{checkpoint} holds no moving average of its network: train it with ema above 0")
+    if half:
+        parameters = load_trained(checkpoint).head.named_parameters()
+        weights = halved(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
     write_state(path, {**{key: state[key] for key in ("settings", "global_step")}, "state_dict": weights})

@@ -4,7 +4,11 @@
   is kept in FOLDER/results.sqlite as soon as it is measured; the same command goes on where it was interrupted. Two of
   them may share the work, with different ``--systems``.
 - ``--quick`` takes two small scenes, two systems and one noise: seconds.
-- ``--checkpoint outputs/run/best.ckpt`` adds a trained system.
+- ``--checkpoint outputs/run/best.safetensors`` adds a trained system.
+- ``--physical`` takes shot and read noise at equal exposure time alone. A designed camera against the best lens without
+  masks, each with its own network, where DESIGNS are folders of ``kornia-tidy design`` for the four amounts of light:
+  ``--physical --checkpoint outputs/designed/best.safetensors outputs/flat/best.safetensors --restorations network
+  --designs DESIGNS``
 - ``--report`` measures nothing and writes results.md, results.csv and results.png of what is there. ``--page
   docs/results.md`` writes the page and its picture there, too.
 """
@@ -33,7 +37,7 @@ from tests.benchmarks.results.scenes import SceneSet, dead_leaves, real_scenes
 from tests.benchmarks.results.store import Provenance, Store
 from tests.benchmarks.results.systems import System, available, from_checkpoint
 from tests.benchmarks.results.table import Results
-from tests.benchmarks.results.verdicts import REAL, in_words, verdicts
+from tests.benchmarks.results.verdicts import REAL, in_words, recommendations, verdicts
 
 SETS = {REAL: real_scenes, "leaves": dead_leaves}
 QUICK_SYSTEMS, QUICK_SCENES, QUICK_SIZE = ("edof-5", "flat f/50"), 2, 96
@@ -48,6 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
     systems = _systems(args)
     for noise in args.noises:
         sensor_of(noise, 17.6)  # raises for an unknown noise, before any work
+    recommended = recommendations(args.designs)
     sets = _sets(args)
     with Store(folder / "results.sqlite", _provenance()) as store:
         if not args.report:
@@ -60,10 +65,10 @@ def main(arguments: list[str] | None = None) -> None:
     draw_results(results, sets[0].name).savefig(picture, dpi=DOTS_PER_INCH)
     for path in pages:
         (path.parent / PICTURE).parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, page(results, cells).encode())
+        write_bytes(path, page(results, cells, recommended).encode())
         write_bytes(path.parent / PICTURE, picture.getvalue())
     write_bytes(folder / "results.csv", scores_csv(results).encode())
-    print("\n".join(in_words(verdicts(results))))
+    print("\n".join(in_words(verdicts(results, recommended))))
     print(f"wrote {', '.join(map(str, pages))} and {folder / 'results.csv'}")
 
 
@@ -84,6 +89,21 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NOISE",
         default=[*FIXED, *PHYSICAL],
         help="standard deviations, 0.002, or electrons of white at f/17.6, 57000e (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--physical",
+        dest="noises",
+        action="store_const",
+        const=[*PHYSICAL],
+        help=f"the same as --noises {' '.join(PHYSICAL)}",
+    )
+    parser.add_argument(
+        "--designs",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FOLDER",
+        help="of kornia-tidy design: does what they recommend lose anywhere by more than two standard errors?",
     )
     parser.add_argument("--restorations", nargs="+", metavar="NAME", help="default: all that a system has")
     parser.add_argument("--report", action="store_true", help="measure nothing")

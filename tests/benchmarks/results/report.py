@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from tests.benchmarks.results.captures import FIXED, PHYSICAL
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
@@ -53,12 +53,12 @@ this page, and goes on where it was interrupted.
 """
 
 
-def page(results: Results, cells: Sequence[Measured]) -> str:
+def page(results: Results, cells: Sequence[Measured], recommended: Mapping[str, str] | None = None) -> str:
     """Return the whole page."""
     lines = [INTRODUCTION, _measured_where(cells), "", *_missing(results, cells), ""]
     lines += [f"![PSNR over noise and over f-number]({PICTURE})", "", "## Targets", ""]
     lines += ["On half B of the real scenes; what they ask for is in dB unless it says otherwise.", ""]
-    lines += [*in_words(verdicts(results)), ""]
+    lines += [*in_words(verdicts(results, recommended)), ""]
     for scenes in results.sets:
         title = SET_NAMES.get(scenes, scenes)
         for noise in (*FIXED, *PHYSICAL):
@@ -86,9 +86,12 @@ def scores_csv(results: Results) -> str:
 
 
 def reference_row(results: Results, scenes: str, noise: str) -> Key | None:
-    """Return the reference of the differences: the best closed form of five masks, or of all systems without them."""
+    """Return the reference of the differences.
+
+    It is the best closed form of five masks, or of all systems without them, or the best network without closed forms.
+    """
     own = results.keys(scenes, noise, system=FIVE, network=False)
-    return results.best(own or results.keys(scenes, noise, network=False))
+    return results.best(own or results.keys(scenes, noise, network=False) or results.keys(scenes, noise))
 
 
 def _image_table(results: Results, rows: Sequence[Key]) -> Iterator[str]:

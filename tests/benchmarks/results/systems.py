@@ -12,6 +12,7 @@ from torch import nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.inference.hub import from_pretrained
 from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
 from kornia_tidy.masks.fresnel import FresnelLens
@@ -68,8 +69,13 @@ def available() -> dict[str, Callable[[], System]]:
 
 
 def from_checkpoint(path: Path) -> System:
-    """Return the system in a checkpoint of ``kornia-tidy train``, named as its file, or its folder for best.ckpt."""
-    name = path.stem if path.stem not in ("best", "last") else path.parent.name
+    """Return the system in a checkpoint of ``kornia-tidy train`` or in a folder of ``save_pretrained``.
+
+    It is named as its file, or as the folder of ``best.safetensors``.
+    """
+    if path.is_dir():
+        return of_trained(path.name, from_pretrained(path))
+    name = path.stem if path.stem not in ("best", "last") else path.absolute().parent.name
     return of_trained(name, load_trained(path))
 
 

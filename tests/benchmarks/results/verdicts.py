@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-from tests.benchmarks.results.captures import FIXED, PHYSICAL
+from kornia_tidy.files import read_json
+from kornia_tidy.mask_design.candidates import FLAT
+from kornia_tidy.mask_design.design_report import DATA
+from kornia_tidy.sensor.exposure import electrons_at
+from tests.benchmarks.results.captures import FIXED, PHYSICAL, REFERENCE_F_NUMBER
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
 from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK
 from tests.benchmarks.results.table import Difference, Key, Results
@@ -32,13 +37,38 @@ class Verdict(NamedTuple):
     """None where it was not measured, or there is no target."""
 
 
-def verdicts(results: Results) -> list[Verdict]:
-    """Return the targets in their order."""
+def recommendations(folders: Sequence[Path]) -> dict[str, str]:
+    """Return by noise whether the designs in folders of ``kornia-tidy design`` recommend ``"coded"`` or ``"flat"``.
+
+    Raises:
+        ValueError: if a design is for another amount of light than the benchmark's.
+    """
+    found = {}
+    for folder in folders:
+        report = read_json(folder / DATA)
+        task = report["task"]
+        noise = f"{electrons_at(REFERENCE_F_NUMBER, task['electrons'], task['reference_f_number']):.0f}e"
+        if noise not in PHYSICAL:
+            raise ValueError(
+                f"{folder} is a design for {noise[:-1]} electrons at f/{REFERENCE_F_NUMBER:g}, not measured"
+            )
+        found[noise] = "flat" if report["recommended"]["start"] == FLAT else "coded"
+    return found
+
+
+def verdicts(results: Results, recommended: Mapping[str, str] | None = None) -> list[Verdict]:
+    """Return the targets in their order.
+
+    Args:
+        results: the measured scores.
+        recommended: see :func:`recommendations`.
+    """
     return [
         *_networks(results),
         *_stray_light(results),
         *_wrong_noise(results),
         *_coded_against_flat(results),
+        *_recommended(results, recommended or {}),
         *_joint(results),
     ]
 
@@ -106,16 +136,31 @@ def _coded_against_flat(results: Results) -> Iterator[Verdict]:
     """Coded against flat at equal exposure time: of each kind the best on half A, networks and closed forms apart."""
     for noise in PHYSICAL:
         for network, kind in ((True, "networks"), (False, "closed forms")):
-            keys = results.keys(REAL, noise, network=network)
-            coded, flat = (
-                results.best([key for key in keys if results.systems[key.system].kind == wanted])
-                for wanted in ("coded", "flat")
-            )
-            both = (coded, flat) if coded is not None and flat is not None else None
+            both = _best_of_kinds(results, noise, network=network)
             names = "coded over flat" if both is None else f"{both[0].system} over {both[1].system}"
             gain = None if both is None else results.difference(*both)
             target = CODED_GAINS.get(noise) if network else None
             yield _at_least(f"{int(noise[:-1]):,} electrons, {kind}: {names}", gain, target)
+
+
+def _recommended(results: Results, recommended: Mapping[str, str]) -> Iterator[Verdict]:
+    """What `kornia-tidy design` recommends for each amount of light, against the other kind, both with networks."""
+    for noise, kind in recommended.items():
+        pair = _best_of_kinds(results, noise, network=True)
+        gain = None if pair is None else results.difference(*(pair if kind == "coded" else pair[::-1]))
+        claim = f"{int(noise[:-1]):,} electrons, networks: what design recommends ({kind}) over the other"
+        measured = "not measured" if gain is None else f"{gain} ({gain.ahead} of {gain.pairs} scenes)"
+        met = None if gain is None else gain.mean >= -2 * gain.error
+        yield Verdict(claim, measured, "a loss of at most two standard errors", met)
+
+
+def _best_of_kinds(results: Results, noise: str, *, network: bool) -> tuple[Key, Key] | None:
+    """Return the rows of coded and flat that are best on half A; None unless there are both."""
+    keys = results.keys(REAL, noise, network=network)
+    coded, flat = (
+        results.best([key for key in keys if results.systems[key.system].kind == kind]) for kind in ("coded", "flat")
+    )
+    return (coded, flat) if coded is not None and flat is not None else None
 
 
 def _joint(results: Results) -> Iterator[Verdict]:
