@@ -1,4 +1,4 @@
-"""The API reference: one page for each package, made of its exported names and of the modules that pages import from."""
+"""The API reference: one page for each package, made of its exported names and of what pages import by module."""
 
 from __future__ import annotations
 

@@ -23,15 +23,8 @@ from api_pages import write_api_pages  # noqa: E402
 from gallery import write_gallery  # noqa: E402
 from sphinx.cmd.build import main as sphinx  # noqa: E402
 
-FILES = (
-    "README.md",
-    "CONTRIBUTING.md",
-    "CHANGELOG.md",
-    "CITATION.cff",
-    "LICENSE",
-    "constraints.txt",
-    "kornia_tidy/fidelity.py",
-)
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+LINKED = ("CITATION.cff", "LICENSE", "constraints.txt", "kornia_tidy/fidelity.py")  # files that pages link to
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def copy_pages(source: Path) -> list[Path]:
     """Copy the pages and pictures of the repository, so that their links hold, and drop what is gone from it."""
-    listed = [ROOT / name for name in FILES] + [
+    listed = [ROOT / name for name in PAGES + LINKED] + [
         path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".jpg", ".svg"}
     ]
     copied = {source / path.relative_to(ROOT): path for path in listed}

@@ -1,7 +1,8 @@
 """References of docstrings to Python objects: public ones become links, others plain text if they exist.
 
 Docstrings name objects as their own module sees them, such as ``thin_lens_defocus`` or
-``kornia_tidy.optics.thin_lens.thin_lens_defocus``. The site describes an object once, under the package that exports it.
+``kornia_tidy.optics.thin_lens.thin_lens_defocus``. The site describes an object once, under the package
+that exports it.
 """
 
 from __future__ import annotations

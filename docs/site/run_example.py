@@ -9,7 +9,7 @@ from typing import Any
 
 
 def main(script: str, arguments: list[str]) -> None:
-    """Run main() of a script in the current folder."""
+    """Run a script in the current folder, and draw what it returns if it draws nothing."""
     sys.path.insert(0, str(Path(script).parent))
     returned = importlib.import_module(Path(script).stem).main(arguments)
     if not any(Path().rglob("*.png")):
