@@ -49,7 +49,7 @@ def defined() -> tuple[dict[str, ModuleType], dict[str, list[str]]]:
         if info.name in sys.modules or not info.name.endswith("__main__"):
             try:
                 modules[info.name] = importlib.import_module(info.name)
-            except ImportError:  # an adapter of a package that is not installed
+            except (ImportError, RuntimeError):  # an adapter of a package that is missing, or does not fit torch
                 continue
     for module_name, module in modules.items():
         for name, value in list(vars(module).items()):
