@@ -4,9 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs-ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint bench targets clean
+.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint docs bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -20,6 +21,8 @@ help:
 	@echo "make extremes   how exact captures are at the extremes, as docs/extremes.md: minutes; ARGS=--quick a part of it"
 	@echo "make fuzz     damaged files through every reading function: 2000, or ARGS='--count 100000 --seed 1 --guided'"
 	@echo "make lint     style, spelling and types"
+	@echo "make docs     the site of the documentation, in outputs/site: minutes at first, for the examples of its gallery;"
+	@echo "              ARGS=--no-gallery runs none of them, ARGS=--linkcheck also asks the addresses of external links"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
 	@echo "make targets  the figures that rendering is judged by, on a real scene: minutes, on an idle machine"
@@ -56,6 +59,9 @@ lint: $(READY)
 	@$(BIN)/lint-imports --no-cache
 	@$(BIN)/python docs/make_architecture.py --check
 
+docs: $(DOCS_READY)
+	@$(BIN)/python docs/site/make_site.py $(ARGS)
+
 # The usual options of pytest leave the benchmarks out.
 bench: $(READY)
 	@mkdir -p outputs
@@ -71,6 +77,10 @@ targets: $(READY)
 clean:
 	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
 	find kornia_tidy tests -name __pycache__ -prune -exec rm -rf {} +
+
+$(DOCS_READY): $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@touch $@
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

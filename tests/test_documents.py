@@ -31,10 +31,15 @@ from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "ecosystems").glob("*.md")),
+]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
-MOST_NOT_RUN = 11  # in all pages: a block that is not run can be wrong
+MOST_NOT_RUN = 12  # in all pages: a block that is not run can be wrong
 SLOW: set[str] = set()  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
