@@ -32,7 +32,7 @@ from kornia_tidy.commands.demo import stretched
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, ship
+from kornia_tidy.inference.pretrained import FOLDER, ship
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -166,11 +166,10 @@ def table(root: Path) -> str:
 def ship_all(root: Path) -> None:
     """Put the best systems into the library, and beside them how they came about."""
     systems, settings = {}, {}
-    for name in PRETRAINED:
-        task, masks = name.split("-")
-        runs = {}
+    for task, masks in ((task, masks) for task in TASKS for masks in MASKS):
+        name, runs = f"{task}-{masks}", {}
         for seed in SEEDS:
-            folder = folder_of(root, task, int(masks), seed)
+            folder = folder_of(root, task, masks, seed)
             if is_trained(folder):
                 runs[folder] = min(float(row["val_loss"]) for row in _rows(folder / "validation.csv"))
         best = min(runs, key=lambda folder: runs[folder])

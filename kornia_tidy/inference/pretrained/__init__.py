@@ -17,8 +17,10 @@ from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
-PRETRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0")
-"""Names: task and number of masks; 0 masks are a plain lens, for comparison."""
+PRETRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat")
+"""Names: task and number of masks; 0 masks are a Fresnel element, as in the paper. All have the paper's lens of f/17.6
+but two, which are for light of 500 to 57,000 electrons of white at f/17.6 in the same exposure time: ``"edof-designed"``
+has five masks at f/24, as ``kornia-tidy design`` recommends, and ``"edof-flat"`` no mask, at f/48."""
 
 
 def load_pretrained(name: str) -> TrainedSystem:
@@ -74,7 +76,7 @@ def pretrained_record(name: str) -> dict[str, Any]:
     """
     check_choice("name", name, PRETRAINED)
     about = about_pretrained()
-    return {**about["systems"][name], **{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}}
+    return {**{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}, **about["systems"][name]}
 
 
 def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, half: bool = True) -> None:
