@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Path]:
         both = np.hstack([before, np.full((len(before), GAP, 3), 255, np.uint8), after])
         path = options.output.resolve() / f"{page}.jpg"
         cv2.imwrite(str(path), both[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-        print(path)
+        print(path)  # noqa: T201
         written.append(path)
     return written
 

@@ -33,6 +33,7 @@ nitpicky = True
 default_role = "literal"  # docstrings write commands as Markdown does
 exclude_patterns = ["examples/*.md"]
 
+myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4  # links to headings as GitHub makes them
 myst_fence_as_directive = ["mermaid"]
 
