@@ -253,9 +253,13 @@ class RandomDepthBlur(DepthAugmentation):
     ) -> None:
         super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim)
         nearest, farthest = checked_range("focus_distance", focus_distance, "metres")
+        check_positive("focal_length", focal_length)
         if nearest <= focal_length:
             raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {nearest}")
         check_choice("color_space", color_space, COLOR_SPACES)
+        check_choice("compositing", compositing, ("gather", "scatter", "occlusion"))
+        check_positive("max_radius", max_radius, "pixels")
+        check_positive("pixel_pitch", pixel_pitch)
         ends = torch.tensor(checked_range("f_number", f_number))
         focus = torch.tensor([nearest, farthest])
         self._param_generator = PlainUniformGenerator(

@@ -30,7 +30,7 @@ class LinearCamera(nn.Module):
     Raises:
         TypeError: if ``optics`` is no camera, or the depth is not a floating-point tensor.
         ValueError: if compositing is occlusion, which is not linear, the spectrum has a basis, or a depth is not
-            positive.
+            positive; on use, if an image has another size or batch than the depth.
 
     Convention:
         - Gradients reach x, y and, through ``camera(x)``, the masks.
@@ -61,15 +61,29 @@ class LinearCamera(nn.Module):
 
     def forward(self, light: Tensor) -> Tensor:
         """Return the irradiance A x of linear light x."""
+        check_float_tensor("light", light, 4, "(B, C, H, W)")
+        self._check("light", light, (self.depth.shape[-2], self.depth.shape[-1]))
         scene, options = self._scene(light.shape[1], light.dtype)
         image = light.to(scene[0].dtype)
         return torch.ops.kornia_tidy.render_layers(image, *scene, *options).to(light.dtype)
 
     def adjoint(self, irradiance: Tensor) -> Tensor:
         """Return the transpose of the camera applied to an irradiance y: light of the scene's size."""
+        check_float_tensor("irradiance", irradiance, 4, "(B, C, H, W)")
         scene, options = self._scene(irradiance.shape[1], irradiance.dtype)
+        cut = scene[2].shape[-1] - 1 if self.optics.border == "valid" else 0
+        rows, columns = self.depth.shape[-2:]
+        self._check("irradiance", irradiance, (rows - cut, columns - cut))
         plain = [part if part is None else part.detach() for part in scene]
         return _Adjoint.apply(irradiance.to(plain[0].dtype), *plain, *options).to(irradiance.dtype)
+
+    def _check(self, name: str, image: Tensor, size: tuple[int, int]) -> None:
+        """Raise unless an image has the size and the batch that the depth map is for."""
+        if tuple(image.shape[-2:]) != size or self.depth.shape[0] not in (1, image.shape[0]):
+            raise ValueError(
+                f"{name} must have {size[0]} x {size[1]} pixels and the batch of the depth {tuple(self.depth.shape)}, "
+                f"got {tuple(image.shape)}"
+            )
 
     def _scene(self, channels: int, dtype: torch.dtype) -> tuple[list[Any], list[Any]]:
         """Return defocus, nodes, PSFs and stray light, and the options of the renderer."""

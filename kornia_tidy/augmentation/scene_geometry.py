@@ -113,6 +113,13 @@ class SceneGeometry(nn.Module):
         """
         check_float_tensor("image", image, 3 if image.ndim == 3 else 4, "(B, C, H, W) or (C, H, W)")
         check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
+        size = (1, *image.shape[-2:])
+        if tuple(depth.shape[-3:]) != size or (image.ndim == 4 and len(depth) not in (1, len(image))):
+            raise ValueError(
+                f"depth must be one map {size} for each image {tuple(image.shape)}, got {tuple(depth.shape)}"
+            )
+        if valid is not None and valid.numel() != depth.numel():
+            raise ValueError(f"valid must have the depth's shape {tuple(depth.shape)}, got {tuple(valid.shape)}")
         wide = torch.promote_types(torch.promote_types(image.dtype, depth.dtype), torch.float32)
         known = (depth > 0) if valid is None else (valid.reshape(depth.shape) > 0) & (depth > 0)
         batched = image.ndim == 4

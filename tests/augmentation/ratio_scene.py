@@ -19,10 +19,15 @@ STEP = 1.5 * GRADIENT  # depth between pixels that touch at a corner
 
 
 class RatioMark(DepthAugmentation):
-    """Writes the depth that it is given, times the blue channel, into the red channel."""
+    """Writes the depth that it is given, times the blue channel, into the red channel.
+
+    Holes, which a rotation leaves 0, have no depth to write: there red is green, so that a later interpolation does not
+    mix a mark of 0 into the pixels around. A camera refuses a depth of 0.
+    """
 
     def change(self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor]) -> Tensor:
-        return torch.cat([depth.to(image) * image[:, 2:], image[:, 1:]], 1)
+        mark = torch.where(depth > 0, depth.to(image) * image[:, 2:], image[:, 1:2])
+        return torch.cat([mark, image[:, 1:]], 1)
 
 
 def ratio_scene() -> tuple[Tensor, Tensor]:

@@ -151,6 +151,11 @@ class TestRandomDepthBlur(BaseTester):
             RandomDepthBlur(focus_distance=(0.01, 1.0))
         with pytest.raises(ValueError, match=r"f_number must be a range \(low, high\)"):
             RandomDepthBlur(f_number=(4.0, 2.0))
+        with pytest.raises(ValueError, match="compositing must be one of 'gather', 'scatter', 'occlusion', got 'x'"):
+            RandomDepthBlur(compositing="x")
+        for name in ("max_radius", "focal_length", "pixel_pitch"):
+            with pytest.raises(ValueError, match=f"{name} must be positive"):
+                RandomDepthBlur(**{name: -1.0})
 
     @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
     def test_dynamo(self):

@@ -75,6 +75,18 @@ class TestLinearCamera(BaseTester):
         with pytest.raises(ValueError, match="depth must be positive metres"):
             LinearCamera(linear(), depth * 0)
 
+    @pytest.mark.parametrize("border", ["reflect", "valid"])
+    def test_exception_images_that_do_not_fit_the_depth(self, border):
+        image, depth = scene(2)
+        operator = LinearCamera(linear(border=border), depth)
+        for use, name in ((operator, "light"), (operator.adjoint, "irradiance")):
+            with pytest.raises(TypeError, match=f"{name} must be floating point"):
+                use((image * 255).byte())
+            with pytest.raises(ValueError, match=rf"{name} must have \d+ x \d+ pixels and the batch of the depth"):
+                use(image[..., :-1])
+            with pytest.raises(ValueError, match="and the batch of the depth"):
+                use(operator(image)[:1].expand(3, -1, -1, -1) if name == "irradiance" else image[[0, 1, 0]])
+
     def test_gradcheck(self):
         """Of the transpose, whose gradient is the camera."""
         depth = torch.rand(1, 1, 10, 11, dtype=torch.float64)

@@ -89,3 +89,12 @@ class TestSceneGeometry(BaseTester):
         image, depth = scene(1)
         with pytest.raises(ValueError, match="call it 'mask_normals'"):
             warped_entries({"image": image, "depth": depth, "normals": image}, ("image", "depth"))
+
+    def test_exception_depth_and_mask_that_do_not_fit(self):
+        image, depth = scene(2)
+        geometry = SceneGeometry(K.RandomHorizontalFlip(p=1.0))
+        for other in (depth.expand(-1, 3, -1, -1), depth[..., :9], depth[[0, 1, 0]]):
+            with pytest.raises(ValueError, match=r"depth must be one map \(1, 40, 48\) for each image"):
+                geometry(image, other)
+        with pytest.raises(ValueError, match=r"valid must have the depth's shape \(2, 1, 40, 48\), got \(3,\)"):
+            geometry(image, depth, valid=torch.ones(3))
