@@ -1,5 +1,6 @@
-"""Ships networks of ``kornia-tidy train --learn network``: ``python -m tests.benchmarks.ship_networks NAME=FOLDER ...``.
+"""Ships networks of ``kornia-tidy train --learn network``.
 
+``python -m tests.benchmarks.ship_networks NAME=FOLDER ...``
 Each is scored on new dead leaves and on the real scenes, where these are on the machine, and put into the library with
 the commands that made it, which FOLDER/commands.txt holds.
 """
