@@ -20,7 +20,7 @@ FOLDER = Path(__file__).parent
 PRETRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat")
 """Names: task and number of masks; 0 masks are a Fresnel element, as in the paper. All have the paper's lens of f/17.6
 but two, whose networks know light of 500 to 57,000 electrons of white at f/17.6 in the same exposure time:
-``"edof-designed"`` has five masks at f/24, as ``kornia-tidy design`` recommends, and ``"edof-flat"`` no mask, at f/48."""
+``"edof-designed"`` has five masks at f/24, as ``kornia-tidy design`` recommends; ``"edof-flat"`` has none, at f/48."""
 
 
 def load_pretrained(name: str) -> TrainedSystem:
