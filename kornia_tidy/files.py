@@ -5,6 +5,7 @@ No package is used for atomic writes: atomicwrites is no longer maintained, and 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -156,6 +157,7 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
     if path.exists() and not (replace and path.is_dir()):
         raise FileExistsError(f"cannot write {path}: it exists")
     new, old = (path.with_name(f".{uuid4().hex}.tmp") for _ in range(2))
+    needed = True  # the old folder, until another one stands in its place
     try:
         with _named(path):
             new.mkdir()
@@ -165,13 +167,15 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
                 path.rename(old)
             try:
                 new.rename(path)
-            except OSError:
-                if old.exists():
+                needed = False
+            except OSError as error:
+                needed = error.errno not in {errno.ENOTEMPTY, errno.EEXIST}  # else another writer was faster
+                if needed and old.exists():
                     old.rename(path)
                 raise
     finally:
         shutil.rmtree(new, ignore_errors=True)
-        if path.exists():
+        if not needed:
             shutil.rmtree(old, ignore_errors=True)
 
 

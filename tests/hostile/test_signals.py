@@ -110,8 +110,12 @@ class TestSignals(BaseTester):
                 os.kill(os.getpid(), number)
                 time.sleep(60)
 
+        def command():
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
+            os._exit(cli.main([]))
+
         run_instead(monkeypatch, write)
-        assert wait(fork(lambda: os._exit(cli.main([])))) == STATUS[number]
+        assert wait(fork(command)) == STATUS[number]
         assert os.listdir(tmp_path) == []
 
     def test_convention_a_handler_of_the_caller_stays(self, monkeypatch):
