@@ -46,7 +46,7 @@ def main() -> None:
     growth.draw(curves, DOCS / "images" / "extremes_growth.png")
     made = (
         f"Measured on {dt.datetime.now(tz=dt.UTC):%d %B %Y}, {platform.machine()}, "
-        f"{torch.backends.cpu.get_cpu_capability()}, one thread, torch {torch.__version__.split('+')[0]}. "
+        f"{torch.backends.cpu.get_cpu_capability()}, one thread, torch {torch.__version__.split('+')[0]}.\n"
         f"Errors differ in their digits between machines; the bounds hold on all."
     )
     (DOCS / "extremes.md").write_text(page(results, curves, made), encoding="utf-8")

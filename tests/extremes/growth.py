@@ -73,10 +73,11 @@ def draw(curves: dict[str, list[tuple[float, float]]], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, len(curves), figsize=(13, 2.8), sharey=True, layout="constrained")
+    highest = max(error for pairs in curves.values() for _, error in pairs)
     for plot, (quantity, pairs) in zip(axes, curves.items(), strict=True):
         plot.semilogx(*zip(*pairs, strict=True), "o-", color="#3465a4")
         plot.set_xlabel(quantity)
-        plot.set_ylim(0)
+        plot.set_ylim(0, 1.1 * highest)
         plot.grid(visible=True, alpha=0.3)
     axes[0].set_ylabel("largest error, units of $2^{-24}$")
     path.parent.mkdir(parents=True, exist_ok=True)

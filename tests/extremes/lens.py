@@ -106,10 +106,10 @@ def rows() -> list[Row]:
             lambda: _lens(focus_distance=0.0501, depth_range=(0.05005, 0.05015)), BOUND, CAPTURE),
         Row("Depth and lens", "focus, m", "infinity, depths from 10 m",
             lambda: _lens(focus_distance=INF, depth_range=(10.0, INF)), BOUND, CAPTURE),
-        Row("Depth and lens", "focus, m", "learnable, at infinity, no depth range",
+        Row("Depth and lens", "focus, m", "infinity without a depth range; 0.05 m, the focal length",
             refusals(lambda: ThinLensCamera(focus_distance=INF), lambda: ThinLensCamera(focus_distance=infinity),
                      lambda: ThinLensCamera(focus_distance=0.05)), None),
-        Row("Depth and lens", "f-number", "f/0.5 (focused at 1 m, 0.995 to 1.005 m)",
+        Row("Depth and lens", "f-number", "f/0.5 (focused at 1 m, depths 0.999 to 1.001 m)",
             lambda: _lens(aperture_diameter=0.1, focus_distance=1.0, depth_range=(0.999, 1.001)), BOUND, CAPTURE),
         Row("Depth and lens", "f-number", "f/2.8, f/500", lambda: worst([
             _lens(aperture_diameter=0.05 / 2.8, focus_distance=2.0, depth_range=(1.9, 2.1)),
