@@ -101,7 +101,7 @@ class TestSystems(BaseTester):
     def test_feature_kinds_are_told_from_the_masks(self):
         makers = available()
         kinds = {
-            name: makers[name]().kind for name in ("edof-5", "edof-0", FLAT, "preset chang2019", "edof-1 as trained")
+            name: makers[name]().kind for name in ("edof-5", "edof-0", FLAT, "preset chang2019", "joint-1 as trained")
         }
         assert list(kinds.values()) == ["coded", "Fresnel", "flat", "published", "as trained"]
 
@@ -111,8 +111,8 @@ class TestSystems(BaseTester):
         self.assert_close(bank.psfs.sum((-2, -1)) + bank.veil, torch.ones(2, 3))
 
     def test_feature_a_system_as_trained_has_its_window_and_no_stray_light(self):
-        system = available()["edof-1 as trained"]()
-        assert system.optics.window == load_pretrained("edof-1").optics.window < WINDOW
+        system = available()["joint-1 as trained"]()
+        assert system.optics.window == load_pretrained("joint-1").optics.window < WINDOW
         assert f"PSFs of {system.optics.window} px" in system.title
         assert system.optics.psf_bank(defocus=[0.0]).veil is None
 
@@ -185,7 +185,7 @@ class TestRestorations(BaseTester):
         self.assert_close(told[4], told[3] / 2)
 
     def test_feature_networks_without_noise_have_no_wrong_levels(self):
-        assert [name for name in restorations_for(available()["edof-1"]()) if NETWORK in name] == [NETWORK]
+        assert [name for name in restorations_for(available()["joint-1"]()) if NETWORK in name] == [NETWORK]
         assert not any(NETWORK in name for name in restorations_for(available()[FLAT]()))
 
     def test_feature_tikhonov_undoes_a_flat_lens(self):

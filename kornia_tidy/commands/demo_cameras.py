@@ -59,8 +59,8 @@ class Result(NamedTuple):
 def shipped_cameras(electrons: float) -> dict[str, Camera]:
     """Return the shipped systems that are shown, for the light of a white pixel at the reference f-number.
 
-    ``"coded"`` has the most masks of those for an image in focus everywhere, ``"joint"`` of those for depth too, and
-    ``"flat"`` has none; each as far as one is shipped.
+    ``"coded"`` has the most masks of those for an image in focus everywhere, ``"joint"`` of those for depth too; of
+    several with as many masks the one with the largest f-number. ``"flat"`` has none. Each as far as one is shipped.
 
     Example:
         >>> round(shipped_cameras(57_000)["coded"].optics.sensor.full_well) > 10_000
@@ -72,13 +72,17 @@ def shipped_cameras(electrons: float) -> dict[str, Camera]:
         kind = {"edof": "coded", "joint": "joint"}.get(settings.task)
         if settings.start == "flat":
             kind = "flat" if settings.task == "edof" else None
-        if kind is not None and settings.masks > (chosen[kind][1].masks if kind in chosen else 0):
+        if kind is not None and settings.masks and (kind not in chosen or _rank(settings) > _rank(chosen[kind][1])):
             chosen[kind] = name, settings
     found = {}
     for kind, (name, settings) in chosen.items():
         system = load_pretrained(name)
         found[kind] = Camera(_exposed(system.optics, electrons), system.head, settings)
     return found
+
+
+def _rank(settings: SystemSettings) -> tuple[int, float]:
+    return settings.masks, settings.camera().f_number
 
 
 def stopped_down(lens: ThinLensCamera, electrons: float) -> Camera:

@@ -126,7 +126,10 @@ class TestOpenReal(BaseTester):
             aperture=5.6,
             focal_length=0.065,
             timestamp=datetime(2019, 6, 6, 7, 29, 51),
+            noise_profile=raw.info.noise_profile,
         )
+        assert raw.info.noise_profile is not None
+        assert raw.info.noise_profile[0] == pytest.approx((3.314066762e-05, 9.213006845e-08))
         for name, make, model in (
             ("raw/thorsted+digicam_corpus/G2_CRW_0305.CRW", "Canon", "Canon PowerShot G2"),
             ("raw/colinleroy+a2tools/QKTK_IMAGE01.QTK", "Apple", "QuickTake 100"),

@@ -40,11 +40,11 @@ def load_pretrained(name: str) -> TrainedSystem:
     Example:
         >>> import torch
         >>> system = load_pretrained("edof-5")
-        >>> image, depth = torch.rand(1, 3, 64, 64), torch.full((1, 1, 64, 64), 1.0)
+        >>> image, depth = torch.rand(1, 3, 72, 72), torch.full((1, 1, 72, 72), 1.0)
         >>> with torch.no_grad():
         ...     estimate = system.head(system.optics(image, depth))
         >>> estimate.shape
-        torch.Size([1, 3, 64, 64])
+        torch.Size([1, 3, 72, 72])
     """
     check_choice("name", name, PRETRAINED)
     return load_trained(FOLDER / f"{name}.safetensors")

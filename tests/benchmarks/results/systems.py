@@ -13,7 +13,7 @@ from torch import nn
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.hub import from_pretrained
-from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained, pretrained_settings
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
 from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.pixelwise import PixelwiseMask
@@ -63,7 +63,8 @@ class System:
 def available() -> dict[str, Callable[[], System]]:
     """Return a function for each system that the benchmark knows by name."""
     known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in PRETRAINED}
-    known |= {f"{name} as trained": _as_trained(name) for name in PRETRAINED if not name.endswith("-0")}
+    small = [name for name in PRETRAINED if pretrained_settings(name).stray_light is None and not name.endswith("-0")]
+    known |= {f"{name} as trained": _as_trained(name) for name in small}
     known |= {f"flat f/{number:g}": _flat(number) for number in FLAT}
     return known | {f"preset {name}": _published(name) for name in SYSTEMS}
 
