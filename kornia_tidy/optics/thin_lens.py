@@ -34,8 +34,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     Convention:
         - Positive is nearer than focus. At another wavelength multiply by 530 nm / wavelength.
         - The phase over the pupil is defocus * rho**2, with rho = 1 at the edge.
-        - Depths are not checked here. :meth:`ThinLensCamera.defocus` checks them.
-        - Depths below 1e-18 m count as 1e-18 m, and have the gradient 0: the square of their inverse overflows float32.
+        - :meth:`ThinLensCamera.defocus` checks depths. Here those below 1e-18 m count as that, with a gradient of 0.
 
     Source: Goodman, Introduction to Fourier Optics, section 6.4.
 
