@@ -30,6 +30,7 @@ extensions = [
     "sphinxcontrib.mermaid",
 ]
 nitpicky = True
+nitpick_ignore = [("py:class", "Distance")]  # another name of float, by which settings allow inf
 default_role = "literal"  # docstrings write commands as Markdown does
 exclude_patterns = ["examples/*.md"]
 

@@ -37,7 +37,7 @@ The error hardly grows with anything, for these reasons:
 * K masks are averaged: errors are weighted by 1/K each, and a sum of K terms in order adds at most K roundings of a
   value below 1, of which random ones cancel to about their square root.
 * PSFs sum to one, so a convolution is a weighted mean: its error is bounded by gamma(n) of
-  [rounding.py](../tests/rounding.py) times the largest value, and by transforms it grows as the logarithm of their
+  `tests/rounding.py` times the largest value, and by transforms it grows as the logarithm of their
   size.
 * Two neighbouring layers are blended with weights that sum to one, however many layers there are.
 
