@@ -20,6 +20,7 @@ TINT = 0.1  # standard deviation of the logarithm of each channel's factor, as o
 SHOT_SHARE = 0.5  # share of captures with shot noise; the others have read noise alone
 FULL_WELL = (500.0, 60e3)  # electrons, uniform in its logarithm: at a level of 0.3, a noise of 0.024 to 0.0022
 READ_ELECTRONS = 2.4  # read noise of captures with shot noise, as of an industrial sensor
+TOLD_ERROR = 2.0  # largest factor by which the noise told to the network is wrong in training
 
 
 class NoisyCrops(Dataset):
@@ -44,7 +45,8 @@ class NoisyCrops(Dataset):
         crop: side of the crop in pixels. None: the whole capture.
         noise_range: least and largest standard deviation of the read noise, in linear light, full scale 1.
         electrons: least and largest full well of the captures with shot noise, see :func:`electrons_of`.
-        gain: draw gains. False: the gain is one, as for validation.
+        gain: draw gains, and errors of the noise that is told. False: the gain is one and the noise the true one, as
+            for validation.
 
     Raises:
         ValueError: if a range is not 0 < least <= largest, or a capture is smaller than the crop.
@@ -55,7 +57,8 @@ class NoisyCrops(Dataset):
         - ``"coded"``: the capture (3, H, W), and ``"image"``: the all-in-focus image, both encoded as the camera does;
         - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True where depth is known;
         - ``"noise"``: (3, H, W), standard deviation of the noise in linear light, full scale 1, by the sensor's model
-          and the noisy capture, as for a capture whose scene is unknown.
+          and the noisy capture, as for a capture whose scene is unknown. In half of the training samples it is wrong
+          by a factor between one half and two, see :func:`random_error`.
 
     Source: Foi et al., Practical Poissonian-Gaussian noise modeling (TIP 2008), for the noise; training over a range of
     noise levels as in Zhang et al., FFDNet (TIP 2018).
@@ -92,12 +95,13 @@ class NoisyCrops(Dataset):
             light, image = light * gain, image * gain
         sensor = random_sensor(self.noise_range, self.electrons)
         coded = sensor(light[None])[0]
+        told = sensor.std(coded)
         return {
             "coded": self.encode(coded[None])[0],
             "image": self.encode(image[None])[0],
             "inverse_depth": inverse_depth,
             "mask": mask,
-            "noise": sensor.std(coded),
+            "noise": told * random_error() if self.gain else told,
         }
 
 
@@ -164,6 +168,21 @@ def random_gain(peak: Tensor) -> Tensor:
     exposure = least + (largest - least) * torch.rand(1)
     gain = (exposure + TINT * torch.randn(len(peak))).exp()
     return torch.minimum(gain, 1 / peak.clamp(min=1e-6))[:, None, None]
+
+
+def random_error() -> float:
+    """Return a factor between one half and two, by torch's global generator: one for half of the samples.
+
+    A network that is sometimes told a wrong noise learns to look at the capture, too: a user seldom knows the noise of a
+    photograph to better than a factor.
+
+    Example:
+        >>> factors = [random_error() for _ in range(100)]
+        >>> 0.5 <= min(factors) and max(factors) <= 2.0 and 1.0 in factors
+        True
+    """
+    wrong, place = torch.rand(2).tolist()
+    return TOLD_ERROR ** (2 * place - 1) if wrong < 0.5 else 1.0
 
 
 def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, float] = FULL_WELL) -> SensorNoise:

@@ -131,14 +131,15 @@ class TestNoisyCrops(BaseTester):
     def test_convention_no_capture_is_flipped(self, tmp_path):
         """The light of a point lies to its right in every sample, as in a capture by a camera that is tilted so."""
         optics = camera(tilt=1.5e-7, color_space="linear")
-        crops = NoisyCrops(NoiseFreeCaptures(Points(), optics, tmp_path), optics, SIDE - 4, (1e-5, 1e-5))
+        captures = NoiseFreeCaptures(Points(), optics, tmp_path)
+        crops = NoisyCrops(captures, optics, SIDE - 4, (1e-5, 1e-5), (60e3, 60e3))
         torch.manual_seed(0)
         columns = torch.arange(SIDE - 4.0)
         for draw in range(24):
             sample = crops[draw % 3]
             column = int(sample["image"][0].amax(0).argmax())
             light = sample["coded"].mean((0, 1))
-            light = torch.where(light > 5e-4, light, 0)  # of 1 / 28 rows: more than the noise of a column
+            light = torch.where(light > 5e-4, light, 0)  # of 1 / 28 rows: 100 times the noise of a column
             assert (light * columns).sum() / light.sum() > column + 1
 
     def test_feature_the_gain_is_linear_in_capture_and_truth(self, leaves):
@@ -175,6 +176,19 @@ class TestNoisyCrops(BaseTester):
             told.append(noise)
         assert 1e-3 <= min(told) < 3.3e-3
         assert 9e-3 < max(told) <= 0.03
+
+    def test_feature_the_noise_is_told_wrongly_in_half_of_the_training_samples(self, grey, monkeypatch):
+        """By a factor of two at most, in both directions; 40 samples of read noise alone, so that it is one number."""
+        monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 0.0)
+        captures, optics = grey
+        crops, factors = NoisyCrops(captures, optics, noise_range=(0.01, 0.01)), []
+        for seed in range(40):
+            torch.manual_seed(seed)
+            factors.append(float(crops[seed]["noise"].mean()) / 0.01)
+        right = sum(abs(factor - 1) < 1e-4 for factor in factors)
+        assert 6 <= right <= 34  # less likely than 1e-5 otherwise
+        assert 0.5 <= min(factors) < 0.8
+        assert 1.25 < max(factors) <= 2.0 + 1e-6
 
     def test_feature_shot_noise_is_told_by_the_light_of_each_pixel(self, leaves, monkeypatch):
         """It is the root of read noise and of the noisy capture's own light, both in parts of the full well."""
