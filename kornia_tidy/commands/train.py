@@ -80,7 +80,7 @@ examples:
   masks at f/48, both for 500 to 57,000 electrons of white at f/17.6 in the same time:
     kornia-tidy train --learn network --design-from outputs/design --electrons 500 57000 \\
       -o outputs/designed
-    kornia-tidy train --learn network --masks 1 --start flat --f-number 48 \\
+    kornia-tidy train --learn network --masks 1 --start flat --f-number 48 --focus 0.74 \\
       --electrons 500 57000 -o outputs/flat
   Depth with its uncertainty, and the image, in some minutes on a CPU:
     kornia-tidy train --task joint --start "like fishers" --depth-classes 32 --refocus 11 --width 8 \\

@@ -98,11 +98,21 @@ def dead_leaves(
     index, inverse_depth = rasterise(height, width, leaves)
     image = paint_leaves(index, leaves.center, leaves.radius, leaves.angle, rng)
 
+    depth = depth_of(inverse_depth, near, far)
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))), torch.from_numpy(depth[None])
+
+
+def depth_of(inverse_depth: NDArray[np.float64], near: float, far: float) -> NDArray[np.float32]:
+    """Return depth in metres from normalised inverse depth; the far end may be infinite.
+
+    Example:
+        >>> depth_of(np.array([0.0, 0.5, 1.0]), 0.5, math.inf)
+        array([inf, 1. , 0.5], dtype=float32)
+    """
     dioptres = 1 / far + (1 / near - 1 / far) * inverse_depth
     depth = np.full_like(dioptres, np.inf)
     np.divide(1.0, dioptres, out=depth, where=dioptres > 0)
-    depth = depth.astype(np.float32).clip(near, far)
-    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))), torch.from_numpy(depth[None])
+    return depth.astype(np.float32).clip(near, far)
 
 
 class DeadLeaves(SceneDataset):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from numbers import Integral
 
 import cv2
@@ -13,7 +12,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_tidy.data.dead_leaves import check_arguments, rasterise, scatter_leaves
+from kornia_tidy.data.dead_leaves import check_arguments, depth_of, rasterise, scatter_leaves
 from kornia_tidy.data.photographic_textures import photographic_light
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
@@ -78,11 +77,9 @@ def photographic_leaves(
     light = photographic_light(index, leaves.center, leaves.radius, leaves.angle, ZOOM, rng)
     image = _photographed(light.clip(0, 1), rng)
 
-    dioptres = 1 / far + (1 / near - 1 / far) * _of_most(inverse_depth)
-    depth = np.full_like(dioptres, math.inf)
-    np.divide(1.0, dioptres, out=depth, where=dioptres > 0)
+    depth = depth_of(_of_most(inverse_depth), near, far)
     encoded = linear_rgb_to_rgb(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None])[0]
-    return encoded.clamp(0, 1), torch.from_numpy(depth.astype(np.float32).clip(near, far)[None])
+    return encoded.clamp(0, 1), torch.from_numpy(depth[None])
 
 
 class PhotographicLeaves(SceneDataset):

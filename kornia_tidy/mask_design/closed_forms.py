@@ -14,7 +14,7 @@ from torch.nn import functional
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.reconstruction.tikhonov import transfer_function
-from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
+from kornia_tidy.reconstruction.wiener import inverse_spectrum, restored_plane, transfer_moments
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.scene_statistics.statistics import SceneStatistics
 
@@ -50,16 +50,15 @@ class WienerFilter:
     def __init__(self, bank: PSFBank, noise: float, statistics: SceneStatistics, size: tuple[int, int]) -> None:
         self.size = plane_size(bank, size)
         shares = statistics.depth_weights(bank.defocus)
-        self.mean, self.power = transfer_moments(bank.psfs, self.size, shares, bank.veil)
-        self.noise_power = noise**2 * inverse_spectrum(statistics, self.size).to(self.power)
+        self.moments = transfer_moments(bank.psfs, self.size, shares, bank.veil)
+        self.noise_to_scene = noise**2 * inverse_spectrum(statistics, self.size).to(self.moments.power)
 
     def __call__(self, capture: Tensor, noise_factors: Sequence[float] = (1.0,)) -> list[Tensor]:
         """Return the restored images of a capture (B, C, H, W), for so many times the variance of the noise."""
-        matched = self.mean.conj() * torch.fft.rfft2(periodic_extension(capture, self.size))
+        captured = torch.fft.rfft2(periodic_extension(capture, self.size))
         height, width = capture.shape[-2:]
         planes = (
-            torch.fft.irfft2(matched / (self.power + factor * self.noise_power), s=self.size)
-            for factor in noise_factors
+            restored_plane(captured, self.moments, factor * self.noise_to_scene, self.size) for factor in noise_factors
         )
         return [plane[..., :height, :width] for plane in planes]
 

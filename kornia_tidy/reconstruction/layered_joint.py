@@ -6,7 +6,7 @@ import math
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -14,6 +14,7 @@ from kornia_tidy.reconstruction.depth_distribution import depth_moments, interpo
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.residual import zero_last_convolution
 from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 
@@ -129,7 +130,7 @@ class LayeredJointHead(ReconstructionHead):
                     f"{name} must have {channels[0]} input and {channels[1]} output channels, got "
                     f"{network.in_channels} and {network.out_channels}"
                 )
-            _zero_last_convolution(name, network)
+            zero_last_convolution(network, 1, name)
             network.looked = True  # no check of the range, as deconvolved maps leave [0, 1]
         super().__init__(3, depth_network.out_channels + 3)
         self.depth_network, self.image_network = depth_network, image_network
@@ -186,11 +187,3 @@ class LayeredJointHead(ReconstructionHead):
 
     def _from_light(self, light: Tensor) -> Tensor:
         return linear_rgb_to_rgb(light.clamp(0, 1)) if self.encoded else light
-
-
-def _zero_last_convolution(name: str, network: nn.Module) -> None:
-    last = list(network.modules())[-1]
-    if not isinstance(last, nn.Conv2d):
-        raise ValueError(f"{name} must end in a convolution, {type(network).__name__} ends in {last}")
-    for parameter in last.parameters():
-        nn.init.zeros_(parameter)

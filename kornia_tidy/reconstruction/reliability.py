@@ -28,7 +28,8 @@ class ReliabilityCurve(NamedTuple):
             >>> ReliabilityCurve(torch.tensor([0.5, 1.0]), torch.tensor([0.5, 1.5])).calibration_error()
             0.25
         """
-        return float(((self.found - self.predicted).abs() / self.predicted).mean())
+        least = torch.finfo(self.predicted.dtype).tiny  # a prediction of no error is right where none is found
+        return float(((self.found - self.predicted).abs() / self.predicted.clamp(min=least)).mean())
 
 
 def reliability_curve(
@@ -93,7 +94,8 @@ def sparsification_curve(
     if not len(errors):
         raise ValueError("the surest pixels are taken from those of known depth, and there are none")
     squares = errors.square().double().cumsum(0)
-    counts = torch.tensor([max(1, round(share * len(errors))) for share in shares], device=errors.device)
+    counts = [max(1, round(share * len(errors))) for share in shares]
+    counts = torch.tensor(counts, dtype=torch.int64, device=errors.device)
     return (squares[counts - 1] / counts).sqrt().to(errors.dtype)
 
 

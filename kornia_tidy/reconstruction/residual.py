@@ -47,8 +47,13 @@ class Residual(nn.Module):
         return torch.cat([maps[:, :others], maps[:, others:] + image], 1)
 
 
-def zero_last_convolution(network: nn.Module, channels: int) -> None:
+def zero_last_convolution(network: nn.Module, channels: int, name: str = "the network of a residual") -> None:
     """Initialise the last convolution of a network with zeros.
+
+    Args:
+        network: a network.
+        channels: least number of its maps.
+        name: of the network in messages.
 
     Raises:
         ValueError: if the network does not end in a convolution, or has fewer maps than ``channels``.
@@ -56,8 +61,7 @@ def zero_last_convolution(network: nn.Module, channels: int) -> None:
     last = list(network.modules())[-1]
     if not isinstance(last, nn.Conv2d) or last.out_channels < channels:
         raise ValueError(
-            f"a residual needs a network that ends in a convolution to {channels} maps or more, "
-            f"{type(network).__name__} ends in {last}"
+            f"{name} must end in a convolution to {channels} maps or more, {type(network).__name__} ends in {last}"
         )
     with torch.no_grad():
         for parameter in last.parameters():

@@ -72,10 +72,9 @@ def wiener(
     size = _plane(capture, psfs, noise, border)
     precise = torch.promote_types(torch.promote_types(capture.dtype, psfs.dtype), torch.float32)
     captured = torch.fft.rfft2(periodic_extension(capture.to(precise), size))
-    mean, power = transfer_moments(psfs.to(precise), size, depth_weights, veil)
+    moments = transfer_moments(psfs.to(precise), size, depth_weights, veil)
     noise_power = torch.as_tensor(noise, dtype=precise, device=capture.device).square()
-    restored = captured * mean.conj() / (power + noise_power * inverse_spectrum(statistics, size).to(power))
-    plane = torch.fft.irfft2(restored, s=size)
+    plane = restored_plane(captured, moments, noise_power * inverse_spectrum(statistics, size).to(moments.power), size)
     return plane[..., : capture.shape[-2], : capture.shape[-1]].to(capture.dtype)
 
 
@@ -123,6 +122,18 @@ def transfer_moments(
         mean = mean + _at_zero(added.sum(0), size)
         power = power + _at_zero((added * (2 * light + veil)).sum(0), size)
     return TransferMoments(mean, power.maximum(mean.real.square() + mean.imag.square()))
+
+
+def restored_plane(captured: Tensor, moments: TransferMoments, noise_to_scene: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return the plane that the Wiener filter restores from the half spectrum of a capture. See :func:`wiener`.
+
+    Args:
+        captured: (B, C, M, N // 2 + 1).
+        moments: of the PSFs.
+        noise_to_scene: noise power over the power spectrum of scenes.
+        size: rows M and columns N of the plane.
+    """
+    return torch.fft.irfft2(moments.mean.conj() * captured / (moments.power + noise_to_scene), s=size)
 
 
 def _at_zero(values: Tensor, size: tuple[int, int]) -> Tensor:

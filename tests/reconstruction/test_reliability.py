@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from kornia_tidy.reconstruction.reliability import reliability_curve, sparsification_curve
+from kornia_tidy.reconstruction.reliability import ReliabilityCurve, reliability_curve, sparsification_curve
 from tests.base import BaseTester
 
 PIXELS, BINS = 200, 10  # a side; 4000 pixels in a bin
@@ -46,6 +46,11 @@ class TestReliabilityCurve(BaseTester):
         maps = [torch.rand(1, 1, 2, 3)] * 3
         with pytest.raises(ValueError, match=f"bins must be from 1 to the 6 pixels of known depth, got {bins}"):
             reliability_curve(*maps, bins=bins)
+
+    def test_feature_a_bin_that_predicts_no_error_and_has_none_is_calibrated(self):
+        curve = ReliabilityCurve(torch.tensor([0.0, 0.5]), torch.tensor([0.0, 0.75]))
+        assert curve.calibration_error() == 0.25
+        assert ReliabilityCurve(torch.tensor([0.0]), torch.tensor([0.1])).calibration_error() > 1e6
 
 
 class TestSparsificationCurve(BaseTester):
