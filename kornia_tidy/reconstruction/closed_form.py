@@ -212,15 +212,16 @@ class ClosedForm(nn.Module):
 
 
 @contextmanager
-def whole_picture(head: nn.Module, light: Tensor) -> Generator[None]:
+def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) -> Generator[None]:
     """Let the closed forms in a network take away the stray light of a whole picture while they see parts of it.
 
-    Without it a network whose camera has stray light is refused by
-    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled` does so by itself for a network that takes captures as its
+    closed form does. One that encodes linear light before is told here. Closed forms that were told already stay so.
 
     Args:
         head: a network.
-        light: (B, 3, H, W), the picture in linear light, clipped to [0, 1] by the network.
+        picture: (B, 3, H, W), clipped to [0, 1] by the network.
+        encoded: the picture is encoded as sRGB. False: it is linear light.
 
     Example:
         >>> restore = ClosedForm()
@@ -230,11 +231,12 @@ def whole_picture(head: nn.Module, light: Tensor) -> Generator[None]:
         ...     restore.mean_light.flatten()
         tensor([0.2500, 0.2500, 0.2500])
     """
-    parts = [module for module in head.modules() if isinstance(module, ClosedForm) and module.has_stray_light]
+    parts = untold_closed_forms(head)
     if parts:
-        strips = light.split(256, -2)  # a copy of a large picture would take its memory again
-        total = torch.stack([strip.clamp(0, 1).double().sum((-2, -1)) for strip in strips]).sum(0)
-        mean = total[..., None, None] / (light.shape[-2] * light.shape[-1])
+        strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
+        lights = (rgb_to_linear_rgb(strip) if encoded else strip for strip in strips)
+        total = torch.stack([light.sum((-2, -1)) for light in lights]).sum(0)
+        mean = total[..., None, None] / (picture.shape[-2] * picture.shape[-1])
     try:
         for part in parts:
             part.mean_light = mean.to(part.psfs)
@@ -242,6 +244,17 @@ def whole_picture(head: nn.Module, light: Tensor) -> Generator[None]:
     finally:
         for part in parts:
             part.mean_light = None
+
+
+def untold_closed_forms(head: nn.Module) -> list[ClosedForm]:
+    """Return the closed forms in a network that take away stray light by the mean light of what they see.
+
+    Example:
+        >>> untold_closed_forms(nn.Conv2d(3, 3, 1))
+        []
+    """
+    parts = [module for module in head.modules() if isinstance(module, ClosedForm)]
+    return [part for part in parts if part.has_stray_light and part.mean_light is None]
 
 
 def _at_noise(estimates: Tensor, level: Tensor, exponent: float) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 from weakref import WeakSet
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
+from kornia_tidy.reconstruction.closed_form import untold_closed_forms, whole_picture
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import (
     input_channels,
@@ -67,7 +69,8 @@ def reconstruct_tiled(
         ValueError: if the network cannot be tiled, a tile is not larger than its overlap, or no tile fits the memory.
 
     Convention:
-        Gradients are not computed.
+        Gradients are not computed. Stray light that a network takes away follows from the mean light of the whole image,
+        see :func:`~kornia_tidy.reconstruction.closed_form.whole_picture`.
 
     Example:
         >>> head = nn.Sequential(nn.Conv2d(3, 8, 5, padding=2), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1)).eval()
@@ -81,6 +84,23 @@ def reconstruct_tiled(
     check_positive("memory_budget", memory_budget, "bytes")
     if overlap is not None and overlap < 0:
         raise ValueError(f"overlap must be 0 pixels or more, got {overlap}")
+    if untold := untold_closed_forms(head):
+        told = whole_picture(head, image, encoded=untold[0].encoded)
+    else:
+        told = nullcontext()
+    with told:
+        return _in_tiles(head, image, tile, overlap, memory_budget, out, progress)
+
+
+def _in_tiles(
+    head: nn.Module,
+    image: Tensor,
+    tile: int | tuple[int, int] | None,
+    overlap: int | None,
+    memory_budget: int,
+    out: Tensor | tuple[Tensor, ...] | None,
+    progress: Callable[[int, int], object] | None,
+) -> Any:
     if overlap is None:
         _check_seamless(head)
         overlap = receptive_field(head)

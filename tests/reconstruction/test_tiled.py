@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from torch import nn
 
 from kornia_tidy.inference.heads import PlainHead
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import (
     AttentionUNet,
+    ClosedFormHead,
     JointHead,
     MiDaSSmall,
     NAFNet,
@@ -26,6 +28,7 @@ from kornia_tidy.reconstruction import (
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import maps_of, total_stride
 from kornia_tidy.reconstruction.tile_grid import TileGrid
+from kornia_tidy.reconstruction.tiled import SEAM
 from tests.base import BaseTester
 
 
@@ -95,6 +98,22 @@ class TestSeams(BaseTester):
         difference, _, _ = seam(head, image, tile=(least + more, least + and_more))
         head.float()
         assert difference <= 1e-12
+
+    @pytest.mark.parametrize("encoded", [True, False])
+    def test_feature_stray_light_is_that_of_the_whole_image(self, encoded):
+        """Its left half is dark and its right half bright: by a tile's own light it would be wrong by .03 and more."""
+        head = ClosedFormHead(encoded=encoded).eval()
+        psf = torch.rand(1, 3, 5, 5, generator=torch.Generator().manual_seed(0))
+        psf = 0.8 * psf / psf.sum((-2, -1), keepdim=True)
+        one = torch.ones(1, 3)
+        head.closed_form.set_psfs(PSFBank(psf, torch.zeros(1), one, 0.2 * one))
+        image = 0.1 + 0.8 * (torch.arange(300) > 150).float().expand(1, 3, 40, -1)
+        tile = 2 * receptive_field(head) + 20
+        assert tile < 200
+        difference, tiles, _ = seam(head, image, tile=tile)
+        assert tiles > 1
+        assert difference <= SEAM
+        assert head.closed_form.mean_light is None
 
     @pytest.mark.parametrize(
         ("name", "size"),
