@@ -15,6 +15,7 @@ import tarfile
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,6 +56,7 @@ def render_scenes(
     jobs: int = 1,
     rank: int = 0,
     world: int = 1,
+    take_over: bool = False,
     made_from: Mapping[str, Any] | None = None,
     each: Each | None = None,
 ) -> Rendered:
@@ -71,11 +73,14 @@ def render_scenes(
         jobs: number of worker processes of this call.
         rank: number of this call among those that share the work, here or on other machines that see the folder.
         world: number of those calls. They need not run at the same time.
+        take_over: render what others have not written yet when this call's own share is complete. The work of a process
+            that was lost is then done by the others. Near the end several processes may render the same part, where they
+            would otherwise wait: the first one that is complete stays.
         made_from: how camera and scenes were made, as plain values, for ``render.json``.
         each: called after each item with the number of finished items and of all items of this call.
 
     Returns:
-        Numbers of items that this call photographed and found.
+        Numbers of items that this call photographed and found, those of others included.
 
     Raises:
         ValueError: if the folder holds other captures, or a scene cannot be used; written captures are kept.
@@ -107,21 +112,32 @@ def render_scenes(
     folder.mkdir(parents=True, exist_ok=True)
     parts = layout.parts(count)
     own = parts[rank::world]
-    missing = [part for part in own if not (folder / part.name).exists()]
-    total = sum(len(part.items) for part in own)
-    found = total - sum(len(part.items) for part in missing)
+    missing = _missing(folder, own)
+    total, made = _items_of(own), _items_of(missing)
+    found = total - made
     with repeatable():
         claim(folder, conditions(optics, count, layout, seed, made_from or {}))
         items = _Captures(scenes, optics, layout, seed)
-        captures = _rendered(items, [index for part in missing for index in part.items], jobs)
-        if each is not None:
-            captures = _counted(captures, each, found, total)
-        for part in missing:
-            with _unless_there(folder / part.name), _told():
-                _write(folder / part.name, itertools.islice(captures, len(part.items)), layout)
-    if all((folder / part.name).exists() for part in parts):
+        counted = None if each is None else partial(_counted, each=each, found=found, total=total)
+        _photograph(items, folder, missing, jobs, counted)
+        if take_over:
+            # From the end of the shares of others: those who still work on them come from the start.
+            others = [part for step in range(1, world) for part in parts[(rank + step) % world :: world][::-1]]
+            for start in range(0, len(others), jobs):
+                missing = _missing(folder, others[start : start + jobs])
+                _photograph(items, folder, missing, jobs)
+                made += _items_of(missing)
+    if not _missing(folder, parts):
         _finish(folder, parts, layout)
-    return Rendered(total - found, found)
+    return Rendered(made, found)
+
+
+def _missing(folder: Path, parts: Iterable[Part]) -> list[Part]:
+    return [part for part in parts if not (folder / part.name).exists()]
+
+
+def _items_of(parts: Iterable[Part]) -> int:
+    return sum(len(part.items) for part in parts)
 
 
 def shard_items_within(optics: TiDyOptics, scenes: Dataset[Any], layout: Layout, size: int, seed: int = 0) -> int:
@@ -194,13 +210,28 @@ def _end_with_parent(_: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _counted(captures: Iterator[Capture], each: Each, found: int, total: int) -> Iterator[Capture]:
+def _counted(captures: Iterator[Capture], *, each: Each, found: int, total: int) -> Iterator[Capture]:
     for done, capture in enumerate(captures, found + 1):
         each(done, total)
         yield capture
 
 
 # ---------------------------------------------------------------------- writing
+
+
+def _photograph(
+    items: _Captures,
+    folder: Path,
+    parts: Sequence[Part],
+    jobs: int,
+    counted: Callable[[Iterator[Capture]], Iterator[Capture]] | None = None,
+) -> None:
+    """Render folders or shards and write each as soon as it is complete."""
+    captures = _rendered(items, [index for part in parts for index in part.items], jobs) if parts else iter(())
+    captures = captures if counted is None else counted(captures)
+    for part in parts:
+        with _unless_there(folder / part.name), _told():
+            _write(folder / part.name, itertools.islice(captures, len(part.items)), items.layout)
 
 
 def _write(path: Path, captures: Iterable[Capture], layout: Layout) -> None:

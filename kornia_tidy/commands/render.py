@@ -32,6 +32,8 @@ OF_CAMERA = (
 )  # fmt: skip
 OF_PRESET = ("sigma", "fidelity", "compositing", "border")  # options that replace a part of a published system
 
+PLACES = (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS"))  # in the environment, by torchrun and by srun
+
 DESCRIPTION = """\
 Photograph every scene of a data set once through a camera with phase masks, and store
 the captures for training. The camera is given by the options below, a published system
@@ -50,8 +52,9 @@ EPILOG = """\
 After an interruption the same command continues and gives the same bytes, since captures
 and shards are written atomically. A capture is determined by camera, scene, seed and
 number alone, for any --jobs and any process (on processors of one kind). Processes of
-torchrun, or others with RANK and WORLD_SIZE in their environment, share the work, on one
-machine or on several that share FOLDER.
+torchrun or srun, or others with RANK and WORLD_SIZE in their environment, share the work,
+on one machine or on several that share FOLDER. One that is done with its share takes over
+what is missing: a process that is lost loses nothing.
 
 examples:
   Scenes made here, through five random masks, on all of 8 cores:
@@ -61,6 +64,8 @@ examples:
         --shard-megabytes 500 -o captures
   Two machines with 16 processes each:
     torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy.cli render ... -o captures
+  The same by SLURM:
+    srun --nodes 2 --ntasks-per-node 16 kornia-tidy render ... -o captures
 
 In Python, in a data loader:
   from kornia_tidy.coded_datasets.captures import CodedCaptures
@@ -131,7 +136,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Render the data set, and print a summary."""
-    rank, world = (_environment(name, default) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
+    rank, world = _place()
     optics, settings, camera_from = _camera(args)
     scenes = make_scenes(settings, args.split, args.scenes)
     layout = Layout(tuple(args.beside), args.float, args.shard_items)
@@ -160,7 +165,7 @@ def run(args: argparse.Namespace) -> None:
         try:
             made, found = render_scenes(
                 optics, scenes, args.output, layout, seed=args.noise_seed, jobs=args.jobs, rank=rank, world=world,
-                made_from=made_from, each=each,
+                take_over=True, made_from=made_from, each=each,
             )  # fmt: skip
         except KeyboardInterrupt:
             bar.close()
@@ -199,8 +204,18 @@ def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dic
     return optics, seen, {"preset": args.preset, "options": {name: given[name] for name in own}}
 
 
-def _environment(name: str, default: int) -> int:
-    text = os.environ.get(name, str(default))
-    if not text.isdecimal():
-        raise ValueError(f"{name} in the environment must be a whole number, got {text!r}")
-    return int(text)
+def _place() -> tuple[int, int]:
+    """Return the number of this process among those that share the work, and their number."""
+    for rank, world in PLACES:
+        if rank in os.environ:
+            place = _whole(rank), _whole(world) if world in os.environ else 1
+            if place[0] >= place[1]:
+                raise ValueError(f"{rank} in the environment must be below {world}, {place[1]}, got {place[0]}")
+            return place
+    return 0, 1
+
+
+def _whole(name: str) -> int:
+    if not os.environ[name].isdecimal():
+        raise ValueError(f"{name} in the environment must be a whole number, got {os.environ[name]!r}")
+    return int(os.environ[name])

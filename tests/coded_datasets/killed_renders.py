@@ -86,6 +86,13 @@ def go_on(folder: Path, layout: Layout, chance: random.Random, kills: int) -> li
     return there
 
 
+def lose(folder: Path, layout: Layout) -> None:
+    """Kill one of three processes after its first capture; the others take its work over."""
+    lost = partial(render_killed, 1, 0.0, folder, layout, 0, 3)
+    others = [partial(render, folder, layout, rank, 3, take_over=True) for rank in (1, 2)]
+    assert run([lost, *others]) == ({0, -signal.SIGKILL}, True)
+
+
 def bereave(folder: Path) -> dict[str, bool]:
     """Kill a process that has others render for it; return whether those ended, by the moment of the kill.
 
@@ -118,6 +125,7 @@ def main(folder: Path, kills: int) -> None:
     for name, layout in FORMS.items():
         assert run([partial(render, folder / f"{name}-whole", layout)]) == ({0}, True)
         assert run([partial(render, folder / f"{name}-three", layout, rank, 3) for rank in range(3)]) == ({0}, True)
+        lose(folder / f"{name}-lost", layout)
         there[name] = go_on(folder / f"{name}-killed", layout, chance, kills)
     print(json.dumps({"there": there, "ended": bereave(folder)}))
 

@@ -56,6 +56,18 @@ class TestRenderScenes(BaseTester):
         assert min(made) > 0
         assert contents(tmp_path) == contents(folder)
 
+    @pytest.mark.parametrize("jobs", [1, 2])
+    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+    def test_feature_a_process_takes_over_what_others_have_not_written(self, whole, jobs, tmp_path):
+        folder, layout = whole
+        first = render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=2, world=3)
+        rest = render_scenes(
+            small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=0, world=3, jobs=jobs, take_over=True
+        )
+        assert 0 < first.made < 5
+        assert rest == (5 - first.made, 0)
+        assert contents(tmp_path) == contents(folder)
+
     @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
     @pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")
     def test_feature_so_do_jobs(self, whole, tmp_path):

@@ -35,6 +35,11 @@ class TestResume(BaseTester):
         assert contents(folder / f"{name}-three") == whole
         assert contents(folder / f"{name}-killed") == whole, f"killed when parts were there: {there}"
 
+    @pytest.mark.parametrize("name", FORMS)
+    def test_feature_the_work_of_a_lost_process_is_taken_over(self, name, killed):
+        folder, _ = killed
+        assert contents(folder / f"{name}-lost") == contents(folder / f"{name}-whole")
+
     def test_feature_jobs_do_not_outlive_the_process_that_is_killed(self, killed):
         """While they start, and while they wait to hand over a capture; else they would for ever."""
         assert killed[1]["ended"] == {"first fork": True, "second fork": True, "first capture": True}

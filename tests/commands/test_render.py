@@ -59,12 +59,14 @@ class TestRender(BaseTester):
         assert capture["coded"].shape == (3, 40, 40)
         assert 0.4 <= capture["depth"].min() <= capture["depth"].max() <= 4
 
-    def test_feature_ranks_of_the_environment_share_the_work(self, rendered, tmp_path, monkeypatch, capsys):
-        monkeypatch.setenv("WORLD_SIZE", "2")
-        for rank, made in (("1", 1), ("0", 2)):
-            monkeypatch.setenv("RANK", rank)
+    @pytest.mark.parametrize("names", [("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS")])
+    def test_feature_ranks_of_the_environment_share_the_work(self, names, rendered, tmp_path, monkeypatch, capsys):
+        """The first call takes the share of the second one over, as that has not begun."""
+        monkeypatch.setenv(names[1], "2")
+        for rank, made in (("1", "3 captures"), ("0", "0 captures")):
+            monkeypatch.setenv(names[0], rank)
             assert main(["render", *SMALL, "--masks", "2", "--shard-items", "2", "-o", str(tmp_path)]) == 0
-            assert f"process {int(rank) + 1} of 2: {made} captures" in capsys.readouterr().out
+            assert f"process {int(rank) + 1} of 2: {made}" in capsys.readouterr().out
         assert contents(tmp_path) == contents(rendered)
 
     @pytest.mark.slow
@@ -133,3 +135,7 @@ class TestRender(BaseTester):
         monkeypatch.setenv("RANK", "first")
         assert main(["render", *SMALL, "-o", str(tmp_path / "out")]) == 2
         assert "RANK in the environment must be a whole number, got 'first'" in capsys.readouterr().err
+        monkeypatch.setenv("RANK", "2")
+        monkeypatch.setenv("WORLD_SIZE", "2")
+        assert main(["render", "-o", str(tmp_path)]) == 2
+        assert "RANK in the environment must be below WORLD_SIZE, 2, got 2" in capsys.readouterr().err
