@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 TITLES = {
@@ -21,6 +22,7 @@ TITLES = {
     "dataloader_transform": "A camera in a data loader",
     "lightning_training": "Train with Lightning",
     "train_on_rendered": "Train on captures made once",
+    "ray_rendering": "Photograph a data set with Ray",
     "learn_point_psf": "Masks with a sharp PSF at all depths",
     "design_masks": "Masks designed without images",
     "mask_families": "Which mask family learns how fast",
@@ -37,6 +39,7 @@ ARGUMENTS = {
     "lightning_training": "--epochs 2 --scenes 16",
     "train_on_rendered": "--scenes 16 --size 96 --epochs 4 --output captures",
 }
+NEEDS = {"ray_rendering": "ray"}  # packages without which only the script is shown
 DRAW = Path(__file__).with_name("run_example.py")
 COMMAND = re.compile(r"^ *python examples/.*\n", re.MULTILINE)
 
@@ -74,7 +77,7 @@ def write_gallery(pages: Path, results: Path, examples: list[Path], *, run: bool
     (pages / "images").mkdir(parents=True, exist_ok=True)
     examples.sort(key=lambda path: [*TITLES, path.stem].index(path.stem))
     for example in examples:
-        if run:
+        if run and (example.stem not in NEEDS or find_spec(NEEDS[example.stem])):
             run_example(example, results / example.stem)
         write_page(example, results / example.stem, pages)
     cards = "\n".join(card(example, pages) for example in examples)
@@ -125,7 +128,10 @@ def write_page(example: Path, folder: Path, pages: Path) -> None:
         used = f"python examples/{example.name} {ARGUMENTS.get(example.stem, '')}".strip()
         result = f"## What it prints\n\n```bash\n{used}\n```\n```text\n{text(printed)}```\n"
     else:
-        result = "Pictures and numbers are made by `make docs`.\n"
+        package = NEEDS.get(example.stem)
+        result = (
+            f"Pictures and numbers are made by `make docs`{f', where {package} is installed' if package else ''}.\n"
+        )
     words += f"\n\n```bash\n{commands}```\n" if commands else "\n"
     title = TITLES.get(example.stem, example.stem.replace("_", " ").capitalize())
     page = PAGE.format(title=title, words=words, pictures="\n".join(pictures), result=result, stem=example.stem)

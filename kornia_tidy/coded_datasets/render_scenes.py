@@ -74,8 +74,8 @@ def render_scenes(
         rank: number of this call among those that share the work, here or on other machines that see the folder.
         world: number of those calls. They need not run at the same time.
         take_over: render what others have not written yet when this call's own share is complete. The work of a process
-            that was lost is then done by the others. Near the end several processes may render the same part, where they
-            would otherwise wait: the first one that is complete stays.
+            that was lost is then done by the others. Near the end several processes may render the same part, where
+            they would otherwise wait: the first one that is complete stays.
         made_from: how camera and scenes were made, as plain values, for ``render.json``.
         each: called after each item with the number of finished items and of all items of this call.
 

@@ -215,8 +215,9 @@ class ClosedForm(nn.Module):
 def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) -> Generator[None]:
     """Let the closed forms in a network take away the stray light of a whole picture while they see parts of it.
 
-    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled` does so by itself for a network that takes captures as its
-    closed form does. One that encodes linear light before is told here. Closed forms that were told already stay so.
+    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled` does so by itself for a network that takes captures as
+    its closed form does. One that encodes linear light before is told here. Closed forms that were told before keep
+    what they were told.
 
     Args:
         head: a network.

@@ -69,8 +69,8 @@ def reconstruct_tiled(
         ValueError: if the network cannot be tiled, a tile is not larger than its overlap, or no tile fits the memory.
 
     Convention:
-        Gradients are not computed. Stray light that a network takes away follows from the mean light of the whole image,
-        see :func:`~kornia_tidy.reconstruction.closed_form.whole_picture`.
+        Gradients are not computed. Stray light that a network takes away follows from the mean light of the whole
+        image, see :func:`~kornia_tidy.reconstruction.closed_form.whole_picture`.
 
     Example:
         >>> head = nn.Sequential(nn.Conv2d(3, 8, 5, padding=2), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1)).eval()

@@ -173,8 +173,8 @@ def random_gain(peak: Tensor) -> Tensor:
 def random_error() -> float:
     """Return a factor between one half and two, by torch's global generator: one for half of the samples.
 
-    A network that is sometimes told a wrong noise learns to look at the capture, too: a user seldom knows the noise of a
-    photograph to better than a factor.
+    A network that is sometimes told a wrong noise learns to look at the capture, too: a user seldom knows the noise of
+    a photograph to better than a factor.
 
     Example:
         >>> factors = [random_error() for _ in range(100)]
