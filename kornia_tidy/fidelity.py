@@ -65,7 +65,8 @@ class Fidelity:
             below 0.1 %, ``"draft"`` below 3 % and ``"reference"`` below 1e-6, for masks of every family and 400 to
             700 nm (``tests/psf/test_exact.py``). Only for exact propagation.
         layers: interpolation of PSFs over defocus: ``"nearest"``, ``"linear"``, ``"cubic"``, or ``"bandlimited"``,
-            which is nearly exact for a spacing below 2.8 rad (at 470 nm).
+            which is nearly exact and takes more layers where the aperture and the wavelengths ask for it: see
+            :func:`kornia_tidy.psf.defocus_interpolation.interpolable_spacing`.
         layer_spacing: distance between the computed PSFs in radians of defocus.
         wavelengths: at most so many, where the camera's spectrum has more: neighbours then stand together for one, see
             :func:`kornia_tidy.psf.spectral_binning.bin_spectrum`. Default: all that the spectrum has.

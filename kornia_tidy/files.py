@@ -46,10 +46,17 @@ def check_file(path: str | os.PathLike[str]) -> Path:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is a folder, or no regular file: a pipe or a device might never end.
+        ValueError: if it is a folder, or no regular file: a pipe or a device might never end; or if no file can have
+            this name.
     """
     path = Path(path)
-    if path.is_dir():
+    try:
+        folder = path.is_dir()
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        raise ValueError(f"cannot read {str(path)[:100]}...: the name is too long") from None
+    if folder:
         raise ValueError(f"cannot read {path}: it is a folder")
     if not path.exists():
         raise FileNotFoundError(f"cannot read {path}: there is no such file")

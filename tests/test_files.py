@@ -39,6 +39,10 @@ class TestReading(BaseTester):
         with pytest.raises(ValueError, match="cannot read /dev/zero: it is not a regular file"):
             read_bytes("/dev/zero")
 
+    def test_exception_a_name_that_no_file_can_have(self, tmp_path):
+        with pytest.raises(ValueError, match=r"cannot read .{60,100}\.\.\.: the name is too long$"):
+            read_bytes(tmp_path / ("a" * 5000))
+
     def test_exception_json_nested_too_deep(self, tmp_path):
         for text in ("[" * 100_000 + "]" * 100_000, '{"a":' * 100_000 + "1" + "}" * 100_000):
             (tmp_path / "a.json").write_text(text)

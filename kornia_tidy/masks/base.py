@@ -18,6 +18,8 @@ NOISE_RMS = 2.05  # rad at 530 nm, as the paper's initial masks: heights uniform
 HEIGHTS = (1e-9, 1e-3)  # m; limits of ``max_height``
 HEIGHT_STEPS = (1e-40, 1e-4)  # m; limits of a learning rate; a tiny one is harmless, a large one is a wrong unit
 
+MOST_MASKS, MOST_PIXELS = 10_000, 2**28  # of a sequence, and of all its masks together: 1 GiB of float32
+
 Size = int | tuple[int, int]
 """Pixels of a mask: along both sides, or (rows, columns)."""
 
@@ -146,7 +148,8 @@ def mask_axes(size: Size) -> tuple[Tensor, Tensor]:
         y of the rows, downwards, (rows, 1), and x of the columns, (columns,); float64.
 
     Raises:
-        ValueError: if a size is not positive, or one is odd and the other even (see :func:`central_square`).
+        ValueError: if a size is not positive or too large, or one is odd and the other even (see
+            :func:`central_square`).
 
     Example:
         >>> y, x = mask_axes((23, 45))
@@ -155,10 +158,30 @@ def mask_axes(size: Size) -> tuple[Tensor, Tensor]:
     """
     rows, columns = (size, size) if isinstance(size, int) else size
     check_positive("size", min(rows, columns))
+    if rows * columns > MOST_PIXELS:
+        raise ValueError(f"a mask must have at most {MOST_PIXELS} pixels, got {rows} x {columns}")
     if (rows - columns) % 2:
         raise ValueError(f"rows and columns of a mask must both be odd or both even, got {rows} and {columns}")
     pitch = MASK_SPAN / min(rows, columns)
     return mask_coordinates(rows, pitch)[:, None], mask_coordinates(columns, pitch)
+
+
+def check_number_of_masks(num_masks: int, pixels: int = 1) -> None:
+    """Raise ``ValueError`` unless a number of masks is possible, before any of them is made.
+
+    Args:
+        num_masks: the number.
+        pixels: of each mask.
+
+    Example:
+        >>> check_number_of_masks(5, 23 * 23)
+    """
+    check_positive("num_masks", num_masks)
+    if num_masks > MOST_MASKS or num_masks * pixels > MOST_PIXELS:
+        raise ValueError(
+            f"num_masks must be at most {min(MOST_MASKS, MOST_PIXELS // pixels)} for masks of {pixels} pixels, "
+            f"got {num_masks}"
+        )
 
 
 def central_square(phase: Tensor) -> Tensor:
@@ -229,7 +252,7 @@ def initial_values(
             raise ValueError("initial values must be finite, got NaN or infinity")
         return values.detach().to(torch.get_default_dtype(), copy=True)
     check_generator(generator)
-    check_positive("num_masks", num_masks)
+    check_number_of_masks(num_masks)
     check_choice("initial", initial, ("noise", "flat"))
     if initial == "flat":
         return torch.zeros(num_masks, *shape)

@@ -5,8 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_generator, check_positive
-from kornia_tidy.masks.base import HEIGHTS, PhaseMasks, Size, mask_axes, metres_to_radians
+from kornia_tidy.checks import check_choice, check_generator
+from kornia_tidy.masks.base import (
+    HEIGHTS,
+    PhaseMasks,
+    Size,
+    check_number_of_masks,
+    mask_axes,
+    metres_to_radians,
+)
 from kornia_tidy.masks.limits import unlimited_phase
 from kornia_tidy.optics.materials import Material
 
@@ -67,9 +74,9 @@ class PixelwiseMask(PhaseMasks):
             phase = (heights.detach().double() * to_radians).to(torch.get_default_dtype())
         else:
             check_generator(generator)
-            check_positive("num_masks", num_masks)
             check_choice("initial", initial, ("noise", "flat"))
             y, x = mask_axes(size)
+            check_number_of_masks(num_masks, len(y) * len(x))
             phase = torch.zeros(num_masks, len(y), len(x))
             if initial == "noise":
                 phase = torch.rand(phase.shape, generator=generator) * (self.NOISE_HEIGHT * to_radians)

@@ -6,7 +6,15 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.masks.base import NOISE_RMS, PhaseMasks, Size, gather_values, initial_values, mask_axes
+from kornia_tidy.masks.base import (
+    NOISE_RMS,
+    PhaseMasks,
+    Size,
+    check_number_of_masks,
+    gather_values,
+    initial_values,
+    mask_axes,
+)
 from kornia_tidy.optics.materials import Material
 
 
@@ -66,7 +74,7 @@ class SpiralMask(PhaseMasks):
         max_height: float | None = None,
     ) -> None:
         super().__init__(material, constraint, max_height)
-        check_positive("num_masks", num_masks)
+        check_number_of_masks(num_masks)
         check_positive("num_zones", num_zones)
         check_choice("initial", initial, ("noise", "rotating"))
         y, x = mask_axes(size)

@@ -16,6 +16,7 @@ import numpy as np
 from kornia_tidy.psf.psf_bank import PSFBank
 
 TAPS = {"cubic": 4, "bandlimited": 10}
+SHARE_OF_NYQUIST = 0.7  # distance of samples over pi / band up to which ten taps interpolate
 FINE_SPACING = 0.35  # radians between interpolated PSFs; between those, linear layers err by less than a thousandth
 
 
@@ -27,6 +28,18 @@ def defocus_band(max_rho2: float, shortest_wavelength: float, reference_waveleng
         2.79
     """
     return max_rho2 * reference_wavelength / shortest_wavelength
+
+
+def interpolable_spacing(band: float) -> float:
+    """Return the largest distance of samples in radians from which ten taps find every PSF of the band.
+
+    Near the limit of Nyquist, ten taps err by thousandths of full scale, as for masks of one or two pixels a side.
+
+    Example:
+        >>> round(interpolable_spacing(defocus_band(1.145, 470e-9, 530e-9)), 2)
+        1.7
+    """
+    return SHARE_OF_NYQUIST * math.pi / band
 
 
 def fine_nodes(nodes: Sequence[float]) -> tuple[float, ...]:

@@ -70,16 +70,11 @@ def check_layer_spacing(spacing: float, band: float, shortest_wavelength: float)
         shortest_wavelength: in metres, for the message.
 
     Raises:
-        ValueError: if the spacing is not below pi / band, or the band is 0, as of an aperture of one cell on the axis.
+        ValueError: if the spacing is not below pi / band.
 
     Example:
         >>> check_layer_spacing(1.0, 1.13, 470e-9)
     """
-    if band == 0:
-        raise ValueError(
-            "layers='bandlimited' needs an aperture of several cells, whose centres say how fast PSFs change with "
-            "defocus, got one cell on the axis: use layers='linear' or 'cubic'"
-        )
     if spacing >= (limit := math.pi / band):
         raise ValueError(
             f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "

@@ -38,7 +38,7 @@ class Pupil:
     extent: float = field(init=False)
     """Half width of the open part in pupil radii; twice it bounds the frequencies in a PSF."""
     max_rho2: float = field(init=False)
-    """Largest squared distance of an open cell from the axis; it bounds how fast a PSF changes with defocus."""
+    """Largest squared distance from the axis to a corner of an open cell: a bound on how fast PSFs change with defocus."""
 
     @property
     def diameter(self) -> float:
@@ -57,7 +57,7 @@ class Pupil:
         cells = torch.nonzero(self.amplitude) - (size - 1) / 2
         object.__setattr__(self, "light", float(self.amplitude.double().square().sum()) * self.cell_pitch**2)
         object.__setattr__(self, "extent", (float(cells.abs().max()) + 0.5) * self.cell_pitch)
-        object.__setattr__(self, "max_rho2", float(cells.square().sum(1).max()) * self.cell_pitch**2)
+        object.__setattr__(self, "max_rho2", float((cells.abs() + 0.5).square().sum(1).max()) * self.cell_pitch**2)
 
 
 def pupil_over(mask_shape: Sequence[int], aperture: Tensor | None, fill_factor: float) -> Pupil:

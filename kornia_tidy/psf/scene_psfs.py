@@ -19,7 +19,13 @@ from kornia_tidy.modulator.modulator import DwellTimes, Timeline, settled_timeli
 from kornia_tidy.optics.aperture import check_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank
+from kornia_tidy.psf.defocus_interpolation import (
+    TAPS,
+    defocus_band,
+    fine_nodes,
+    interpolable_spacing,
+    interpolated_bank,
+)
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.lens_limits import PARTS, check_defocus_range, check_layer_spacing
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
@@ -295,7 +301,10 @@ class ScenePSFs:
         if self.measured is not None:
             return tuple(self.measured.defocus.tolist())
         lo, hi = self.camera.defocus_range
-        intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
+        spacing = self.fidelity.layer_spacing
+        if self.fidelity.layers == "bandlimited":
+            spacing = min(spacing, interpolable_spacing(self._band()))
+        intervals = max(1, round((hi - lo) / spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
 
     @property

@@ -66,6 +66,18 @@ class TestPixelwiseMask(BaseTester):
         self.assert_close(banks[1].psfs, banks[0].psfs, rtol=0, atol=1e-7)
         self.assert_close(banks[2].psfs, banks[0].psfs.mT, rtol=0, atol=1e-5)
 
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            ({"num_masks": 10**6}, "num_masks must be at most 10000 for masks of 529 pixels, got 1000000"),
+            ({"num_masks": 100, "size": 4096}, "num_masks must be at most 16 for masks of 16777216 pixels, got 100"),
+            ({"size": 10**6}, "a mask must have at most 268435456 pixels, got 1000000 x 1000000"),
+        ],
+    )
+    def test_exception_more_than_memory_is_meant_for(self, options, sentence):
+        with pytest.raises(ValueError, match=sentence):
+            PixelwiseMask(**options)
+
     def test_exception_a_mask_that_cannot_be_centred(self):
         with pytest.raises(ValueError, match="rows and columns of a mask must both be odd or both even, got 4 and 3"):
             PixelwiseMask(initial=torch.zeros(2, 4, 3))
