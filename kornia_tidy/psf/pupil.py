@@ -38,7 +38,7 @@ class Pupil:
     extent: float = field(init=False)
     """Half width of the open part in pupil radii; twice it bounds the frequencies in a PSF."""
     max_rho2: float = field(init=False)
-    """Largest squared distance from the axis to a corner of an open cell: a bound on how fast PSFs change with defocus."""
+    """Largest squared distance from the axis to a corner of an open cell: bounds how fast PSFs change with defocus."""
 
     @property
     def diameter(self) -> float:
