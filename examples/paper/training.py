@@ -34,6 +34,8 @@ The noise at a fifth of full scale is then 0.01, which is that of PhaseCam3D; Ti
 """
 REFERENCE = ThinLensCamera()  # depths of all scenes are painted for it, and stretched to the range of other cameras
 
+BALANCED = Fidelity.preset("balanced")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
@@ -57,28 +59,28 @@ class Budget:
         accelerator: of Lightning.
     """
 
-    size: int = 96
-    scenes: int = 160
+    size: int = 64
+    scenes: int = 96
     batch: int = 4
-    steps: int = 100
+    steps: int = 60
     width: int = 8
     scored: int = 16
     real: int = 12
-    real_size: int = 192
+    real_size: int = 160
     seeds: int = 2
     lr: float = 2e-3
     lr_metres: float = 6e-8
     schedule: str = "cosine"
     residual: bool = True
-    fidelity: Fidelity = Fidelity.preset("balanced")
+    fidelity: Fidelity = BALANCED
     accelerator: str = "cpu"
 
     @property
     def words(self) -> str:
         """The budget in words, for tables."""
         return (
-            f"{self.steps:,} steps of {self.batch} of {self.scenes:,} painted scenes of {self.size} px, U-Nets of width "
-            f"{self.width}, learning rates {self.lr:g} and {self.lr_metres:g} m ({self.schedule}); scored on "
+            f"{self.steps:,} steps of {self.batch} of {self.scenes:,} painted scenes of {self.size} px, U-Nets of "
+            f"width {self.width}, learning rates {self.lr:g} and {self.lr_metres:g} m ({self.schedule}); scored on "
             f"{self.scored} other painted scenes and {self.real} real ones of {self.real_size} px; seeds {self.seeds}"
         )
 
