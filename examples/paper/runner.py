@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -43,19 +44,28 @@ class Experiment:
         name: of the module and of the files of results.
         title: heading of its section.
         trials: function from the scale to the trials, the most wanted first.
-        measure: function from a trial and the scale to its scores by name.
+        measure: function from a trial and the scale to its scores by name; with ``together``, from several trials to
+            the scores of each.
         table: function from rows and scale to the section's text, in Markdown.
         settings: function from the scale to all that results depend on, in words.
         draw: function from rows and a path to a figure, if it has one.
+        together: number of trials that are measured at once, by scale. None: one after the other.
     """
 
     name: str
     title: str
     trials: Callable[[str], Sequence[Trial]]
-    measure: Callable[[Trial, str], Mapping[str, float | str]]
+    measure: Callable[..., Any]
     table: Callable[[Sequence[Row], str], str]
     settings: Callable[[str], str]
     draw: Callable[[Sequence[Row], Path], None] | None = None
+    together: Mapping[str, int] | None = None
+
+    def measure_all(self, trials: Sequence[Trial], scale: str) -> Sequence[Mapping[str, float | str]]:
+        """Return the scores of each trial."""
+        if self.together is not None:
+            return self.measure(trials, scale)
+        return [self.measure(trial, scale) for trial in trials]
 
 
 def main(experiment: Experiment, about: str, arguments: Sequence[str] | None = None) -> list[Row]:
@@ -105,13 +115,16 @@ def run(experiment: Experiment, scale: str, folder: Path, most: int | None = Non
     trials = [dict(trial) for trial in experiment.trials(scale)]
     known = [{name: row.get(name) for name in trials[0]} for row in rows]
     todo = [trial for trial in trials if trial not in known][:most]
-    bar = tqdm(todo, desc=experiment.name, leave=False, disable=None)
-    for trial in bar:
-        bar.set_postfix_str(", ".join(trial.values()))
-        scores = {name: as_text(value) for name, value in experiment.measure(trial, scale).items()}
+    size = 1 if experiment.together is None else experiment.together[scale]
+    bar = tqdm(total=len(todo), desc=experiment.name, leave=False, disable=None)
+    for start in range(0, len(todo), size):
+        group = todo[start : start + size]
+        bar.set_postfix_str(", ".join(group[0].values()))
         about = dict(zip(ABOUT, (settings, f"{datetime.now(UTC):%Y-%m-%d}", commit(), machine()), strict=True))
-        rows.append({**trial, **scores, **about})
+        for trial, scores in zip(group, experiment.measure_all(group, scale), strict=True):
+            rows.append({**trial, **{name: as_text(value) for name, value in scores.items()}, **about})
         write_rows(path, rows)
+        bar.update(len(group))
     return rows
 
 
