@@ -8,7 +8,8 @@ the unit impulse at 21 depths. The score is the error of captures, against the s
 
 What the paper leaves open, and how it is done here: light of 530 nm; heights follow Adam from steps of 6e-8 m; a start
 whose loss fell by less than a ten-thousandth in 20 steps continues with half the step, and has converged after the
-fifth time. Four scenes are painted, with depth over the whole range, and composed layer by layer (gather) in linear light.
+fifth time. Four scenes are painted, with depth over the whole range, and composed layer by layer (gather) in linear
+light.
 
 Source: Shah et al., TiDy-PSFs (ICCV 2023), the experiment on extended depth of field without a network.
 """
