@@ -22,7 +22,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from kornia.color import rgb_to_linear_rgb
@@ -31,110 +30,20 @@ from torch import Tensor
 
 from examples.paper.report import grid
 from examples.paper.runner import Experiment, Row, Trial, main
-from kornia_tidy import PixelwiseMask, ThinLensCamera
+from examples.paper.sequences import PSI, RULE, first_phase, impulse, learn, psfs_of
+from kornia_tidy import ThinLensCamera
 from kornia_tidy.data import photographic_leaves
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.psf.paper import PAPER_PAD, PAPER_SIZE, paper_psfs
+from kornia_tidy.psf.paper import PAPER_SIZE
 
 LENGTHS = (1, 2, 3, 5, 4, 8, 16)  # the lengths that are wanted most come first
 STARTS = {"smoke": 4, "cpu": 100, "gpu": 1000, "paper": 1000}
 TOGETHER = {"smoke": 2, "cpu": 50, "gpu": 1000, "paper": 50}  # starts in a batch: 50 fit the caches of a processor
 STEPS = {"smoke": 20, "cpu": 600, "gpu": 600, "paper": 600}  # at most
-PSI = torch.linspace(-20, 20, 21)
-WAVELENGTH, STEP = 530e-9, 6e-8  # m
 SCENES, SIDE = 4, 96  # painted scenes and their sides in pixels
-PATIENCE, LEAST_GAIN, HALVINGS = 20, 1e-4, 5
 SCORES = {
     "capture_rmse": "light outside the window of 23 pixels lost",
     "capture_rmse_scaled": "PSFs scaled to sum one",
 }
-BETAS, EPS = (0.9, 0.999), 1e-15
-RADIANS = math.pi / WAVELENGTH  # of a metre of height, at an index of 1.5
-
-
-class Learnt(NamedTuple):
-    """Masks that were optimised from several starts."""
-
-    phase: Tensor
-    """Radians, (T, K, 23, 23)."""
-    before: Tensor
-    """Loss of each start, (T,)."""
-    after: Tensor
-    """Loss at the end, (T,)."""
-    steps: Tensor
-    """Steps of each until it converged, (T,)."""
-
-
-def first_phase(length: int, seeds: Sequence[int]) -> Tensor:
-    """Return the phase of masks that begin as noise, (T, K, 23, 23)."""
-    starts = [PixelwiseMask(length, generator=torch.Generator().manual_seed(seed)).phase for seed in seeds]
-    return torch.stack(starts).detach()
-
-
-@lru_cache(maxsize=1)
-def lens() -> Tensor:
-    """Return the field of the open aperture at each defocus, scaled so that PSFs sum to one before the crop."""
-    x = torch.linspace(-1.1, 1.1, PAPER_SIZE, dtype=torch.float64)
-    rho2 = x[:, None].square() + x.square()
-    aperture = circular_aperture(PAPER_SIZE).double()
-    angle = PSI.double()[:, None, None] * rho2
-    scale = aperture / (PAPER_PAD * aperture.square().sum().sqrt())
-    return torch.polar(scale.expand(angle.shape), angle).to(torch.complex64)
-
-
-def losses_and_gradient(phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean squared difference of PSFs and impulse, (T,), and its gradient by the phase, (T, K, 23, 23).
-
-    The PSFs are those of :func:`~kornia_tidy.psf.paper.paper_psfs` for each start. The gradient is written out, which
-    takes half the time and a third of the memory of autograd's.
-    """
-    count, margin = phase.shape[1], (PAPER_PAD - PAPER_SIZE) // 2
-    field = torch.polar(torch.ones_like(phase), phase)[:, None] * lens()[None, :, None]  # (T, D, K, 23, 23)
-    wave = torch.fft.fft2(field, s=(PAPER_PAD, PAPER_PAD))
-    wave = wave.roll((PAPER_PAD // 2, PAPER_PAD // 2), (-2, -1))
-    wave = wave[..., margin : margin + PAPER_SIZE, margin : margin + PAPER_SIZE]
-    psfs = (wave.real.square() + wave.imag.square()).mean(2)
-    psfs[..., PAPER_SIZE // 2, PAPER_SIZE // 2] -= 1
-    # Of the loss by the wave's conjugate, then back through crop, shift and transform to the field.
-    by_wave = wave * (psfs[:, :, None] * (2 / (count * psfs[0].numel())))
-    by_wave = torch.nn.functional.pad(by_wave, (margin, margin, margin, margin))
-    by_wave = by_wave.roll((-(PAPER_PAD // 2), -(PAPER_PAD // 2)), (-2, -1))
-    by_field = torch.fft.ifft2(by_wave)[..., :PAPER_SIZE, :PAPER_SIZE] * PAPER_PAD**2
-    return psfs.square().mean((1, 2, 3)), 2 * (by_field * field.conj()).imag.sum(1)
-
-
-def learn(phase: Tensor, most: int) -> Learnt:
-    """Optimise each start by Adam until it has converged; the result of a start does not depend on the others."""
-    count = len(phase)
-    best, best_phase = torch.full((count,), math.inf), phase.clone()
-    before, steps = torch.zeros(count), torch.zeros(count, dtype=torch.int64)
-    active, phase = torch.arange(count), phase.clone()
-    first, second = torch.zeros_like(phase), torch.zeros_like(phase)
-    rate = torch.full((count,), STEP * RADIANS)
-    waited, reached = torch.zeros(count), torch.full((count,), math.inf)
-    for step in range(1, most + 1):
-        losses, gradient = losses_and_gradient(phase)
-        if step == 1:
-            before = losses.clone()
-        better = losses < best[active]
-        best[active[better]], best_phase[active[better]] = losses[better], phase[better]
-        gained = losses < reached * (1 - LEAST_GAIN)
-        reached = torch.where(gained, losses, reached)
-        waited = torch.where(gained, 0, waited + 1)
-        halved = waited >= PATIENCE
-        rate, waited = torch.where(halved, rate / 2, rate), torch.where(halved, 0, waited)
-        steps[active] = step
-        kept = rate > STEP * RADIANS / 2 ** (HALVINGS - 0.5)
-        if not kept.any():
-            break
-        if not kept.all():
-            active, phase, first, second, gradient = (part[kept] for part in (active, phase, first, second, gradient))
-            rate, waited, reached = rate[kept], waited[kept], reached[kept]
-        first.lerp_(gradient, 1 - BETAS[0])
-        second.lerp_(gradient.square(), 1 - BETAS[1])
-        direction = first / (1 - BETAS[0] ** step) / ((second / (1 - BETAS[1] ** step)).sqrt() + EPS)
-        phase = phase - rate[:, None, None, None] * direction
-    return Learnt(best_phase, before, best, steps)
 
 
 # ---------------------------------------------------------------------- captures
@@ -173,12 +82,6 @@ def capture_error(psfs: Tensor, *, scaled: bool = False) -> float:
     return float(error[..., half:-half, half:-half].square().mean().sqrt())
 
 
-def psfs_of(phase: Tensor, aperture: Tensor | None = None) -> Tensor:
-    """Return the PSFs of one sequence, (21, 23, 23), by the library."""
-    aperture = circular_aperture(PAPER_SIZE) if aperture is None else aperture
-    return paper_psfs(phase, torch.full((len(phase),), 1 / len(phase)), aperture, PSI, WAVELENGTH)
-
-
 @lru_cache(maxsize=2)
 def without_masks(*, scaled: bool) -> tuple[float, float, float]:
     """Return the error of the lens without masks, of the best stopped-down one, and the diameter of that."""
@@ -203,7 +106,9 @@ def trials(scale: str) -> list[Trial]:
 def measure(group: Sequence[Trial], scale: str) -> list[Mapping[str, float | str]]:
     """Optimise the starts of one length together, and return the scores of each."""
     torch.manual_seed(0)
-    learnt = learn(first_phase(int(group[0]["length"]), [int(trial["seed"]) for trial in group]), STEPS[scale])
+    learnt = learn(
+        first_phase(int(group[0]["length"]), [int(trial["seed"]) for trial in group]), STEPS[scale], impulse()
+    )
     rows = []
     for start in range(len(group)):
         row = {
@@ -268,9 +173,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 def settings(scale: str) -> str:
     """Return what the results depend on."""
     return (
-        f"Adam, steps of {STEP:g} m, halved after {PATIENCE} steps with less than {LEAST_GAIN:g} of gain, at most "
-        f"{STEPS[scale]} steps; 530 nm, 21 depths from -20 to 20 rad, the paper's discretisation, {TOGETHER[scale]} "
-        f"starts in a batch."
+        f"{RULE}; 21 depths from -20 to 20 rad; at most {STEPS[scale]} steps, {TOGETHER[scale]} starts in a batch, "
+        f"{SCENES} painted scenes of {SIDE} pixels."
     )
 
 
