@@ -39,7 +39,7 @@ NODES = (-8.0, 0.0, 8.0)
 
 
 class Operation(NamedTuple):
-    """An operation on one tensor, and what is true of it."""
+    """Operation on one tensor, with the argument it takes and the properties it has."""
 
     make: Callable[[Tensor], Call]
     shape: tuple[int, ...] = IMAGE

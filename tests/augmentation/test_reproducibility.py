@@ -146,6 +146,16 @@ class TestReproducibility(BaseTester):
         assert not torch.equal(own[:1].expand_as(own), own)
 
 
+class TestProbability(BaseTester):
+    @pytest.mark.parametrize("name", AUGMENTATIONS)
+    @pytest.mark.parametrize("p", [2.0, -0.1, float("nan")])
+    def test_exception(self, name, p):
+        with pytest.raises(ValueError, match=rf"p must be a probability from 0 to 1, got {p}$"):
+            AUGMENTATIONS[name](p=p)
+        with pytest.raises(TypeError, match="p must be a number"):
+            AUGMENTATIONS[name](p="often")
+
+
 class Augmented(Dataset):
     """Scenes, each changed by every augmentation inside the data set."""
 
