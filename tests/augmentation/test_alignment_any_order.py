@@ -1,6 +1,6 @@
 """All orders of geometry, optics and photometry in three libraries: aligned image and depth, or an error.
 
-Every order of two warps, and random chains of up to three, with interpolating warps too (affine, rotation, resize), which
+Every order of two warps, and random chains of up to three, interpolating ones (affine, rotation, resize) too, which
 tests/augmentation/test_alignment.py leaves out.
 """
 
