@@ -36,8 +36,7 @@ def middlebury(root: str | os.PathLike[str], transform: Transform | None = None)
     Source: Scharstein et al., High-Resolution Stereo Datasets with Subpixel-Accurate Ground Truth (GCPR 2014).
     """
     layouts = [("*/im0.png", "*/disp0.pfm"), ("*/im0.png", "*/disp0GT.pfm")]
-    options = {"kind": "disparity", "calibration": "*/calib.txt"}
-    return _folder("Middlebury", root, layouts, transform, **options)
+    return _folder("Middlebury", root, layouts, transform, kind="disparity", calibration="*/calib.txt")
 
 
 def seven_scenes(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
