@@ -59,7 +59,7 @@ class Operation(NamedTuple):
     least: int = 0
     """Items that there must be."""
     slow_to_compile: bool = False
-    """Whether compiling it takes seconds: kornia's containers, and loops over states."""
+    """Whether compiling it takes seconds (kornia's containers, loops over states) or is tested in its own file too."""
     wide: bool = False
     """Whether float32 comes out for half precision: weights and sums, not images."""
 
@@ -171,13 +171,13 @@ def plain(function: Call) -> Callable[[Tensor], Call]:
 
 
 LEVELS = "levels are steps: tests/modulator/test_phase_panel.py tests the gradient that is passed through"
-BINARY = "the image is the argument, and what is drawn has steps: the function of the same name is checked"
+SHOT = "shot noise of less than 25 electrons has steps: sensor_noise is checked above"
 RADIANS = "whole radians are radians"
 PHASES = "phases of a module of this package, never of a file"
 FLIP = K.RandomHorizontalFlip(p=1.0)
 
 OPERATIONS = {
-    "TiDyOptics": Operation(with_depth(lambda: camera(sensor=None))),
+    "TiDyOptics": Operation(with_depth(lambda: camera(sensor=None)), slow_to_compile=True),
     "burst": Operation(with_depth(lambda: partial(burst, camera(sensor=None))), out=(5, *IMAGE), slow_to_compile=True),
     "moving_capture": Operation(of_moments, shape=(5, *IMAGE), out=IMAGE, slow_to_compile=True),
     "thin_lens_defocus": Operation(
@@ -207,7 +207,7 @@ OPERATIONS = {
         allows=RADIANS,
         wide=True,
     ),
-    "Wiener": Operation(restored(reconstruction.Wiener)),
+    "Wiener": Operation(restored(reconstruction.Wiener), slow_to_compile=True),
     "Tikhonov": Operation(restored(reconstruction.Tikhonov)),
     "TikhonovLayers": Operation(restored(reconstruction.TikhonovLayers), out=(3, *IMAGE)),
     "GreyLevels": Operation(plain(modulator.GreyLevels(4)), PHASE, (0.0, 7.0), stepped=LEVELS, allows=PHASES),
@@ -224,13 +224,19 @@ OPERATIONS = {
         with_depth(lambda: ours.OpticsPipeline(FLIP, camera(sensor=None)), 0),
         slow_to_compile=True,
     ),
-    "RandomDepthBlur": Operation(drawn(lambda: ours.RandomDepthBlur(p=0.7, **LENS), True), error="Expected input of"),
+    "RandomDepthBlur": Operation(
+        drawn(lambda: ours.RandomDepthBlur(p=0.7, **LENS), True), error="Expected input of", slow_to_compile=True
+    ),
     "RandomSensorNoise": Operation(
-        drawn(lambda: ours.RandomSensorNoise(p=0.7, bits=None)), error="Expected input of", stepped=BINARY
+        drawn(lambda: ours.RandomSensorNoise(p=0.7, bits=None)),
+        error="Expected input of",
+        stepped=SHOT,
+        slow_to_compile=True,
     ),
     "RandomTiDyOptics": Operation(
         drawn(lambda: ours.RandomTiDyOptics(camera(sensor=None), exposure=(0.5, 1.0), p=0.7), True),
         error="Expected input of",
+        slow_to_compile=True,
     ),
     "SceneGeometry": Operation(with_depth(lambda: ours.SceneGeometry(FLIP), 0), slow_to_compile=True),
     "bound_depth": Operation(bound_sequence, error="Expected input of", slow_to_compile=True),
