@@ -11,6 +11,7 @@ import kornia.augmentation as K
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.augmentation.ranges import check_probability
 from kornia_tidy.augmentation.rows import changed_rows
 from kornia_tidy.checks import check_float_tensor
 
@@ -117,12 +118,17 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         p: probability of each image to be changed.
         keepdim: return (C, H, W) for (C, H, W).
 
+    Raises:
+        TypeError: if ``p`` is no number.
+        ValueError: if ``p`` is not from 0 to 1.
+
     Shape:
         - ``augmentation(image, depth)``: (B, C, H, W) and (B, 1, H, W) or (1, 1, H, W), or both without B.
         - ``augmentation(image)`` inside a container: behind ``augmentation.depth_tap``, or with :func:`bound_depth`.
     """
 
     def __init__(self, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False) -> None:
+        check_probability(p)
         super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
         self.depth_tap = DepthTap()
         self.bound: Tensor | None = None  # while a call or bound_depth lasts

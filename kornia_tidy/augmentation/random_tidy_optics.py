@@ -45,8 +45,8 @@ class RandomTiDyOptics(DepthAugmentation):
 
     Raises:
         TypeError: if the camera lacks the part that a range is for.
-        ValueError: if a range is empty or out of what the camera allows, or the camera's border is ``"valid"``, which
-            gives smaller images; on use, as :class:`~kornia_tidy.TiDyOptics`.
+        ValueError: if a range is empty or out of what the camera allows, ``p`` is not from 0 to 1, or the camera's
+            border is ``"valid"``, which gives smaller images; on use, as :class:`~kornia_tidy.TiDyOptics`.
 
     Convention:
         - Each value is uniform in its range. None leaves that of the camera.

@@ -1,9 +1,11 @@
-"""Ranges of values that augmentations draw from."""
+"""Ranges of values that augmentations draw from, and the probability with which they change an image."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+
+from kornia_tidy.checks import check_number
 
 Range = Sequence[float] | None
 """Lowest and highest value, or None to leave a setting as it is."""
@@ -35,3 +37,15 @@ def checked_range(name: str, ends: object, unit: str = "", zero: bool = False) -
             f"{', ' + unit if unit else ''}, got {(low, high)}"
         )
     return low, high
+
+
+def check_probability(p: float) -> None:
+    """Raise unless a number is a probability.
+
+    Raises:
+        TypeError: if it is no number.
+        ValueError: if it is not from 0 to 1.
+    """
+    check_number("p", p)
+    if not 0 <= p <= 1:
+        raise ValueError(f"p must be a probability from 0 to 1, got {p}")

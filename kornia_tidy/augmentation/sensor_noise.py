@@ -11,7 +11,7 @@ from kornia.augmentation.random_generator import PlainUniformGenerator
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
-from kornia_tidy.augmentation.ranges import Range, checked_range
+from kornia_tidy.augmentation.ranges import Range, check_probability, checked_range
 from kornia_tidy.augmentation.rows import changed_rows, row_seeds
 from kornia_tidy.camera.color import any_channels
 from kornia_tidy.checks import check_choice, check_float_tensor
@@ -117,7 +117,7 @@ class RandomSensorNoise(K.IntensityAugmentationBase2D):
 
     Raises:
         TypeError: if a range is not two numbers.
-        ValueError: if a range is empty or negative, or the dark signal reaches the full well.
+        ValueError: if a range is empty or negative, the dark signal reaches the full well, or ``p`` is not from 0 to 1.
 
     Convention:
         - Values are uniform in their ranges. ``_params`` holds them and a seed for each image, from which its noise
@@ -145,6 +145,7 @@ class RandomSensorNoise(K.IntensityAugmentationBase2D):
         p: float = 0.5,
         keepdim: bool = False,
     ) -> None:
+        check_probability(p)
         super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim)
         check_choice("color_space", color_space, COLOR_SPACES)
         wells = checked_range("full_well", full_well, "electrons")

@@ -100,7 +100,7 @@ def read_depth(
         known &= stored != value
     metres = stored.astype(np.float64) * scale
     if kind == "distance" and focal_px is not None:
-        metres *= _cosine(metres.shape, focal_px)
+        metres *= ray_cosine(metres.shape, focal_px)
     elif focal_px is not None and baseline_m is not None:
         metres = _disparity_to_depth(metres + doffs_px, focal_px * baseline_m)
     with np.errstate(over="ignore"):
@@ -232,8 +232,17 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
     write_bytes(path, with_text(encoded, {"depth_scale": f"{scale:g}", "Description": text}))
 
 
-def _cosine(shape: tuple[int, ...], focal_px: float) -> NDArray[np.float64]:
-    """Return the cosine of the angle between each pixel's ray and the optical axis, through the middle of the map."""
+def ray_cosine(shape: tuple[int, ...], focal_px: float) -> NDArray[np.float64]:
+    """Return the cosine of the angle between each pixel's ray and the optical axis, through the middle of the map.
+
+    Args:
+        shape: rows and columns.
+        focal_px: focal length in pixels.
+
+    Example:
+        >>> ray_cosine((1, 3), 1.0).round(3)
+        array([[0.707, 1.   , 0.707]])
+    """
     y, x = (np.arange(length) - (length - 1) / 2 for length in shape)
     return focal_px / np.sqrt(focal_px**2 + x**2 + y[:, None] ** 2)
 

@@ -7,10 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from kornia_tidy.data.depth_files import ray_cosine
+from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.rgbd_folder import RGBDFolder
 from kornia_tidy.data.scene_dataset import Transform
 
-HYPERSIM_FOCAL_PX = 886.81  # of all its images, 1024 x 768
+HYPERSIM_FOCAL_PX, HYPERSIM_SIZE = 886.81, (768, 1024)  # of all its images as published
 
 
 def middlebury(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
@@ -32,8 +36,7 @@ def middlebury(root: str | os.PathLike[str], transform: Transform | None = None)
     Source: Scharstein et al., High-Resolution Stereo Datasets with Subpixel-Accurate Ground Truth (GCPR 2014).
     """
     layouts = [("*/im0.png", "*/disp0.pfm"), ("*/im0.png", "*/disp0GT.pfm")]
-    options = {"kind": "disparity", "calibration": "*/calib.txt"}
-    return _folder("Middlebury", root, layouts, transform, **options)
+    return _folder("Middlebury", root, layouts, transform, kind="disparity", calibration="*/calib.txt")
 
 
 def seven_scenes(root: str | os.PathLike[str], transform: Transform | None = None) -> RGBDFolder:
@@ -69,7 +72,8 @@ def scannet(root: str | os.PathLike[str], transform: Transform | None = None) ->
         ValueError: if an image has no depth, or depth no image.
 
     Convention:
-        Images, 1296 x 968, are averaged to the size of the depth, 640 x 480.
+        Images, 1296 x 968, are averaged to the size of the depth, 640 x 480. Frames are in the order of their names as
+        text: 10 comes before 2.
 
     Source: Dai et al., ScanNet (CVPR 2017).
     """
@@ -111,17 +115,32 @@ def hypersim(root: str | os.PathLike[str], transform: Transform | None = None) -
 
     Raises:
         FileNotFoundError: if there is no folder, or nothing in it has this layout.
-        ValueError: if an image has no depth, or depth no image.
+        ValueError: if an image has no depth, or depth no image; on reading, if the sides of a frame are not 4 : 3.
 
     Convention:
-        NaN, such as a window, is unknown. A focal length of 886.81 px is taken for every camera; some scenes have
-        tilted lenses, for which it is an approximation.
+        NaN, such as a window, is unknown. The focal length is 886.81 px at the published width of 1024 px, and in
+        proportion in frames that were resized. Cropped frames are refused: where their optical axis is cannot be known.
+        Some scenes have tilted lenses, for which this is an approximation.
 
     Source: Roberts et al., Hypersim (ICCV 2021).
     """
     folder = "*/images/scene_*"
     layouts = [(f"{folder}_final_preview/frame.*.tonemap.jpg", f"{folder}_geometry_hdf5/frame.*.depth_meters.hdf5")]
-    return _folder("Hypersim", root, layouts, transform, kind="distance", focal_px=HYPERSIM_FOCAL_PX)
+    return _folder("Hypersim", root, layouts, transform, made=_Hypersim)
+
+
+class _Hypersim(RGBDFolder):
+    """Frames whose stored distance along the ray is converted to depth."""
+
+    def read(self, index: int) -> Scene:
+        """Read a pair."""
+        scene = super().read(index)
+        rows, columns = scene.depth.shape[1:]
+        scale = columns / HYPERSIM_SIZE[1]
+        if abs(rows - scale * HYPERSIM_SIZE[0]) > 1:
+            raise ValueError(f"a frame of Hypersim must have sides of 4 : 3, got {rows} rows x {columns} columns")
+        cosine = torch.from_numpy(ray_cosine((rows, columns), HYPERSIM_FOCAL_PX * scale))
+        return scene._replace(depth=(scene.depth * cosine).float())
 
 
 def _folder(
@@ -129,6 +148,7 @@ def _folder(
     root: str | os.PathLike[str],
     layouts: Sequence[tuple[str, str]],
     transform: Transform | None,
+    made: type[RGBDFolder] = RGBDFolder,
     **options: Any,
 ) -> RGBDFolder:
     """Return the pairs of the first layout that files in the folder have."""
@@ -137,6 +157,6 @@ def _folder(
         raise FileNotFoundError(f"there is no folder {root}")
     for image, depth in layouts:
         if any(root.glob(image)) and any(root.glob(depth)):
-            return RGBDFolder(root, image, depth, transform=transform, **options)
+            return made(root, image, depth, transform=transform, **options)
     wanted = " or ".join(f"{image} with {depth}" for image, depth in layouts)
     raise FileNotFoundError(f"{name} is not in {root}: there should be {wanted}")

@@ -78,7 +78,8 @@ def _listed(path: Path) -> list[tuple[str, str, str]]:
     """Return listed pairs: TUM's tool writes the image first, ICL-NUIM the depth."""
     depth_first = PurePosixPath(_lines(path, 4)[0][1]).parts[0].startswith("depth")
     rows = [line[2:4] + line[:2] if depth_first else line[:4] for line in _lines(path, 4)]
-    return [(time, image, depth) for time, image, _, depth in rows]
+    pairs = [(time, image, depth) for time, image, _, depth in rows]
+    return sorted(pairs, key=lambda pair: float(pair[0]))
 
 
 def _associated(root: Path, max_difference: float) -> list[tuple[str, str, str]]:

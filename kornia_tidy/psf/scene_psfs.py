@@ -385,8 +385,8 @@ class ScenePSFs:
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them where it cannot be looked at."""
-    if is_value_unknown():
+    """Return the nodes that a defocus map lies between; all of them where it is empty or cannot be looked at."""
+    if is_value_unknown() or not defocus.numel():
         return nodes
     lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
     # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.

@@ -294,6 +294,8 @@ def _spectra(
 def _spectrum(image: Tensor, size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     """Return the half spectrum of an image on a periodic plane, in float32 or the precision of image or ``dtype``."""
     precise = torch.promote_types(torch.promote_types(image.dtype, dtype), torch.float32)
+    if not len(image):  # torch transforms no empty batch
+        return image.new_zeros(*image.shape[:-2], size[0], size[1] // 2 + 1, dtype=precise.to_complex())
     return torch.fft.rfft2(periodic_extension(image.to(precise), size))
 
 
@@ -303,5 +305,7 @@ def _power(transfer: Tensor) -> Tensor:
 
 def _image(spectrum: Tensor, size: tuple[int, int], capture: Tensor) -> Tensor:
     """Return the image on a plane, cropped to the capture."""
+    if not len(capture):
+        return capture.new_empty(*spectrum.shape[:-2], *capture.shape[-2:])
     plane = torch.fft.irfft2(spectrum, s=size)
     return plane[..., : capture.shape[-2], : capture.shape[-1]].to(capture.dtype)

@@ -70,6 +70,8 @@ def wiener(
         tensor([False,  True, False, False])
     """
     size = _plane(capture, psfs, noise, border)
+    if not len(capture):
+        return capture.clone()
     precise = torch.promote_types(torch.promote_types(capture.dtype, psfs.dtype), torch.float32)
     captured = torch.fft.rfft2(periodic_extension(capture.to(precise), size))
     moments = transfer_moments(psfs.to(precise), size, depth_weights, veil)

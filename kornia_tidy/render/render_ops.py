@@ -86,6 +86,8 @@ def render_layers(
 
 def _render(*arguments: Any) -> Tensor:
     image, method = arguments[0], arguments[-1]
+    if not len(image):
+        return _render_fake(*arguments)
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
         scene = remembered_scene(SceneArguments._make(arguments[:-1]))
         return render_unrecorded(choose(scene, method), scene).contiguous()
@@ -99,6 +101,8 @@ def _render_fake(*arguments: Any) -> Tensor:
 
 def _gradients(*arguments: Any) -> list[Tensor]:
     tensors, options, (method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:-3], arguments[-3:]
+    if not len(gradient):
+        return [torch.zeros_like(x) for x, want in zip(tensors, wanted, strict=True) if want and x is not None]
     own = leaves_of(tensors, wanted)
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):

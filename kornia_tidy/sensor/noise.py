@@ -25,6 +25,7 @@ def quantize(image: Tensor, bits: int) -> Tensor:
         steps and not clipped.
 
     Raises:
+        TypeError: if ``image`` is not a floating-point tensor.
         ValueError: if ``bits`` is not a whole number from 1 to 16.
 
     Convention:
@@ -34,6 +35,7 @@ def quantize(image: Tensor, bits: int) -> Tensor:
         >>> quantize(torch.tensor([0.0, 0.2, 0.6, 1.0, 1.2]), bits=2) * 3
         tensor([0., 1., 2., 3., 4.])
     """
+    check_float_tensor("image", image, image.ndim, "")
     _check_bits(bits)
     value = image.to(torch.promote_types(image.dtype, torch.float32))
     top = 2**bits - 1

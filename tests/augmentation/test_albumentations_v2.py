@@ -33,6 +33,24 @@ def captured(optics: torch.nn.Module, image: np.ndarray, depth: np.ndarray) -> n
 
 
 class TestOpticsTransform(BaseTester):
+    @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+    def test_smoke(self, kind):
+        given = arrays()
+        top = 1 if kind is np.float32 else np.iinfo(kind).max
+        out = A.Compose([OpticsTransform(camera())], **DEPTH)(
+            image=(given["image"] * top).astype(kind), depth=given["depth"]
+        )
+        assert out["image"].dtype == kind
+        assert np.isfinite(out["image"]).all()
+
+    @pytest.mark.parametrize("shape", [(40, 48), (40, 48, 1), (40, 48, 3)])
+    @pytest.mark.parametrize("axis", [False, True])
+    def test_cardinality(self, shape, axis):
+        image, depth = np.random.default_rng(0).random(shape, np.float32), np.ones((40, 48, 1)[: 2 + axis], np.float32)
+        out = A.Compose([A.HorizontalFlip(p=1.0), OpticsTransform(camera())], **DEPTH)(image=image, depth=depth)
+        assert out["image"].shape == image.shape
+        assert out["depth"].shape[:2] == (40, 48)
+
     def test_feature_flip_optics_crop_equals_the_manual_chain(self):
         optics, given = camera(sensor=None), arrays()
         chain = A.Compose([A.HorizontalFlip(p=1.0), OpticsTransform(optics), A.CenterCrop(20, 24)], **DEPTH)

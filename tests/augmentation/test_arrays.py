@@ -36,6 +36,17 @@ def head():
 
 class TestSimulate(BaseTester):
     @pytest.mark.parametrize("kind", MOST)
+    def test_smoke(self, kind, optics):
+        """Every type of depth that files and cameras give, for every type of image."""
+        image = picture(kind, 24, 32, 3)
+        depths = {"uint16": 0.001, "int32": 0.001, "float16": None, "float32": None, "float64": None}
+        for name, scale in depths.items():
+            depth = np.full((24, 32), 700 if scale else 0.7, name)
+            found = kornia_tidy.simulate(image, depth, scale, optics=optics)
+            assert (found.shape, found.dtype) == (image.shape, image.dtype)
+            assert np.isfinite(found).all()
+
+    @pytest.mark.parametrize("kind", MOST)
     @pytest.mark.parametrize("color", ["bgr", "rgb"])
     def test_feature_the_capture_of_the_same_tensors(self, kind, color, optics):
         """Within the rounding to the data type and of the division to [0, 1]."""

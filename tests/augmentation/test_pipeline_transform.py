@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from kornia_tidy.augmentation import OpticsPipeline, RandomTiDyOptics
 from tests.base import BaseTester
-from tests.camera.pipeline_samples import Scenes, camera
+from tests.camera.pipeline_samples import Scenes, camera, scene
 
 LOADERS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]  # it imports all again
 
@@ -68,6 +68,23 @@ class TestPipelineTransform(BaseTester):
         data[0]
         assert not torch.equal(data[0]["seeded"]["image"], data[1]["seeded"]["image"])
         assert torch.equal(torch.get_rng_state(), before)
+
+    @pytest.mark.parametrize("seed", [None, 3])
+    def test_cardinality(self, seed):
+        """Single samples, also such as have a batch axis of one, keep their rank and get the size of the crop."""
+        transform, (image, depth) = pipeline().as_transform(seed=seed), scene(1, height=64, width=64)
+        for lead, sample in (((), (image[0], depth[0])), ((1,), (image, depth))):
+            out = transform({"image": sample[0], "depth": sample[1], "index": 2})
+            assert out["image"].shape == out["all_in_focus"].shape == (*lead, 3, 40, 48)
+            assert out["depth"].shape == (*lead, 1, 40, 48)
+
+    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+    def test_smoke(self, kind):
+        image, depth = (x[0] for x in scene(1, height=64, width=64))
+        out = pipeline().as_transform(seed=1)({"image": image.to(kind), "depth": depth, "index": 0})
+        assert out["image"].dtype == kind
+        assert out["depth"].dtype == torch.float32
+        assert out["image"].isfinite().all()
 
     def test_exception_a_seed_without_the_key(self):
         with pytest.raises(KeyError, match=r"tells items apart by sample\['index'\]"):

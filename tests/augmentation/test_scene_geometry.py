@@ -12,6 +12,14 @@ from tests.camera.pipeline_samples import camera, scene
 
 
 class TestSceneGeometry(BaseTester):
+    def test_smoke(self, dtype):
+        image, depth = (x.to(dtype) for x in scene(2))
+        out = SceneGeometry(K.RandomRotation((30.0, 30.0), p=1.0), K.RandomHorizontalFlip())(image, depth)
+        assert out.image.dtype == out.depth.dtype == dtype
+        assert out.valid.dtype == torch.bool
+        assert (out.depth > 0).all()
+        assert out.image.isfinite().all()
+
     @pytest.mark.parametrize("batched", [True, False])
     def test_cardinality(self, batched):
         image, depth = scene(2)

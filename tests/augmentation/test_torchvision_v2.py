@@ -85,6 +85,26 @@ class TestDepth(BaseTester):
 
 
 class TestOpticsTransform(BaseTester):
+    @pytest.mark.parametrize("kind", [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64])
+    def test_smoke(self, kind):
+        image = v2.functional.to_dtype(sample()["image"], kind, scale=True)
+        out = OpticsTransform(camera())({"image": image, "depth": sample()["depth"]})
+        assert out["image"].dtype == kind
+        assert out["depth"].dtype == torch.float32
+        assert plain(out["image"]).double().isfinite().all()
+
+    @pytest.mark.parametrize("channels", [1, 3])
+    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
+    def test_cardinality(self, lead, channels):
+        image, depth = torch.rand(*lead, channels, 40, 48), torch.ones(*lead, 1, 40, 48)
+        coded, kept = OpticsTransform(camera())(tv_tensors.Image(image), Depth(depth))
+        assert (coded.shape, kept.shape) == (image.shape, depth.shape)
+
+    def test_gradcheck(self):
+        image, depth = scene(1, height=12, width=12)
+        transform = OpticsTransform(camera(sensor=None, check_inputs=False))
+        self.gradcheck(lambda x: transform(x, Depth(depth.double()))[0], (image,))
+
     @pytest.mark.parametrize("batch", [None, 2])
     def test_feature_flip_optics_crop_equals_the_manual_chain(self, batch):
         optics, given = camera(sensor=None), sample(batch)

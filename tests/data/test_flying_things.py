@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy import DefocusRange
-from kornia_tidy.data import FlyingThings3D, UnreadableItemError, paper_patches
+from kornia_tidy.data import FlyingThings3D, UnreadableItemError, paper_patches, split_frames
 from tests.base import BaseTester, shared
 from tests.data.published import flying_things_disparity, write_flying_things, write_pfm
 
@@ -212,3 +212,25 @@ class TestPaperPatches(BaseTester):
     def test_exception_names_the_bad_split(self, root):
         with pytest.raises(ValueError, match="split must be one of 'train', 'val', 'test', got 'dev'"):
             paper_patches(root, "dev")
+
+
+class TestSplitFrames(BaseTester):
+    def test_feature_whole_sequences_are_held_out_and_no_frame_is_in_two_splits(self, tmp_path):
+        write_flying_things(tmp_path, {"TRAIN/A": 8, "TRAIN/B": 3, "TRAIN/C": 1, "TEST/A": 1, "TEST/B": 1, "TEST/C": 1})
+        names = {
+            split: [part.dataset.names[index] for index in part.indices]
+            for split in ("train", "val", "test")
+            for part in [split_frames(tmp_path, split)]
+        }
+        sequences = {split: {name.split("/left/")[0] for name in found} for split, found in names.items()}
+        assert sequences["val"] == {"TRAIN/B/0001"}  # the tenth of TRAIN
+        assert len(sequences["train"]) == 11
+        assert not sequences["train"] & sequences["val"]
+        assert all(name.startswith("TEST/") for name in names["test"])
+        assert sum(map(len, names.values())) == 2 * (12 + 3)
+
+    def test_exception(self, root):
+        with pytest.raises(ValueError, match="has 4 sequences of TRAIN: 10 or more are needed to validate"):
+            split_frames(root)
+        with pytest.raises(ValueError, match="split must be one of 'train', 'val', 'test', got 'validation'"):
+            split_frames(root, "validation")

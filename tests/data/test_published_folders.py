@@ -115,17 +115,27 @@ class TestKitti(BaseTester):
 
 
 class TestHypersim(BaseTester):
-    def test_feature_distance_along_the_ray_becomes_depth(self, tmp_path):
+    def frame(self, root, rows, columns):
         """A wall at 3 m in front of the camera: its distance grows towards the corners."""
-        y, x = np.indices((768, 1024))
-        distance = 3 * np.sqrt(1 + ((x - 511.5) ** 2 + (y - 383.5) ** 2) / 886.81**2)
+        y, x = np.indices((rows, columns))
+        pixels = 1024 / columns  # of the published width in one of these
+        aside = ((x - (columns - 1) / 2) ** 2 + (y - (rows - 1) / 2) ** 2) * pixels**2
+        distance = 3 * np.sqrt(1 + aside / 886.81**2)
         distance[100, 200] = np.nan
-        images = tmp_path / "ai_001_001/images"
-        write_picture(images / "scene_cam_00_final_preview/frame.0007.tonemap.jpg", picture(768, 1024))
+        images = root / "ai_001_001/images"
+        write_picture(images / "scene_cam_00_final_preview/frame.0007.tonemap.jpg", picture(rows, columns))
         (images / "scene_cam_00_geometry_hdf5").mkdir()
         with h5py.File(images / "scene_cam_00_geometry_hdf5/frame.0007.depth_meters.hdf5", "w") as file:
             file.create_dataset("dataset", data=distance.astype(np.float16))
-        (sample,) = hypersim(tmp_path)
-        self.assert_close(sample["depth"], torch.full((1, 768, 1024), 3.0), rtol=1e-3, atol=0)  # float16
+        return root
+
+    @pytest.mark.parametrize("size", [(768, 1024), (384, 512), (240, 320)])
+    def test_feature_distance_along_the_ray_becomes_depth_at_any_size(self, size, tmp_path):
+        (sample,) = hypersim(self.frame(tmp_path, *size))
+        self.assert_close(sample["depth"], torch.full((1, *size), 3.0), rtol=2e-3, atol=0)  # float16, and the hole
         assert (~sample["mask"]).nonzero().tolist() == [[0, 100, 200]]
         assert sample["name"] == "ai_001_001/cam_00/0007"
+
+    def test_exception_a_crop(self, tmp_path):
+        with pytest.raises(ValueError, match="must have sides of 4 : 3, got 512 rows x 512 columns"):
+            hypersim(self.frame(tmp_path, 512, 512))[0]

@@ -51,10 +51,18 @@ class TestTUMSequence(BaseTester):
         write(tmp_path)
         pairs = [("10.066 rgb/10.066.png", "10.090 depth/10.090.png"), ("11.5 rgb/11.5.png", "12.5 depth/12.5.png")]
         lines = [" ".join(reversed(pair) if depth_first else pair) for pair in pairs]
-        (tmp_path / name).write_text("\n".join(lines))
-        data = TUMSequence(tmp_path)
-        assert [sample["name"] for sample in data] == ["10.066", "11.5"]
+        for order in (1, -1):  # sorted by the image's time, whatever the order in the file
+            (tmp_path / name).write_text("\n".join(lines[::order]))
+            data = TUMSequence(tmp_path)
+            assert [sample["name"] for sample in data] == ["10.066", "11.5"]
         self.assert_close(data[1]["depth"].max(), torch.tensor(1.8))
+
+    def test_feature_numbers_of_frames_are_times_too(self, tmp_path):
+        """As ICL-NUIM lists them, whose first ten frames would be 1, 10, 2 as text."""
+        write(tmp_path, images=("2", "10"), depths=("2", "10"))
+        lines = [f"{frame} depth/{frame}.png {frame} rgb/{frame}.png" for frame in ("10", "2")]
+        (tmp_path / "associations.txt").write_text("\n".join(lines))
+        assert [sample["name"] for sample in TUMSequence(tmp_path)] == ["2", "10"]
 
     @pytest.mark.parametrize(
         ("text", "sentence"),

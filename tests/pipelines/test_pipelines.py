@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import io
 import re
@@ -22,6 +23,7 @@ from tests.augmentation.optional import need, need_torchvision
 SCRIPTS = Path(__file__).parent / "scripts"
 NAMES = sorted(path.stem for path in SCRIPTS.glob("*.py") if path.stem != "scenes_of_user")
 LIBRARIES = ("torchvision", "albumentations", "lightning", "datasets", "monai", "deepinv", "webdataset")
+FLAT = "torchvision_classification_reference"  # has no depth
 TRAINED = {"kornia_augmentation_in_training_step", "lightning_module", "pytorch_training_loop"}
 
 pytestmark = [
@@ -45,11 +47,18 @@ def changes(text: str) -> tuple[int, int]:
     return len(lines) + len(re.findall(r"^ *# was: ", text, flags=re.MULTILINE)), imports
 
 
-def write_scenes(root: Path) -> None:
+FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "rows and columns of the depth swapped": lambda depth: np.ascontiguousarray(depth.T),
+    "all depth unknown": np.zeros_like,
+}
+
+
+def write_scenes(root: Path, fault: str | None = None) -> None:
     """Three scenes of noise over a ramp of depth, 0.4 to 2 m, as files and as a shard."""
     for kind in ("rgb", "depth"):
         (root / "scenes" / kind).mkdir(parents=True)
     ramp = np.linspace(400, 2000, 80)[None].repeat(64, 0).round().astype(np.uint16)
+    ramp = ramp if fault is None else FAULTS[fault](ramp)
     noise = np.random.default_rng(0)
     with tarfile.open(root / "scenes.tar", "w") as shard:
         for index in range(3):
@@ -95,23 +104,8 @@ def plain(value: Any) -> np.ndarray:
     return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_feature_runs_with_two_lines_changed(name, tmp_path, monkeypatch):
-    text = (SCRIPTS / f"{name}.py").read_text()
-    for library in LIBRARIES:
-        if re.search(rf"^(import|from) {library}\b", text, flags=re.MULTILINE):
-            need(library, module=False)
-    if re.search(r"torchvision|deepinv|lightning", text):
-        need_torchvision(module=False)
-    write_scenes(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    importlib.import_module("scenes_of_user")
-    monkeypatch.setattr(TiDyOptics, "__init__", draws_kept(TiDyOptics.__init__))
-    try:
-        before, after = run(original(text), f"{name} before"), run(text, f"{name} after")
-    finally:
-        sys.modules.pop("scenes_of_user", None)
+def compare(before: dict[str, Any], after: dict[str, Any], name: str) -> None:
+    """Assert that the camera took the picture, and left form, type and depth as they were."""
     if "image" in before:
         assert form(after["image"]) == form(before["image"])
         assert not np.array_equal(plain(after["image"]), plain(before["image"]))
@@ -125,6 +119,62 @@ def test_feature_runs_with_two_lines_changed(name, tmp_path, monkeypatch):
         assert gradient is not None
         assert gradient.isfinite().all()
         assert gradient.abs().sum() > 0
+
+
+@pytest.fixture
+def script(request, tmp_path, monkeypatch):
+    """A script whose libraries are installed, in a folder of its own, where its scenes can be written."""
+    text = (SCRIPTS / f"{request.param}.py").read_text()
+    for library in LIBRARIES:
+        if re.search(rf"^(import|from) {library}\b", text, flags=re.MULTILINE):
+            need(library, module=False)
+    if re.search(r"torchvision|deepinv|lightning", text):
+        need_torchvision(module=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    importlib.import_module("scenes_of_user")
+    monkeypatch.setattr(TiDyOptics, "__init__", draws_kept(TiDyOptics.__init__))
+    yield request.param, text
+    sys.modules.pop("scenes_of_user", None)
+    gc.collect()  # closes what a script that ended in an error left open, while its warnings are ignored
+
+
+@pytest.mark.parametrize("script", NAMES, indirect=True)
+def test_feature_runs_with_two_lines_changed(script, tmp_path):
+    name, text = script
+    write_scenes(tmp_path)
+    before = run(original(text), f"{name} before")
+    after = run(text, f"{name} after")
+    compare(before, after, name)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("script", sorted({*NAMES} - {FLAT}), indirect=True)
+def test_exception_a_depth_that_cannot_be_right_is_told(script, fault, tmp_path):
+    name, text = script
+    write_scenes(tmp_path, fault)
+    told = (
+        "depth|Height and Width of image, mask or masks|multiple HxW dimensions"  # by us, albumentations, torchvision
+    )
+    with pytest.raises((ValueError, RuntimeError), match=told):
+        run(text, name)
+
+
+@pytest.mark.parametrize("fault", ["no picture taken", "another form", "depth moved", "depth in another type", "NaN"])
+def test_exception_the_comparison_sees_a_fault(fault):
+    """Otherwise the tests above would say nothing."""
+    image, depth = torch.rand(1, 3, 8, 9), torch.rand(1, 1, 8, 9) + 1
+    before, after = {"image": image, "depth": depth}, {"image": 1 - image, "depth": depth}
+    compare(before, after, "")
+    changes_of = {
+        "no picture taken": {"image": image},
+        "another form": {"image": 1 - image[0]},
+        "depth moved": {"depth": depth.flip(-1)},
+        "depth in another type": {"depth": depth.double()},
+        "NaN": {"image": image * torch.nan},
+    }
+    with pytest.raises(AssertionError):
+        compare(before, after | changes_of[fault], "")
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,0 +1,199 @@
+"""One seed, one result: the augmentations alone, in kornia's containers and in the workers of a data loader.
+
+The checks are those of kornia's own augmentations: the seed, the draw handed back as ``params``, ``same_on_batch``.
+"""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import kornia.augmentation as K
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from kornia_tidy.augmentation import RandomDepthBlur, RandomSensorNoise, RandomTiDyOptics, bound_depth
+from tests.base import BaseTester
+from tests.camera.pipeline_samples import camera, scene
+
+LENS: dict[str, Any] = {"focal_length": 10e-3, "pixel_pitch": 4e-6}
+RANGES: dict[str, Any] = {
+    "exposure": (0.5, 1.0),
+    "focus_distance": (0.5, 0.8),
+    "mask_jitter": (0.1, 0.3),
+    "noise_level": (0.01, 0.1),
+}
+AUGMENTATIONS: dict[str, Callable[..., Any]] = {
+    "RandomTiDyOptics": lambda **options: RandomTiDyOptics(camera(), **RANGES, **options),
+    "RandomDepthBlur": lambda **options: RandomDepthBlur(f_number=(1.0, 4.0), **LENS, **options),
+    "RandomSensorNoise": lambda **options: RandomSensorNoise((1e2, 1e3), dark=(1.0, 5.0), **options),
+}
+BATCH = 4
+# Python 3.12 and later: every process that uses torch has threads, and fork says so.
+pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+
+
+def needs_depth(augmentation: nn.Module) -> bool:
+    return hasattr(augmentation, "depth_tap")
+
+
+class Alone:
+    """The augmentation itself."""
+
+    def __init__(self, augmentation: Any) -> None:
+        self.module, self.depth = augmentation, needs_depth(augmentation)
+
+    def __call__(self, image: Tensor, depth: Tensor, params: Any = None) -> Tensor:
+        return self.module(image, *([depth] if self.depth else []), params=params)
+
+
+class InAugmentationSequential(Alone):
+    """Between a flip and a crop, behind its tap."""
+
+    def __init__(self, augmentation: Any) -> None:
+        super().__init__(augmentation)
+        parts = [augmentation.depth_tap] if self.depth else []
+        self.module = K.AugmentationSequential(
+            K.RandomHorizontalFlip(),
+            *parts,
+            augmentation,
+            K.RandomCrop((32, 36)),
+            data_keys=["input", "mask"],
+            same_on_batch=augmentation.same_on_batch,
+        )
+
+    def __call__(self, image: Tensor, depth: Tensor, params: Any = None) -> Tensor:
+        return torch.cat(self.module(image, depth, params=params), 1)
+
+
+class InImageSequential(Alone):
+    """Before a change of colours, with the depth bound."""
+
+    def __init__(self, augmentation: Any) -> None:
+        super().__init__(augmentation)
+        self.module = K.ImageSequential(augmentation, K.ColorJiggle(0.2, 0.2), same_on_batch=augmentation.same_on_batch)
+
+    def __call__(self, image: Tensor, depth: Tensor, params: Any = None) -> Tensor:
+        if not self.depth:
+            return self.module(image, params=params)
+        with bound_depth(self.module, depth):
+            return self.module(image, params=params)
+
+
+class InVideoSequential(InImageSequential):
+    """Frames of a video, each with a draw of its own."""
+
+    same_on_frame = False
+
+    def __init__(self, augmentation: Any) -> None:
+        super().__init__(augmentation)
+        self.module = K.VideoSequential(augmentation, data_format="BTCHW", same_on_frame=self.same_on_frame)
+
+    def __call__(self, image: Tensor, depth: Tensor, params: Any = None) -> Tensor:
+        return super().__call__(image.unflatten(0, (-1, 2)), depth.unflatten(0, (-1, 2)), params).flatten(0, 1)
+
+
+class InVideoSequentialSame(InVideoSequential):
+    """Frames of a video, all of one draw."""
+
+    same_on_frame = True
+
+
+WAYS = [Alone, InAugmentationSequential, InImageSequential, InVideoSequential, InVideoSequentialSame]
+
+
+def seeded(way: Alone, seed: int, *given: Any) -> Tensor:
+    torch.manual_seed(seed)
+    return way(*given).detach()
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+class TestReproducibility(BaseTester):
+    @pytest.mark.parametrize("p", [0.5, 1.0])
+    def test_feature_one_seed_one_result_and_another_seed_another(self, name, way, p):
+        made, given = way(AUGMENTATIONS[name](p=p)), scene(BATCH)
+        first, again, other = (seeded(made, seed, *given) for seed in (3, 3, 4))
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+
+    @pytest.mark.parametrize("p", [0.5, 1.0])
+    def test_feature_the_draw_handed_back_repeats_the_result(self, name, way, p):
+        made, given = way(AUGMENTATIONS[name](p=p)), scene(BATCH)
+        first, params = made(*given), copy.deepcopy(made.module._params)
+        made(*given)
+        assert torch.equal(made(*given, params), first)
+
+    def test_feature_a_copy_and_a_pickle_draw_the_same(self, name, way):
+        made, given = way(AUGMENTATIONS[name](p=0.7)), scene(BATCH)
+        seeded(made, 1, *given)
+        expected = seeded(made, 3, *given)
+        for other in (copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
+            assert torch.equal(seeded(other, 3, *given), expected)
+
+    def test_feature_same_on_batch(self, name, way):
+        """Four equal images: one draw makes them equal again, draws of their own do not."""
+        image, depth = (x.expand(BATCH, -1, -1, -1) for x in scene(1))
+        same, own = (
+            seeded(way(AUGMENTATIONS[name](p=1.0, same_on_batch=same)), 3, image, depth) for same in (True, False)
+        )
+        assert torch.equal(same, same[:1].expand_as(same))
+        assert not torch.equal(own[:1].expand_as(own), own)
+
+
+class TestProbability(BaseTester):
+    @pytest.mark.parametrize("name", AUGMENTATIONS)
+    @pytest.mark.parametrize("p", [2.0, -0.1, float("nan")])
+    def test_exception(self, name, p):
+        with pytest.raises(ValueError, match=rf"p must be a probability from 0 to 1, got {p}$"):
+            AUGMENTATIONS[name](p=p)
+        with pytest.raises(TypeError, match="p must be a number"):
+            AUGMENTATIONS[name](p="often")
+
+
+class Augmented(Dataset):
+    """Scenes, each changed by every augmentation inside the data set."""
+
+    def __init__(self) -> None:
+        self.augmentations = {name: make(p=0.7, keepdim=True) for name, make in AUGMENTATIONS.items()}
+
+    def __len__(self) -> int:
+        return BATCH
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        image, depth = (x[0] for x in scene(1, seed=index))
+        return {
+            name: augmentation(image, *([depth] if needs_depth(augmentation) else []))
+            for name, augmentation in self.augmentations.items()
+        }
+
+
+@lru_cache
+def loaded(workers: int, context: str | None, seed: int = 5, time: int = 0) -> dict[str, Tensor]:
+    torch.manual_seed(11)
+    data = Augmented()
+    torch.manual_seed(seed)
+    loader = DataLoader(
+        data, batch_size=2, num_workers=workers, multiprocessing_context=context, timeout=120 * bool(workers)
+    )
+    batches = list(loader)
+    return {name: torch.cat([batch[name] for batch in batches]) for name in AUGMENTATIONS}
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+class TestInWorkers(BaseTester):
+    @pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork")])
+    def test_feature_one_seed_one_result(self, name, workers, context):
+        first, again, other = (loaded(workers, context, seed, time)[name] for seed, time in ((5, 0), (5, 1), (6, 0)))
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+        assert first.requires_grad == (not workers and name == "RandomTiDyOptics")
+
+    @pytest.mark.slow
+    def test_feature_by_spawn_as_by_fork(self, name):
+        assert torch.equal(loaded(2, "spawn")[name], loaded(2, "fork")[name])
