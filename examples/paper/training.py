@@ -203,9 +203,8 @@ def real(most: int, size: int) -> list[dict[str, Any]]:
     from kornia_tidy.commands.demo import stretched  # noqa: PLC0415
     from tests.scenes import ENTRIES, load_scene  # noqa: PLC0415
 
-    names = list(ENTRIES)
     scenes = []
-    for name in names[:: max(1, -(-len(names) // most))] if most else []:
+    for name in list(ENTRIES)[:: -(-len(ENTRIES) // most)] if most and ENTRIES else []:
         image, depth, known = load_scene(name)
         sample = {"image": image.expand(3, -1, -1), "depth": stretched(depth, known, REFERENCE), "mask": known}
         height, width = (min(size, side) for side in image.shape[-2:])
@@ -325,6 +324,39 @@ class ClosedForms(nn.Module):
         return torch.einsum("bdhw,d->bhw", likelihood, places)[:, None]
 
 
+def depth_limit(optics: TiDyOptics) -> float:
+    """Return the bound on the error of a bright point's depth, as a fraction of the range.
+
+    See :func:`~kornia_tidy.mask_design.candidates.depth_bound`; depths are uniform over the range.
+    """
+    from kornia_tidy.mask_design.candidates import depth_bound  # noqa: PLC0415
+    from kornia_tidy.mask_design.design_task import DesignTask  # noqa: PLC0415
+
+    lens = cast("ThinLensCamera", optics.camera)
+    task = DesignTask(electrons=ELECTRONS, reference_f_number=F_NUMBER, depth_weight=1.0)
+    with torch.no_grad():
+        return float(depth_bound(task, optics.psf_model, lens.f_number))
+
+
+def constant_depth(budget: Budget) -> dict[str, float]:
+    """Return the depth errors of the mean normalised inverse depth of the training scenes, which sees no capture."""
+    from kornia_tidy.reconstruction.metrics import rmse  # noqa: PLC0415
+
+    seen = painted(budget, "train", budget.scenes)
+    depths = (normalised_inverse_depth(REFERENCE, seen[index]["depth"]) for index in range(budget.scenes))
+    mean = statistics.fmean(float(depth.mean()) for depth in depths)
+    found = {}
+    for where, scenes in scored_sets(budget).items():
+        errors = []
+        for index in range(len(cast("Any", scenes))):
+            truth = normalised_inverse_depth(REFERENCE, scenes[index]["depth"])[None]
+            known = scenes[index].get("mask", torch.ones_like(truth[0], dtype=torch.bool))[None]
+            errors.append(float(rmse(torch.full_like(truth, mean), truth, known)))
+        if errors:
+            found[f"{where}_rmse"] = statistics.fmean(errors)
+    return found
+
+
 SCORES = {"image_psnr": "psnr", "image_ssim": "ssim", "image_rmse": "image_rmse", "depth_rmse": "rmse"}
 
 
@@ -344,15 +376,16 @@ def mean_scores(system: TrainedSystem, scenes: Sequence[Any] | Dataset[Any]) -> 
 
 def scores_of(system: TrainedSystem, budget: Budget) -> dict[str, float]:
     """Return a system's scores on painted scenes that it was not trained on, and on real ones, as ``painted_psnr``."""
-    sets = {
-        "painted": painted(budget, "test", budget.scored),
-        "real": real(budget.real, budget.real_size) if budget.real else [],
-    }
     return {
         f"{where}_{name}": value
-        for where, scenes in sets.items()
+        for where, scenes in scored_sets(budget).items()
         for name, value in mean_scores(system, scenes).items()
     }
+
+
+def scored_sets(budget: Budget) -> dict[str, Any]:
+    """Return the painted scenes that are scored, and the real ones."""
+    return {"painted": painted(budget, "test", budget.scored), "real": real(budget.real, budget.real_size)}
 
 
 def prefixed(prefix: str, scores: dict[str, float]) -> dict[str, float]:
