@@ -15,19 +15,12 @@ from pathlib import Path
 
 import torch
 
-from examples.paper.report import bars, cells, grid, means
+from examples.paper.cameras import camera_with, flat_lens
+from examples.paper.closed_forms import depth_limit
+from examples.paper.report import bars, cells, grid, mean_and_error, means
 from examples.paper.runner import Experiment, Row, Trial, main
-from examples.paper.training import (
-    BUDGETS,
-    best_flat,
-    camera_with,
-    constant_depth,
-    depth_limit,
-    flat_lens,
-    mean_and_error,
-    prefixed,
-    trained_scores,
-)
+from examples.paper.scenes import BUDGETS
+from examples.paper.training import best_flat, constant_depth, prefixed, trained_scores
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.masks.initial_heights import initial_heights
 

@@ -16,9 +16,11 @@ from pathlib import Path
 
 import torch
 
+from examples.paper.cameras import camera_with, flat_lens
 from examples.paper.report import bars, cells, grid, means
 from examples.paper.runner import Experiment, Row, Trial, main
-from examples.paper.training import BUDGETS, best_flat, camera_with, flat_lens, trained_scores
+from examples.paper.scenes import BUDGETS
+from examples.paper.training import best_flat, trained_scores
 from kornia_tidy import FresnelLens, PixelwiseMask, TiDyOptics
 from kornia_tidy.masks.initial_heights import initial_heights
 

@@ -15,18 +15,11 @@ from typing import Any, NamedTuple
 
 import torch
 
+from examples.paper.cameras import flat_lens, pinhole, sensor_at
 from examples.paper.report import cells, grid
 from examples.paper.runner import Experiment, Row, Trial, main
-from examples.paper.training import (
-    BUDGETS,
-    best_flat,
-    constant_depth,
-    flat_lens,
-    pinhole,
-    prefixed,
-    sensor_at,
-    trained_scores,
-)
+from examples.paper.scenes import BUDGETS
+from examples.paper.training import best_flat, constant_depth, prefixed, trained_scores
 from kornia_tidy import TiDyOptics
 from kornia_tidy.inference.trained import fix_window
 from kornia_tidy.systems.presets import published_system
