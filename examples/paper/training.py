@@ -96,17 +96,21 @@ def closed_form_system(optics: TiDyOptics, task: str, budget: Budget) -> Trained
     The depth is the mean of :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`, at the temperature
     that is best on eight painted scenes which are neither trained on nor scored.
     """
-    forms = ClosedForms(optics, task)
-    system = system_of(optics, forms, SystemSettings(task=task), 0)
+    system = system_of(optics, ClosedForms(optics, task), SystemSettings(task=task), 0)
     if "depth" in MAPS[task]:
-        tuned = painted(budget, "validation", min(TUNED, budget.scored))
-
-        def error(temperature: float) -> float:
-            forms.temperature = temperature
-            return mean_scores(system, tuned)["rmse"]
-
-        forms.temperature = min(TEMPERATURES, key=error)
+        best_temperature(system, painted(budget, "validation", min(TUNED, budget.scored)))
     return system
+
+
+def best_temperature(system: TrainedSystem, scenes: Dataset[Any]) -> None:
+    """Set the temperature of a closed form of depth to the one with the least error on some scenes."""
+    forms = next(part for part in system.head.modules() if isinstance(part, ClosedForms))
+
+    def error(temperature: float) -> float:
+        forms.temperature = temperature
+        return mean_scores(system, scenes)["rmse"]
+
+    forms.temperature = min(TEMPERATURES, key=error)
 
 
 SCORES = {"image_psnr": "psnr", "image_ssim": "ssim", "image_rmse": "image_rmse", "depth_rmse": "rmse"}
