@@ -34,8 +34,8 @@ def trials(scale: str) -> list[Trial]:
     """Return the trials: each start and seed."""
     seeds = range(BUDGETS[scale].seeds)
     return [
-        *({"start": start, "seed": str(seed)} for seed in seeds for start in (*PAPER, FLAT)),
         {"start": CONSTANT, "seed": "0"},
+        *({"start": start, "seed": str(seed)} for seed in seeds for start in (*PAPER, FLAT)),
     ]
 
 
@@ -84,8 +84,9 @@ scenes; mean ± standard error over seeds. The bound is that of a point with the
 JUDGED = """\
 Judged can be how much the first masks tell of a bright point's depth, by the bound, and how far training moved that.
 A row whose network is no better than the mean depth of the training scenes has learnt nothing of depth, and its order
-among others means nothing. The paper's ranking is that of one run each of a pretrained MiDaS Small after 200 epochs,
-without error bars; its weights are not on this machine, and U-Nets with random weights stand in for it."""
+among others means nothing. Not judged can be the paper's ranking, which is that of one run each of a pretrained MiDaS
+Small after 200 epochs, without error bars; its weights are not on this machine, and U-Nets with random weights stand
+in for it."""
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
