@@ -51,7 +51,7 @@ def flat_lens(f_number: float, focus: float, fidelity: Fidelity) -> TiDyOptics:
 
 
 def pinhole(fidelity: Fidelity) -> TiDyOptics:
-    """Return a camera whose captures are in focus everywhere: a small aperture before pixels wider than its PSF."""
+    """Return a camera with captures in focus everywhere: a small aperture, and pixels wider than its PSF."""
     lens = ThinLensCamera(50e-3, 0.5e-3, REFERENCE.focus_distance, 300e-6, REFERENCE.depth_range)
     optics = camera_with(PixelwiseMask(1, initial="flat"), fidelity, lens, sensor=sensor_at(F_NUMBER))
     return optics.requires_grad_(requires_grad=False)

@@ -1,4 +1,4 @@
-"""Experiment 8, the paper's discretisation: what do masks and networks keep of their gain in a physical camera?
+"""Experiment 8, the paper's discretisation: masks and networks that were trained with it, in a physical camera.
 
     python -m examples.paper.discretisation --scale smoke
     python -m examples.paper.discretisation --scale cpu
@@ -85,7 +85,7 @@ def first_masks(count: int, task: str, seed: int) -> PixelwiseMask:
 def camera(masks: Any, fidelity: Fidelity, **parts: Any) -> TiDyOptics:
     """Return the camera of the experiment, with the noise of PhaseCam3D whatever the fidelity."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="the paper's 23x23 pupil")  # this is what is measured
+        warnings.filterwarnings("ignore", message="the paper's 23x23 pupil")  # the aliasing is measured here
         return fix_window(TiDyOptics(masks, REFERENCE, sensor=SensorNoise(NOISE), fidelity=fidelity, **parts))
 
 
@@ -148,7 +148,7 @@ scale in all rows but that of the lens without masks, whose shot noise at a fift
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw the scores of the networks over what is taken away."""
+    """Draw the scores of the networks over the steps from the training to the reference."""
     panels = {}
     for task, masks, score in (("edof", "5", "psnr"), ("depth", "5", "rmse")):
         series = {}

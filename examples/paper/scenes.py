@@ -82,7 +82,7 @@ BUDGETS = {
 
 
 class ForCamera(Dataset):
-    """Scenes whose depths are stretched, linearly in dioptres, from the range of one camera to that of another."""
+    """Scenes with depths stretched, linearly in dioptres, from the range of one camera to that of another."""
 
     def __init__(self, scenes: Dataset[Any], camera: ThinLensCamera) -> None:
         self.scenes, self.camera = scenes, camera

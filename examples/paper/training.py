@@ -83,7 +83,7 @@ def head_settings(task: str, budget: Budget, **head: Any) -> SystemSettings:
 
 
 def system_of(optics: TiDyOptics, head: nn.Module, settings: SystemSettings, steps: int) -> TrainedSystem:
-    """Return a system in eval mode whose maps are clipped to [0, 1], as images are when they are shown."""
+    """Return a system in eval mode with maps clipped to [0, 1]."""
     with torch.no_grad():
         update_psfs(head, optics)
     return TrainedSystem(optics.eval(), nn.Sequential(head, nn.Hardtanh(0.0, 1.0)).eval(), settings, steps)
@@ -179,7 +179,7 @@ FLAT = tuple((f_number, focus) for f_number in (17.6, 25.0, 35.0, 50.0, 71.0) fo
 
 @lru_cache
 def best_flat(task: str, budget: Budget) -> tuple[float, float]:
-    """Return f-number and focus of the lens without masks whose closed form is best on painted scenes.
+    """Return f-number and focus of the lens without masks that a closed form restores best.
 
     They are chosen among :data:`FLAT` on eight scenes that are neither trained on nor scored.
 

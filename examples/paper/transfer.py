@@ -1,4 +1,4 @@
-"""Experiment 6, transfer: what do systems that were trained on painted scenes make of real ones, without fine-tuning?
+"""Experiment 6, transfer: systems that were trained on painted scenes, scored on real ones without fine-tuning.
 
     python -m examples.paper.transfer --scale smoke
     python -m examples.paper.transfer --scale cpu
