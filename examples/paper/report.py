@@ -69,8 +69,8 @@ def bars(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], path
     drawn = zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True)
     for axes, (heading, series) in drawn:
         places = list(dict.fromkeys(place for points in series.values() for place in points))
-        for color, (name, points) in zip((ACCENT, INK, FAINT), series.items(), strict=False):
-            kept = [(places.index(place), values) for place, values in points.items() if values]
+        for turn, (color, (name, points)) in enumerate(zip((ACCENT, INK, FAINT), series.items(), strict=False)):
+            kept = [(places.index(place) + 0.12 * (turn - 1), values) for place, values in points.items() if values]
             if not kept:
                 continue
             errors = [statistics.stdev(v) / len(v) ** 0.5 if len(v) > 1 else 0.0 for _, v in kept]
@@ -87,7 +87,7 @@ def bars(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], path
 
 
 def mean_and_error(values: Sequence[float]) -> str:
-    """Return a mean and its standard error over seeds as text; without the error for one value.
+    """Return a mean and its standard error over seeds as text; without the error if all values are equal.
 
     Example:
         >>> mean_and_error([1.0, 2.0, 3.0]), mean_and_error([1.5])
@@ -95,6 +95,6 @@ def mean_and_error(values: Sequence[float]) -> str:
     """
     mean = statistics.fmean(values)
     digits = 2 if abs(mean) >= 2 else 4
-    if len(values) < 2:
+    if len(set(values)) < 2:
         return f"{mean:.{digits}f}"
     return f"{mean:.{digits}f} ± {statistics.stdev(values) / len(values) ** 0.5:.{digits}f}"
