@@ -92,8 +92,8 @@ The rows differ in masks alone: the exposure time is the same, with 2,000 electr
 which camera is better *after so many steps*, and what its masks are worth to a closed form, which needs no training: a
 sequence is worth its length if this column rises with it. Not judged can be the paper's figure, whose networks were
 trained to convergence from a pretrained start: after the steps of the smaller scales a network is far from its limit,
-and behind the closed form where that says more. A score without ± was the same for all seeds. The paper's PSNR is on other data, with another noise, which it does not
-state, and with its own aliased optics."""
+and behind the closed form where that says more. A score without ± was the same for all seeds. The paper's PSNR is on
+other data, with another noise, which it does not state, and with its own aliased optics."""
 
 
 def title(rows: Sequence[Row]) -> str:
