@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from examples.paper.runner import Row
-from examples.paper.training import mean_and_error
 
 NETWORK, CLOSED, START = "network", "closed", "start"
 WHERE = ("painted", "real")
@@ -61,8 +61,6 @@ def bars(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], path
         path: of the PNG file.
         below: label of the horizontal axis.
     """
-    import statistics  # noqa: PLC0415
-
     from matplotlib.figure import Figure  # noqa: PLC0415 (so that --help needs no extra)
 
     from kornia_tidy.figures.style import ACCENT, FAINT, INK, open_chart  # noqa: PLC0415
@@ -71,8 +69,8 @@ def bars(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], path
     drawn = zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True)
     for axes, (heading, series) in drawn:
         places = list(dict.fromkeys(place for points in series.values() for place in points))
-        for color, (name, points) in zip((ACCENT, INK, FAINT), series.items(), strict=False):
-            kept = [(places.index(place), values) for place, values in points.items() if values]
+        for turn, (color, (name, points)) in enumerate(zip((ACCENT, INK, FAINT), series.items(), strict=False)):
+            kept = [(places.index(place) + 0.12 * (turn - 1), values) for place, values in points.items() if values]
             if not kept:
                 continue
             errors = [statistics.stdev(v) / len(v) ** 0.5 if len(v) > 1 else 0.0 for _, v in kept]
@@ -86,3 +84,17 @@ def bars(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], path
         open_chart(axes, 7.5)
         axes.legend(fontsize=7.5, frameon=False)
     figure.savefig(path, dpi=110)
+
+
+def mean_and_error(values: Sequence[float]) -> str:
+    """Return a mean and its standard error over seeds as text; without the error if all values are equal.
+
+    Example:
+        >>> mean_and_error([1.0, 2.0, 3.0]), mean_and_error([1.5])
+        ('2.00 ± 0.58', '1.50')
+    """
+    mean = statistics.fmean(values)
+    digits = 2 if abs(mean) >= 2 else 4
+    if len(set(values)) < 2:
+        return f"{mean:.{digits}f}"
+    return f"{mean:.{digits}f} ± {statistics.stdev(values) / len(values) ** 0.5:.{digits}f}"

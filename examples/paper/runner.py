@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,7 @@ def main(experiment: Experiment, about: str, arguments: Sequence[str] | None = N
         torch.set_num_threads(options.threads)
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
+    commit()  # of the code that is loaded now
     rows = run(experiment, options.scale, folder, options.most)
     write_section(experiment, rows, options.scale, folder)
     print(experiment.table(rows, options.scale))
@@ -169,8 +171,9 @@ def write_section(experiment: Experiment, rows: Sequence[Row], scale: str, folde
     write_bytes(folder / f"{name}.md", "\n".join(lines).encode())
 
 
+@lru_cache
 def commit() -> str:
-    """Return the abbreviated commit of the checkout, with a plus sign if files differ from it."""
+    """Return the abbreviated commit of the checkout when it is first asked for, with a plus sign if files differ."""
     try:
         told = subprocess.run(  # noqa: S603
             ["git", "-C", str(HERE), "describe", "--always", "--dirty=+", "--exclude=*"],  # noqa: S607

@@ -1,0 +1,69 @@
+"""Yardsticks without a network: the closed forms of image and depth, and the bound on a bright point's depth."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from examples.paper.cameras import ELECTRONS, F_NUMBER
+from kornia_tidy import SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy.inference.tasks import MAPS
+
+TEMPERATURES = (1.0, 4.0, 16.0, 64.0)
+"""By which the log likelihood of depth is divided: neighbouring pixels are not independent."""
+
+
+class ClosedForms(nn.Module):
+    """Maps of a task from a capture, without a network. See :func:`examples.paper.training.closed_form_system`."""
+
+    def __init__(self, optics: TiDyOptics, task: str, layers: int = 11) -> None:
+        from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead  # noqa: PLC0415
+        from kornia_tidy.reconstruction.depth_likelihood import NOISE, likelihood_filters  # noqa: PLC0415
+
+        super().__init__()
+        self.temperature = TEMPERATURES[0]
+        self.task, self.encoded = task, optics.color_space == "srgb"
+        self.image = ClosedFormHead(encoded=self.encoded)
+        if "depth" in MAPS[task]:
+            lo, hi = optics.camera.defocus_range
+            with torch.no_grad():
+                psfs = optics.psf_bank(3, defocus=torch.linspace(lo, hi, layers, dtype=torch.float64).tolist()).psfs
+                psfs = psfs.flip((-2, -1)) if optics.fidelity.correlate else psfs
+                sensor = cast("SensorNoise", optics.sensor)
+                noise = float(sensor.std(torch.tensor(0.2))) / psfs.shape[1] ** 0.5  # of the mean of the colours
+                self.filters = likelihood_filters(psfs.mean(1).float(), max(noise, NOISE))
+
+    def forward(self, coded: Tensor) -> Tensor:
+        """Return depth, image, or depth and image."""
+        maps = []
+        if "depth" in MAPS[self.task]:
+            maps.append(self._depth(coded))
+        if "image" in MAPS[self.task]:
+            maps.append(self.image(coded))
+        return torch.cat(maps, 1)
+
+    def _depth(self, coded: Tensor) -> Tensor:
+        from kornia.color import rgb_to_linear_rgb  # noqa: PLC0415
+
+        from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood  # noqa: PLC0415
+
+        light = (rgb_to_linear_rgb(coded) if self.encoded else coded).mean(1, keepdim=True)
+        likelihood = (depth_likelihood(light, *self.filters) / self.temperature).softmax(1)
+        places = torch.linspace(0, 1, likelihood.shape[1])
+        return torch.einsum("bdhw,d->bhw", likelihood, places)[:, None]
+
+
+def depth_limit(optics: TiDyOptics) -> float:
+    """Return the bound on the error of a bright point's depth, as a fraction of the range.
+
+    See :func:`~kornia_tidy.mask_design.candidates.depth_bound`; depths are uniform over the range.
+    """
+    from kornia_tidy.mask_design.candidates import depth_bound  # noqa: PLC0415
+    from kornia_tidy.mask_design.design_task import DesignTask  # noqa: PLC0415
+
+    lens = cast("ThinLensCamera", optics.camera)
+    task = DesignTask(electrons=ELECTRONS, reference_f_number=F_NUMBER, depth_weight=1.0)
+    with torch.no_grad():
+        return float(depth_bound(task, optics.psf_model, lens.f_number))
