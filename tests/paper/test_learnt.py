@@ -23,7 +23,10 @@ from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
 SMOKE = BUDGETS["smoke"]
-NAMES = ("sequence_length", "initialisation", "state_of_the_art", "transfer", "discretisation")
+NAMES = (
+    "theorem", "point_psf", "sequence_length", "initialisation", "state_of_the_art", "transfer", "switching",
+    "discretisation", "boundaries",
+)  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")

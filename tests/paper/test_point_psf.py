@@ -15,13 +15,6 @@ def scores(row):
 
 
 class TestPointPSF(BaseTester):
-    def test_smoke_a_table_a_figure_and_rows(self, tmp_path):
-        rows = run(point_psf.EXPERIMENT, "smoke", tmp_path)
-        assert [row["length"] for row in rows] == ["1"] * 4 + ["3"] * 4
-        assert "| 3 | 4 of 4 |" in point_psf.table(rows, "smoke")
-        point_psf.draw(rows, tmp_path / "figure.png")
-        assert (tmp_path / "figure.png").stat().st_size > 1e4
-
     def test_feature_interrupted_and_resumed_gives_the_same_rows(self, tmp_path):
         once, twice = tmp_path / "once", tmp_path / "twice"
         once.mkdir()
