@@ -3,8 +3,8 @@
     python -m examples.paper.boundaries --scale smoke
     python -m examples.paper.boundaries --scale cpu
 
-Gather, the paper's way, blurs each pixel by the PSF of its own depth. Occlusion composes layers from far to near, so
-that near objects hide what is behind them and their blur covers it, as in a camera. The systems that come with the package
+Gather, the paper's way, blurs each pixel by the PSF of its own depth. Occlusion composes layers from far to near:
+near objects hide what is behind them, and their blur covers it, as in a camera. The systems that come with the package
 were trained with gather. Scores are those of all pixels and of those near a step of depth.
 """
 
@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from examples.paper.cameras import F_NUMBER
 from examples.paper.closed_forms import ClosedForms
-from examples.paper.report import grid
+from examples.paper.report import WHERE, grid
 from examples.paper.runner import Experiment, Row, Trial, main
 from examples.paper.scenes import Budget, ForCamera, painted, real
 from examples.paper.training import system_of

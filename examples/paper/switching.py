@@ -3,8 +3,8 @@
     python -m examples.paper.switching --scale smoke
     python -m examples.paper.switching --scale cpu
 
-A change from one mask to the next takes 1 to 16 ms of an exposure of 100 ms. In between stand random patterns, as in
-the paper, or the states of a liquid crystal that relaxes. The systems are those that come with the package, which were not
+A change from one mask to the next takes 1 to 16 ms of an exposure of 100 ms. Between stand random patterns, as in the
+paper, or the states of a liquid crystal that relaxes. The systems are those that come with the package, which were not
 trained for it; their networks and closed forms know the PSFs with the states between.
 """
 
