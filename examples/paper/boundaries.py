@@ -83,9 +83,7 @@ def table(rows: Sequence[Row], scale: str) -> str:
     lines = []
     for row in rows:
         cells = [
-            " / ".join(
-                f"{float(row[name]):.2f}" for name in (f"{what}_painted_{part}", f"{what}_real_{part}") if name in row
-            )
+            " / ".join(f"{float(row[name]):.2f}" for where in WHERE if (name := f"{what}_{where}_{part}") in row)
             for what in ("network", "closed")
             for part in ("all", "edges")
         ]
@@ -103,8 +101,8 @@ def table(rows: Sequence[Row], scale: str) -> str:
 
 JUDGED = """\
 Judged can be what a system that was trained with gather loses, or gains, behind a camera that hides what is behind near
-objects. Not judged can be the reverse, training with occlusion, which no shipped system has had. Edges are pixels within 4
-of a step of 2 rad of defocus."""
+objects. Not judged can be the reverse, training with occlusion, which no shipped system has had. Edges are pixels
+within 4 of a step of 2 rad of defocus."""
 
 
 def settings(scale: str) -> str:
