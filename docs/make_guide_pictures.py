@@ -2,6 +2,8 @@
 
     python docs/make_guide_pictures.py         # all pages
     python docs/make_guide_pictures.py slm     # one of them
+
+Each page writes its picture to `guide.png`.
 """
 
 from __future__ import annotations

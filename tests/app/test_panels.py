@@ -1,4 +1,4 @@
-"""What stands where in the pictures of the page, and what a change of the settings must change."""
+"""Pictures of the page: their content and order, and the settings that must change them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SMALL = {"side": 96}
 
 @pytest.fixture(scope="module")
 def result():
-    """Three random masks, whose PSFs have no symmetry, at a range of defocus that is not symmetric either."""
+    """Three random masks, whose PSFs have no symmetry, over a range of defocus without symmetry."""
     return take_picture(Settings(camera="own", start="noise", masks=3, near=0.4, far=2.0, **SMALL))
 
 
@@ -133,7 +133,7 @@ class TestUnits(BaseTester):
 class TestFiles(BaseTester):
     @pytest.fixture
     def files(self, tmp_path, monkeypatch):
-        """A photo, and depths of which few far ones are known, fewer than half a percent, and a fifth is not."""
+        """A photo, and a depth map with a fifth of holes and fewer than half a percent of far pixels."""
         monkeypatch.chdir(tmp_path)
         write_image("photo.png", torch.rand(3, 72, 96))
         depth = np.tile(np.linspace(0.5, 2.0, 96, dtype=np.float32), (72, 1))
