@@ -43,7 +43,7 @@ PAGES = [
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
 MOST_NOT_RUN = 7  # in all pages: a block that is not run can be wrong
-SLOW: set[str] = set()  # pages that take more than about ten seconds
+SLOW: set[str] = {"docs/guides/raw_files.md"}  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 MARKS = re.compile(r"(?:<!-- (?:not run|needs|slow|run with): (?:(?!-->).)+ -->\n)+\Z", re.DOTALL)
