@@ -3,7 +3,8 @@
 The blocks of a page are run in their order, in a folder of their own that holds photo.png and depth.png. Python blocks
 share one namespace. Shell lines are commands of `kornia-tidy`, given to its entry point. A ```text block tells what the
 block before it prints; ... in it stands for anything. A block after <!-- not run: reason --> is only checked: its names
-can be imported, its commands and options exist.
+can be imported, its commands and options exist. Options of <!-- run with: OPTIONS --> are appended to the commands of
+the block, to make them shorter. A block after <!-- slow: reason --> is run with --runslow, and checked without.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from kornia_tidy.cli import build_parser, main
 from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
 from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
+from tests.data.published import write_each
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -36,15 +38,16 @@ PAGES = [
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs" / "ecosystems").glob("*.md")),
+    *sorted((ROOT / "docs" / "guides").glob("*.md")),
 ]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
-MOST_NOT_RUN = 12  # in all pages: a block that is not run can be wrong
-SLOW: set[str] = set()  # pages that take more than about ten seconds
+MOST_NOT_RUN = 7  # in all pages: a block that is not run can be wrong
+SLOW: set[str] = {"docs/guides/raw_files.md"}  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-REASON = re.compile(r"<!-- not run: ((?:(?!-->).)+) -->\n\Z", re.DOTALL)
-NEEDS = re.compile(r"<!-- needs: (\w+) -->\n\Z")
+MARKS = re.compile(r"(?:<!-- (?:not run|needs|slow|run with): (?:(?!-->).)+ -->\n)+\Z", re.DOTALL)
+MARK = re.compile(r"<!-- ([\w ]+): ((?:(?!-->).)+) -->", re.DOTALL)
 LINK = re.compile(r"\]\(([^)\s]*?)(?:#([^)\s]*))?\)")
 
 
@@ -57,6 +60,8 @@ class Block(NamedTuple):
     text: str
     reason: str  # why it is not run, or nothing
     needs: str = ""  # package without which it is only compiled
+    slow: bool = False  # run with --runslow alone
+    options: str = ""  # appended to its commands where it is run
 
     @property
     def place(self) -> str:
@@ -68,9 +73,20 @@ def blocks(name: str, text: str) -> list[Block]:
     found = []
     for fence in FENCE.finditer(text):
         before = text[: fence.start()]
-        marker, needs = REASON.search(before), NEEDS.search(before)
-        reason = " ".join(marker[1].split()) if marker else ""
-        found.append(Block(name, before.count("\n") + 1, fence[1], fence[2], reason, needs[1] if needs else ""))
+        marks = MARKS.search(before)
+        said = {kind: " ".join(words.split()) for kind, words in MARK.findall(marks[0])} if marks else {}
+        found.append(
+            Block(
+                page=name,
+                line=before.count("\n") + 1,
+                language=fence[1],
+                text=fence[2],
+                reason=said.get("not run", ""),
+                needs=said.get("needs", ""),
+                slow="slow" in said,
+                options=said.get("run with", ""),
+            )
+        )
     return found
 
 
@@ -80,8 +96,8 @@ def shell_lines(block: Block) -> list[list[str]]:
     return [[found for word in words for found in (sorted(glob.glob(word)) or [word])] for words in lines if words]
 
 
-def run_page(name: str, text: str) -> None:
-    """Run the blocks of a page in the current folder; an error names the page and the line."""
+def run_page(name: str, text: str, *, slow: bool = False) -> None:
+    """Run the blocks of a page in the current folder, slow ones on request; an error names the page and the line."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
     printed: str | None = ""
     for block in blocks(name, text):
@@ -94,7 +110,7 @@ def run_page(name: str, text: str) -> None:
                     block.text, printed, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
                 )
                 assert same, f"{block.place} shows\n{block.text}but printed is\n{printed}"
-        elif block.language in RUN and not block.reason:
+        elif block.language in RUN and not block.reason and (slow or not block.slow):
             if block.needs in ("torchvision", "deepinv"):
                 need_torchvision()
             out = io.StringIO()
@@ -109,7 +125,7 @@ def run_page(name: str, text: str) -> None:
 def run_shell(block: Block) -> None:
     for words in shell_lines(block):
         assert words[0] == "kornia-tidy", f"{block.place} is not run: only kornia-tidy can be, not {words[0]}"
-        status = main(words[1:])
+        status = main([*words[1:], *shlex.split(block.options)])
         assert status == 0, f"{block.place} ends with {status}: {shlex.join(words)}"
 
 
@@ -178,15 +194,18 @@ class TestEveryPage(BaseTester):
     @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")  # Lightning
     @pytest.mark.filterwarnings("ignore::kornia_tidy.psf.AliasingWarning")  # of fidelity="paper", told in its page
     @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in NAMES])
-    def test_feature_its_blocks_run_and_print_what_they_show(self, name, folder):
-        run_page(name, (ROOT / name).read_text(encoding="utf-8"))
+    def test_feature_its_blocks_run_and_print_what_they_show(self, name, folder, request):
+        if name == "docs/data_sets.md":
+            write_each(folder)
+        run_page(name, (ROOT / name).read_text(encoding="utf-8"), slow=request.config.getoption("--runslow"))
 
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_what_is_not_run_names_what_is_there(self, name):
         for block in blocks(name, (ROOT / name).read_text(encoding="utf-8")):
-            if block.reason and block.language == "python":
+            seldom = block.reason or block.slow
+            if seldom and block.language == "python":
                 check_names(block)
-            elif block.reason and block.language == "bash":
+            elif seldom and block.language == "bash":
                 for words in shell_lines(block):
                     check_command(block, words)
 
@@ -274,6 +293,17 @@ class TestRunPage(BaseTester):
         assert [block.reason for block in blocks("p.md", text)] == ["why", "that"]
         with pytest.raises(ZeroDivisionError):
             run_page("p.md", page(text, "```python", "1 / 0", "```"))
+
+    def test_feature_a_slow_block_is_run_on_request(self, folder):
+        text = page("<!-- slow: it takes long -->", "```python", "1 / 0", "```")
+        run_page("p.md", text)
+        with pytest.raises(ZeroDivisionError):
+            run_page("p.md", text, slow=True)
+
+    def test_feature_options_are_appended_to_the_commands(self, folder):
+        lines = ("```bash", "kornia-tidy simulate photo.png --depth depth.png --depth-scale 0.001 -o a.png", "```")
+        run_page("p.md", page("<!-- slow: a second -->", "<!-- run with: -o b.png -->", *lines), slow=True)
+        assert [path.name for path in folder.glob("?.png")] == ["b.png"]
 
     @pytest.mark.parametrize(
         ("language", "line", "match"),

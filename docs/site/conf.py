@@ -54,9 +54,8 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sphinx = False
 html_theme_options = {
-    "source_repository": "https://github.com/kornia-tidy/kornia-tidy/",
-    "source_branch": "main",
     "navigation_with_keys": True,
+    "top_of_page_buttons": [],  # pages of the gallery and the reference are made: there is no source to view or edit
 }
 copybutton_prompt_text = r">>> |\.\.\. "
 copybutton_prompt_is_regexp = True

@@ -18,13 +18,13 @@ def main(script: str, arguments: list[str]) -> None:
 
 def draw(returned: Any) -> None:
     """Draw the losses of a training as a curve, or the pictures of a batch beside each other."""
+    if not isinstance(returned, list):
+        return
     from matplotlib.figure import Figure  # noqa: PLC0415
     from torch import Tensor, cat  # noqa: PLC0415
 
     from kornia_tidy.data import write_image  # noqa: PLC0415
 
-    if not isinstance(returned, list):
-        return
     if all(isinstance(value, float) for value in returned):
         figure = Figure(figsize=(6, 3.4), layout="constrained")
         axes = figure.subplots()

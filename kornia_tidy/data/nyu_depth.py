@@ -18,8 +18,8 @@ from kornia_tidy.files import read_bytes
 
 LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 SOURCES = {
-    LABELED: "http://horatio.cs.nyu.edu/mit/silberman/nyu_depth_v2/nyu_depth_v2_labeled.mat (2.8 GB)",
-    SPLITS: "http://horatio.cs.nyu.edu/mit/silberman/indoor_seg_sup/splits.mat",
+    LABELED: "https://horatio.cs.nyu.edu/mit/silberman/nyu_depth_v2/nyu_depth_v2_labeled.mat (2.8 GB)",
+    SPLITS: "https://horatio.cs.nyu.edu/mit/silberman/indoor_seg_sup/splits.mat",
 }
 LARGEST_SPLITS = 1 << 16  # bytes; a compressed file may hold a thousand times as many
 FRAME = (480, 640)

@@ -87,3 +87,32 @@ def write_nyu(root: Path, count: int = 5) -> tuple[NDArray[np.uint8], NDArray[np
     half = np.arange(1, count + 1, dtype=np.uint16)
     savemat(root / "splits.mat", {"trainNdxs": half[1::2, None], "testNdxs": half[::2, None]}, do_compression=True)
     return images, depths, raw
+
+
+def write_each(root: Path) -> None:
+    """Write one or two scenes of each data set, in folders named as in docs/data_sets.md."""
+    (root / "nyu").mkdir()
+    write_nyu(root / "nyu", 2)
+    parts = {f"{half}/{part}": 1 for half in ("TRAIN", "TEST") for part in "ABC"}
+    write_flying_things(root / "flyingthings3d", {**parts, "TRAIN/A": 8}, size=(279, 280))
+    write_frames(root / "chess", "seq-01/frame-{:06}.color.png", "seq-01/frame-{:06}.depth.png", 1)
+    write_frames(root / "scans", "scene0000_00/color/{}.jpg", "scene0000_00/depth/{}.png", 1)
+    write_frames(root / "SUNRGBD/kv2", "{}/image/a.jpg", "{}/depth_bfx/a.png", 1)
+    drive = "2011_09_26_drive_0002_sync"
+    names = (
+        f"image/{drive}_image_{{:010}}_image_02.png",
+        f"groundtruth_depth/{drive}_groundtruth_depth_{{:010}}_image_02.png",
+    )
+    write_frames(root / "val_selection_cropped", *names, 1)
+    write_frames(root / "rgbd_dataset_freiburg1_desk", "rgb/{}.0.png", "depth/{}.0.png", 1)
+    for part in ("rgb", "depth"):
+        (root / "rgbd_dataset_freiburg1_desk" / f"{part}.txt").write_text(f"0.0 {part}/0.0.png\n")
+    write_frames(root / "middlebury2014", "Piano{}/im0.png", "unused/{}.png", 1)
+    write_pfm(root / "middlebury2014/Piano0/disp0.pfm", np.full((36, 44), 48.0, np.float32))
+    calibration = "cam0=[1000 0 4; 0 1000 3; 0 0 1]\ndoffs=2\nbaseline=100\nwidth=44\nheight=36\n"
+    (root / "middlebury2014/Piano0/calib.txt").write_text(calibration)
+    preview, geometry = (f"ai_001_001/images/scene_cam_00_{kind}" for kind in ("final_preview", "geometry_hdf5"))
+    write_frames(root / "hypersim", preview + "/frame.{:04}.tonemap.jpg", "unused/{}.png", 1)
+    (root / "hypersim" / geometry).mkdir()
+    with h5py.File(root / "hypersim" / geometry / "frame.0000.depth_meters.hdf5", "w") as file:
+        file.create_dataset("dataset", data=np.full((36, 44), 3.0, np.float16))

@@ -1,0 +1,164 @@
+"""The scripts that make the site of the documentation: gallery, pages of the API reference, and docstrings."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+import kornia_tidy
+from kornia_tidy.data import read_image
+from tests.base import BaseTester
+
+SITE = Path(__file__).resolve().parents[1] / "docs" / "site"
+EXAMPLE = '''"""A question. Two sentences.
+
+What follows the first paragraph.
+
+    python examples/{stem}.py --size 8
+"""
+
+
+def main(arguments):
+    print("arguments", arguments)
+    return {returned}
+'''
+
+
+def load(name):
+    """Import a script of docs/site under a name of its own."""
+    spec = importlib.util.spec_from_file_location(f"site_{name}", SITE / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+gallery, api_pages = load("gallery"), load("api_pages")
+
+
+@pytest.fixture
+def example(tmp_path):
+    """A function that writes an example with a result, and returns its path."""
+    (tmp_path / "examples").mkdir()
+
+    def write(returned, stem="my_example"):
+        path = tmp_path / "examples" / f"{stem}.py"
+        path.write_text(EXAMPLE.format(stem=stem, returned=returned), encoding="utf-8")
+        return path
+
+    return write
+
+
+class TestGallery(BaseTester):
+    def make(self, tmp_path, example, *, run=True):
+        gallery.write_gallery(tmp_path / "pages", tmp_path / "results", [example], run=run)
+        return (tmp_path / "pages" / f"{example.stem}.md").read_text(encoding="utf-8")
+
+    @pytest.mark.parametrize(("returned", "picture"), [("[3.0, 2.0, 1.0]", "loss"), ("None", None)])
+    def test_smoke_a_page_has_words_command_output_and_script(self, tmp_path, example, returned, picture):
+        pytest.importorskip("matplotlib", reason="losses are drawn with matplotlib")
+        page = self.make(tmp_path, example(returned))
+        assert page.startswith("# My example\n\nA question. Two sentences.\n\nWhat follows the first paragraph.\n")
+        assert "```bash\npython examples/my_example.py --size 8\n```" in page
+        assert "## What it prints\n\n```bash\npython examples/my_example.py\n```\n```text\narguments []\n```" in page
+        assert "```{literalinclude} my_example.py" in page
+        pictures = re.findall(r"!\[(\w+)\]\((\S+)\)", page)
+        assert [name for name, _ in pictures] == ([picture] if picture else [])
+        assert all(read_image(tmp_path / "pages" / file).shape[0] == 3 for _, file in pictures)
+        card = [":::{grid-item-card} My example", ":link: my_example", ":link-type: doc"]
+        card += [f":img-top: images/my_example-{name}.png" for name, _ in pictures]
+        index = (tmp_path / "pages" / "index.md").read_text(encoding="utf-8")
+        assert "\n".join([*card, "", "A question. Two sentences.", ":::"]) in index
+
+    def test_feature_an_example_runs_again_only_after_a_change(self, tmp_path, example, capsys):
+        path = example("None")
+        self.make(tmp_path, path)
+        assert "examples/my_example.py" in capsys.readouterr().out
+        self.make(tmp_path, path)
+        assert capsys.readouterr().out == ""
+        self.make(tmp_path, example("(1, 2)"))
+        assert "examples/my_example.py" in capsys.readouterr().out
+
+    def test_feature_without_a_run_the_page_says_how_to_get_one(self, tmp_path, example):
+        page = self.make(tmp_path, example("1 / 0"), run=False)
+        assert "Pictures and numbers are made by `make docs`." in page
+        assert "What it prints" not in page
+
+    def test_exception_an_example_that_fails_ends_the_build(self, tmp_path, example):
+        with pytest.raises(RuntimeError, match=r"examples/my_example\.py failed:\n(.|\n)*ZeroDivisionError"):
+            self.make(tmp_path, example("1 / 0"))
+        assert not (tmp_path / "results" / "my_example" / "made_of.txt").exists()
+
+    def test_feature_titles_and_arguments_are_of_examples_that_are_there(self):
+        there = {path.stem for path in (SITE.parents[1] / "examples").glob("*.py")}
+        assert set(gallery.TITLES) == there
+        assert set(gallery.ARGUMENTS) <= there
+
+
+class TestApiPages(BaseTester):
+    def test_smoke_each_public_package_has_its_page(self, tmp_path):
+        page = tmp_path / "page.md"
+        page.write_text("from kornia_tidy.optics.thin_lens import (thin_lens_defocus as psi,)  # why\n")
+        api_pages.write_api_pages(tmp_path / "api", [page])
+        there = {path.stem for path in (tmp_path / "api").iterdir()}
+        assert {"index", "camera", "masks", "psf", "render", "fidelity"} <= there
+        assert not there & set(api_pages.LEFT_OUT)
+        index = (tmp_path / "api" / "index.rst").read_text(encoding="utf-8")
+        assert [name for name in kornia_tidy.__all__ if f"{name}`" not in index] == []
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("from kornia_tidy import TiDyOptics\n", {"kornia_tidy": {"TiDyOptics"}}),
+            ("  from kornia_tidy.a import (\n  c as d,  # from e import f\n  g,\n)\n", {"kornia_tidy.a": {"c", "g"}}),
+            ("import kornia_tidy\nfrom kornia import augmentation\n", {}),
+        ],
+    )  # fmt: skip
+    def test_feature_imports_of_a_page(self, tmp_path, text, expected):
+        (tmp_path / "page.md").write_text(text)
+        assert api_pages.imports([tmp_path / "page.md"]) == expected
+
+
+class TestDocstrings(BaseTester):
+    """How conf.py rewrites what Sphinx reads; none of it needs Sphinx."""
+
+    @pytest.fixture
+    def conf(self, monkeypatch):
+        monkeypatch.setattr(sys, "path", list(sys.path))
+        return load("conf")
+
+    def test_feature_a_property_keeps_its_sentence(self, conf):
+        lines = ["Height in metres: the mask's."]
+        conf.keep_sentences_of_properties(None, "property", "height", None, None, lines)
+        assert lines == ["\\", "Height in metres: the mask's."]
+        conf.keep_sentences_of_properties(None, "function", "height", None, None, lines)
+        assert len(lines) == 2
+
+    def test_feature_a_default_that_is_made_anew_becomes_an_ellipsis(self, conf):
+        shorten = conf.shorten_factories
+        assert shorten(None, "", "", None, None, "(a=<factory>, b=1)", "int") == ("(a=..., b=1)", "int")
+        assert shorten(None, "", "", None, None, None, None) == (None, None)
+
+    def test_feature_links_to_examples_lead_to_the_gallery(self, conf):
+        source = ["see [a](../examples/motion_blur.py), [b](examples/start.ipynb)"]
+        conf.link_examples_to_the_gallery(None, "page", source)
+        assert source == ["see [a](../gallery/motion_blur.md), [b](examples/start.ipynb)"]
+
+    @pytest.mark.parametrize(
+        ("target", "full"),
+        [
+            ("thin_lens_defocus", ["kornia_tidy.optics.thin_lens.thin_lens_defocus"]),
+            ("kornia_tidy.optics", ["kornia_tidy.optics"]),
+            ("ThinLensCamera.defocus", ["kornia_tidy.optics.thin_lens.ThinLensCamera.defocus"]),
+            ("gone_from_here", []),
+        ],
+    )
+    def test_feature_references_have_one_full_name(self, conf, target, full):
+        assert conf.references.full_names(target) == full
+
+    @pytest.mark.parametrize(("target", "there"), [("Tensor", True), ("nn.Module", True), ("Gone", False)])
+    def test_feature_names_of_other_packages_must_exist(self, conf, target, there):
+        assert conf.references.exists(target, None) is there
