@@ -6,9 +6,10 @@ import os
 
 import torch
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import load
 from torch import Tensor
 
-from kornia_tidy.files import check_file
+from kornia_tidy.files import check_file, read_bytes
 
 
 def read_tensors(
@@ -40,8 +41,10 @@ def read_tensors(
     try:
         if not path.stat().st_size:
             raise SafetensorError("the file is empty")
-        with safe_open(path, framework="pt", device=str(device)) as file:
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (no mapping)
-            return tensors, dict(file.metadata() or {})
+        with safe_open(path, framework="pt") as file:  # compares the header with the length, before anything is read
+            header = dict(file.metadata() or {})
+        # Not get_tensor: safetensors 0.8 keeps two integers for each tensor that it reads.
+        found = load(read_bytes(path))
+        return {name: found.pop(name).clone().to(device) for name in sorted(found)}, header
     except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # KeyError: a data type that PyTorch lacks
         raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error!s:.300}") from None

@@ -1,14 +1,17 @@
 """Memory during mixed training and rendering: `python -m tests.long_run --minutes 60`.
 
 Rounds of training steps, captures, files, coded data sets, subcommands and refused files are repeated. After each round
-the resident memory, the open files and the threads of the process are noted. The gradient of memory is that of the
-second half of the run, by the method of Theil and Sen, which a few outliers do not change.
+the resident memory, the open files and the threads of the process are noted. With the C library of GNU, freed memory is
+given back to the system before (``malloc_trim``), so that memory in use is measured and not how it is scattered. The
+gradient of memory is that of the second half of the run, by the method of Theil and Sen, which a few outliers do not
+change.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
 import gc
 import os
 import resource
@@ -33,7 +36,7 @@ class Sample(NamedTuple):
 
     seconds: float
     memory: float
-    """Resident, in MiB."""
+    """Resident, in MiB, after freed memory was given back."""
     files: int
     threads: int
 
@@ -44,19 +47,23 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="(default: 60)")
     parser.add_argument("--seed", type=int, default=0, help="of sizes and scenes (default: 0)")
     parser.add_argument("--most", type=float, default=MOST, help=f"MiB per hour that count as flat (default: {MOST:g})")
-    parser.add_argument("-o", "--output", type=Path, help="CSV file of all samples")
+    parser.add_argument("-o", "--output", type=Path, help="CSV file of the samples, written round by round")
     args = parser.parse_args()
     samples: list[Sample] = []
-    with tempfile.TemporaryDirectory() as place, tqdm(total=round(60 * args.minutes), unit="s") as bar:
+    with (
+        tempfile.TemporaryDirectory() as place,
+        tqdm(total=round(60 * args.minutes), unit="s") as bar,
+        (args.output or Path(os.devnull)).open("w", newline="", buffering=1) as file,
+    ):
+        table = csv.writer(file)
+        table.writerow(Sample._fields)
         load, begin = MixedLoad(Path(place), args.seed), time.monotonic()
         while not samples or samples[-1].seconds < 60 * args.minutes:
             load.round()
             samples.append(_sample(time.monotonic() - begin))
+            table.writerow(samples[-1])
             bar.n = min(round(samples[-1].seconds), bar.total)
             bar.set_postfix_str(f"{samples[-1].memory:.0f} MiB")
-    if args.output:
-        with args.output.open("w", newline="") as file:
-            csv.writer(file).writerows([Sample._fields, *samples])
     faults = report(samples, args.most)
     print(f"{len(samples)} rounds, {load.steps} training steps, {torch.get_num_threads()} thread(s) of torch")
     return int(bool(faults))
@@ -95,6 +102,8 @@ def memory_gradient(samples: list[Sample]) -> tuple[float, float, float]:
 
 def _sample(seconds: float) -> Sample:
     gc.collect()
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     files = len(os.listdir("/proc/self/fd"))
     return Sample(seconds, pages * resource.getpagesize() / 2**20, files, threading.active_count())
