@@ -84,7 +84,7 @@ class TestCameras(BaseTester):
         assert stops <= float(relative) <= stops**2  # shot noise alone, read noise alone
 
     def test_feature_noise_in_the_shade_is_that_of_phasecam3d(self):
-        self.assert_close(float(sensor_at(F_NUMBER).std(torch.tensor(0.2))), 0.01, atol=1e-4, rtol=0.0)
+        assert float(sensor_at(F_NUMBER).std(torch.tensor(0.2))) == pytest.approx(0.01, rel=0.01)
 
     def test_feature_a_pinhole_keeps_the_image_in_focus_at_every_depth(self):
         optics = pinhole(SMOKE.fidelity)
@@ -101,7 +101,7 @@ class TestCameras(BaseTester):
         for focus in (0.25, 1.0):
             camera = flat_lens(50.0, focus, SMOKE.fidelity).camera
             place = normalised_inverse_depth(camera, torch.tensor(float(camera.focus_distance)))
-            self.assert_close(float(place), focus, atol=1e-5, rtol=0.0)
+            assert float(place) == pytest.approx(focus, abs=1e-5)
 
     def test_feature_depths_are_stretched_in_dioptres(self):
         near, far = ThinLensCamera.for_scene((1.0, 5.0)), painted(SMOKE, "test", 2)
@@ -145,7 +145,7 @@ class TestTraining(BaseTester):
             for part in (seen, scored)
         ]
         wanted = (depths[1] - depths[0].mean()).square().mean((1, 2, 3)).sqrt().mean()
-        self.assert_close(constant_depth(SMOKE)["painted_rmse"], float(wanted), atol=1e-6, rtol=0.0)
+        assert constant_depth(SMOKE)["painted_rmse"] == pytest.approx(float(wanted), abs=1e-6)
 
     def test_feature_fisher_masks_tell_more_of_depth_than_noise(self):
         def limit(start: str) -> float:
@@ -169,7 +169,7 @@ class TestSystems(BaseTester):
         published = discretisation.color_cast(discretisation.camera(masks, discretisation.Fidelity.preset("paper")))
         honest = discretisation.color_cast(discretisation.camera(masks, SMOKE.fidelity))
         assert published["cast_ends"] > published["cast_focus"] + 0.05
-        self.assert_close(honest["cast_ends"], 1.0, atol=1e-4, rtol=0.0)
+        assert honest["cast_ends"] == pytest.approx(1.0, abs=1e-4)
 
     def test_convention_turned_masks_have_flipped_psfs(self):
         masks = discretisation.first_masks(1, "edof", 0)
