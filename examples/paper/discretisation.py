@@ -30,7 +30,7 @@ from kornia_tidy.masks.initial_heights import initial_heights
 FLAT = "best lens without masks"
 NOISE = 0.01  # of full scale, as PhaseCam3D; the paper states none
 WINDOW = {"smoke": 45, "cpu": 95}  # pixels of the reference's PSFs, else 129; the light beyond is an even background
-TRIALED = (("edof", "1"), ("edof", "5"), ("depth", "5"))
+TRIALED = (("edof", "5"), ("depth", "5"), ("edof", "1"))
 
 
 def trials(scale: str) -> list[Trial]:

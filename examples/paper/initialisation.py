@@ -84,9 +84,9 @@ scenes; mean ± standard error over seeds. The bound is that of a point with the
 JUDGED = """\
 Judged can be how much the first masks tell of a bright point's depth, by the bound, and how far training moved that.
 A row whose network is no better than the mean depth of the training scenes has learnt nothing of depth, and its order
-among others means nothing. Not judged can be the paper's ranking, which is that of one run each of a pretrained MiDaS
-Small after 200 epochs, without error bars; its weights are not on this machine, and U-Nets with random weights stand
-in for it."""
+among others means nothing; the same goes for the closed form. Not judged can be the paper's ranking, which is that of
+one run each of a pretrained MiDaS Small after 200 epochs, without error bars; its weights are not on this machine, and
+U-Nets with random weights stand in for it."""
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
