@@ -188,6 +188,8 @@ class PSFModel(ScenePSFs):
         """Return what shapes the PSFs besides the weights, by the names of the parts."""
         fidelity = settings_of(self.fidelity)
         fidelity.pop("window")  # the window has an entry of its own
+        if fidelity["wide_blur"] == Fidelity.wide_blur:  # states of earlier versions do not have it
+            fidelity.pop("wide_blur")
         bank = self.measured
         return {
             **{name: settings_of(getattr(self, name)) for name in ("masks", "camera", "modulator", "spectrum")},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+import math
 from functools import partial
 from math import ceil, floor
 from typing import Any, NoReturn, Self, cast
@@ -19,7 +19,7 @@ from kornia_tidy.modulator.modulator import DwellTimes, Timeline, settled_timeli
 from kornia_tidy.optics.aperture import check_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank
+from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, fine_nodes, interpolated_bank, nodes_around
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.lens_limits import PARTS, check_defocus_range, check_layer_spacing
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
@@ -28,17 +28,20 @@ from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
+from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur, blurs_widely, wide_blur, window_of
+from kornia_tidy.psf.wide_psfs import GroupBank, WideBank, held_nodes, is_flat, learnt_bank, wide_psfs
 from kornia_tidy.runtime.threads import SharedLock
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 
 class Derived:
-    """What follows from the parts of a PSF model and is found when it is first asked for: the window and the pupil."""
+    """What follows from the parts of a PSF model and is found when it is first asked for: window, pupil, blur."""
 
     def __init__(self, window: FittedWindow | None = None) -> None:
-        self.window, self.pupil = window, None
-        self.window: FittedWindow | None
-        self.pupil: Pupil | None
+        self.window: FittedWindow | None = window
+        self.pupil: Pupil | None = None
+        self.blur: WideBlur | None = None
+        self.blur_known = False
 
 
 class ScenePSFs:
@@ -60,7 +63,7 @@ class ScenePSFs:
     _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
     _derived: Derived
     # For each moment and state, for their averages, and for each number of threads.
-    _memories: dict[tuple[int | None, int | None, int], BankMemory]
+    _memories: dict[tuple[int | None, int | None, int, int | None], BankMemory]
 
     def __init__(
         self,
@@ -137,6 +140,22 @@ class ScenePSFs:
         """Return the PSFs that a scene needs, averaged over the exposure. See :meth:`scene_banks`."""
         return self.scene_banks(channels, dtype, defocus)[0][1]
 
+    def wide_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> WideBank | None:
+        """Return the PSFs that a scene needs on the grids of wide blur; None where the lens has evenly spaced layers.
+
+        Args:
+            channels: of the image.
+            dtype: float32 or float64.
+            defocus: map in radians, or its lowest and highest value, (2,).
+        """
+        if is_value_unknown() or (blur := self.wide_blur) is None:
+            return None
+        spectrum, groups = self.spectrum_of(channels), []
+        for group, nodes in held_nodes(blur, defocus):
+            bank = self._computed_bank(spectrum, dtype, nodes, None, (self.fidelity.stray_light, 1), group)
+            groups.append(GroupBank(group.grid, (group.nodes[0], group.nodes[-1]), bank))
+        return WideBank(tuple(groups), blur.window)
+
     def scene_banks(
         self, channels: int, dtype: torch.dtype, defocus: Tensor, each_state: bool = False
     ) -> list[tuple[Tensor | float, PSFBank]]:
@@ -191,16 +210,28 @@ class ScenePSFs:
         nodes: tuple[float, ...],
         state: int | None = None,
         stray_light: tuple[str, int] | None = None,
+        group: BlurGroup | None = None,
     ) -> PSFBank:
-        """Return the PSFs at these nodes, computed or remembered."""
+        """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid."""
         states, weights = self.states(dtype)
         if state is not None:
             states, weights = states[state : state + 1], torch.ones_like(weights[:1])
         derived = self._derived
         side = self.window if derived.window is None else derived.window.side
-        build = partial(self._build, states, weights, spectrum, side, self.fidelity.pixel_tolerance)
+        tolerance, grid = self.fidelity.pixel_tolerance, 1 if group is None else group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
         traced = torch.compiler.is_compiling() or is_transformed()
+        if group is not None:
+            side = group.window
+        build = partial(self._build, states, weights, spectrum, side, tolerance)
+        if self.wide_blur is not None and not traced and side in (self.wide_blur.window, group and group.window):
+            exact = partial(self._build_grid, spectrum, tolerance, grid)
+            if learning:
+                with torch.no_grad():
+                    bank = self._computed_bank(spectrum, dtype, nodes, state, None, group)
+                bank = learnt_bank(bank, exact, states, weights)
+                return bank if stray_light is None else bank.with_stray_light(*stray_light)
+            build = partial(self._build_wide, partial(exact, states, weights), spectrum, grid, side, states)
         if learning or traced or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
@@ -208,7 +239,7 @@ class ScenePSFs:
         setting = [side, self.fidelity, self._aperture_mark, fill_factor]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
-        key = self.moment, state if self.state is None else self.state, torch.get_num_threads()
+        key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), group and group.grid
         memory = self._memories.get(key) or self._memories.setdefault(key, BankMemory())
         return memory.recall(spectrum, setting, states, weights, nodes, build, stray_light)
 
@@ -220,6 +251,7 @@ class ScenePSFs:
         window: int,
         tolerance: float,
         nodes: tuple[float, ...],
+        grid: int = 1,
     ) -> PSFBank:
         if not is_value_unknown():
             check_finite("the phase of the masks", states)
@@ -235,8 +267,26 @@ class ScenePSFs:
                     f"{pupil.fill_factor}"
                 )
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
-        step = self.pixel_step
+        step = self.pixel_step * grid
         return exact_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
+
+    def _build_grid(
+        self,
+        spectrum: Spectrum,
+        tolerance: float,
+        grid: int,
+        states: Tensor,
+        weights: Tensor,
+        nodes: tuple[float, ...],
+        side: int,
+    ) -> PSFBank:
+        return self._build(states, weights, spectrum, side, tolerance, nodes, grid)
+
+    def _build_wide(
+        self, exact: Any, spectrum: Spectrum, grid: int, side: int, like: Tensor, nodes: tuple[float, ...]
+    ) -> PSFBank:
+        shares, blur = [sum(row) for row in spectrum.plane_weights], cast("WideBlur", self.wide_blur)
+        return wide_psfs(exact, blur, self.pupil, float(self.pixel_step), grid, shares, side, nodes, like)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)
@@ -280,7 +330,9 @@ class ScenePSFs:
         if self.shown is not None or torch.compiler.is_compiling() or is_transformed():
             return self
         with self.lock:
-            shown = settled_timeline(self.masks, self.modulator, dtype)
+            shown, derived = settled_timeline(self.masks, self.modulator, dtype), self._derived
+            if derived.blur is not None and not is_flat(shown.states):  # masks that were flat have been learnt
+                derived.blur, derived.window = None, None
             if self._derived.window is None:
                 _ = self.fitted, self.pupil  # found here, once for all threads
             model = object.__new__(type(self))
@@ -291,9 +343,11 @@ class ScenePSFs:
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
-        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
+        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range, unless blur is wide."""
         if self.measured is not None:
             return tuple(self.measured.defocus.tolist())
+        if self.wide_blur is not None:
+            return self.wide_blur.nodes
         lo, hi = self.camera.defocus_range
         intervals = max(1, round((hi - lo) / self.fidelity.layer_spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
@@ -325,8 +379,44 @@ class ScenePSFs:
     def _fitted_window(self) -> FittedWindow:
         if self.measured is not None:
             return FittedWindow.of_bank(self.measured)
+        if (blur := self.wide_blur) is not None:
+            return FittedWindow(blur.window, self._wide_light(blur))
         self._check_layers()
         return fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
+
+    @property
+    def wide_blur(self) -> WideBlur | None:
+        """Layers and grids of a fast lens without a mask; None where masks are shown, or the blur is narrow.
+
+        Found with the masks as they were at the first look, and dropped as soon as they are no longer flat.
+        """
+        derived = self._derived
+        if not derived.blur_known and not is_value_unknown():
+            derived.blur, derived.blur_known = self._find_wide_blur(), True
+        return derived.blur
+
+    def _find_wide_blur(self) -> WideBlur | None:
+        fidelity, camera, known = self.fidelity, self.camera, self._derived.window
+        shifts = (camera.chromatic_defocus(wavelength) for wavelength in self.spectrum.wavelengths)
+        if self.measured is not None or not fidelity.blurs_by_rays or self.spectrum.basis is not None:
+            return None
+        if next(camera.parameters(), None) is not None or any(shifts) or getattr(self.modulator, "fill_factor", 1) != 1:
+            return None
+        step, span = float(self.pixel_step), camera.defocus_range
+        if not blurs_widely(span, step) or not is_flat(self.states(torch.float32)[0]):
+            return None
+        blur = wide_blur(span, step, self.pupil.extent)
+        return blur if known is None or known.side == blur.window else None
+
+    @torch.no_grad()
+    def _wide_light(self, blur: WideBlur) -> tuple[float, float]:
+        """Return the least and largest share of the light that the windows of small discs hold: large ones hold more."""
+        states, step, shares = self.states(torch.float32), float(self.pixel_step), []
+        for radius in (0.0, 2.0, SMALLEST_WIDE_RADIUS):
+            nodes = (radius * math.pi * step / REFERENCE_WAVELENGTH,)
+            side = window_of(radius, step, self.pupil.extent)
+            shares.append(self._build(*states, self._sampled.flat(), side, 0.1, nodes).energy)
+        return float(torch.cat(shares).min()), float(torch.cat(shares).max())
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:
@@ -373,15 +463,3 @@ class ScenePSFs:
         raise ValueError(
             f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )
-
-
-def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them where it cannot be looked at."""
-    if is_value_unknown():
-        return nodes
-    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-    # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad or is_transformed())
-    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-    return nodes[min(first, last) : last + 1]
