@@ -69,16 +69,17 @@ def gather_groups(
     height, width = image.shape[-2] - 2 * margin, image.shape[-1] - 2 * margin
     seen = defocus[..., margin : margin + height, margin : margin + width]
     parts = list(groups)
-    ends = [group.span[1] for group in parts[:-1]]
-    owner = torch.bucketize(seen.detach().contiguous(), seen.new_tensor(ends), right=True)
-    coded = None
+    ends = seen.new_tensor([group.span[1] for group in parts[:-1]])
+    owner = torch.bucketize(seen.detach().contiguous(), ends, right=True)
+    fine = [group for group in parts if group.grid == 1]
+    if fine:
+        coded = _on_sensor(image, seen, fine[0].bank, margin, border).clone()
+    else:
+        coded = image.new_zeros(*image.shape[:2], height, width)
     for number, group in enumerate(parts):
-        if group.grid == 1:
-            light = _on_sensor(image, seen, group.bank, margin, border)
-        else:
-            light = _on_grid(image, seen, owner == number, group, margin, border)
-        coded = light if coded is None else torch.where(owner == number, light, coded)
-    assert coded is not None
+        if group.grid > 1:
+            for b, pixels, light in _on_grid(image, seen, owner == number, group, margin, border):
+                coded.flatten(2)[b].index_copy_(1, pixels, light)
     return coded
 
 
@@ -91,23 +92,15 @@ def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str
     return gather(plane, beyond, nodes, bank.psfs, border="valid")
 
 
-def _on_grid(image: Tensor, seen: Tensor, own: Tensor, group: LayerGroup, margin: int, border: str) -> Tensor:
-    """Gather on the group's grid, at its own pixels; elsewhere there is nothing."""
-    grid, bank = group.grid, group.bank
-    radius = bank.psfs.shape[-1] // 2 + 2  # one more for interpolation, one for sharpening
-    rows, columns = (-(-side // grid) for side in seen.shape[-2:])
-    plane = avg_pool2d(
-        _extended(
-            image,
-            (margin - radius * grid, margin + (rows + radius) * grid),
-            (margin - radius * grid, margin + (columns + radius) * grid),
-            border,
-        ),
-        grid,
-    )
-    light = plane.new_zeros(*image.shape[:2], *seen.shape[-2:])
-    psfs, nodes = _sharpened(bank.psfs.to(plane.dtype)), bank.defocus.to(seen)
-    size = [next_fast_size(side) for side in plane.shape[-2:]]
+def _on_grid(
+    image: Tensor, seen: Tensor, own: Tensor, group: LayerGroup, margin: int, border: str
+) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Yield images of the batch, pixels (n,) of the group and their light (C, n), some layers at a time."""
+    grid, radius = group.grid, group.bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening
+    rows, columns = ((margin - radius * grid, margin + (-(-side // grid) + radius) * grid) for side in seen.shape[-2:])
+    plane = avg_pool2d(_extended(image, rows, columns, border), grid)
+    psfs, nodes = _sharpened(group.bank.psfs.to(plane.dtype)), group.bank.defocus.to(seen)
+    size, lost = [next_fast_size(side) for side in plane.shape[-2:]], psfs.shape[-1] - 1
     spectrum = torch.fft.rfft2(plane, s=size)
     at_once = max(2, _LAYER_BYTES // max(1, plane.numel() * plane.element_size()))
     for first in range(0, max(1, len(nodes) - 1), at_once - 1):
@@ -115,29 +108,14 @@ def _on_grid(image: Tensor, seen: Tensor, own: Tensor, group: LayerGroup, margin
         inside = own & _between(seen.detach(), nodes, chunk)
         if not bool(inside.any()):
             continue
-        blurred = []
-        for psf in psfs[chunk]:
-            product = spectrum * torch.fft.rfft2(psf, s=size)
-            blurred.append(torch.fft.irfft2(product, s=size))
-        lost = psfs.shape[-1] - 1
+        blurred = [torch.fft.irfft2(spectrum * torch.fft.rfft2(psf, s=size), s=size) for psf in psfs[chunk]]
         layers = torch.stack(blurred, 2)[..., lost : plane.shape[-2], lost : plane.shape[-1]]
-        for b, pixels in enumerate(_pixels(inside, len(image))):
-            y, x = pixels
-            t = _layer_of(seen[b if len(seen) > 1 else 0, 0][y, x], nodes[chunk])
-            samples = _interpolated(layers[b], t, (y + 0.5) / grid + 0.5, (x + 0.5) / grid + 0.5)
-            light = light.index_put((torch.tensor(b), slice(None), y, x), samples.T) if light.requires_grad or samples.requires_grad else _put(light, b, y, x, samples)
-    return light
-
-
-def _put(light: Tensor, b: int, y: Tensor, x: Tensor, samples: Tensor) -> Tensor:
-    light[b, :, y, x] = samples
-    return light
-
-
-def _pixels(inside: Tensor, batch: int) -> Iterator[tuple[Tensor, Tensor]]:
-    for b in range(batch):
-        y, x = inside[b if len(inside) > 1 else 0, 0].nonzero(as_tuple=True)
-        yield y, x
+        for b in range(len(image)):
+            of_scene = b if len(seen) > 1 else 0
+            pixels = inside[of_scene].flatten().nonzero().flatten()
+            row, column = pixels // seen.shape[-1], pixels % seen.shape[-1]
+            layer = _layer_of(seen[of_scene].flatten()[pixels], nodes[chunk])
+            yield b, pixels, _interpolated(layers[b], layer, (row + 0.5) / grid + 0.5, (column + 0.5) / grid + 0.5)
 
 
 def _between(defocus: Tensor, nodes: Tensor, chunk: slice) -> Tensor:
