@@ -33,7 +33,7 @@ def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, 
         wide = model.wide_bank(channels, dtype, defocus)
         if wide is not None:
             return wide
-    elif (blur := model.wide_blur) is not None:
+    if (blur := model.wide_blur) is not None:
         needed = _BANKS * len(blur.nodes) * channels * dtype.itemsize * blur.window**2
         if needed > camera.memory_budget:
             raise ValueError(

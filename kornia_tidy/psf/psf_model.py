@@ -12,8 +12,9 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.psf.camera_settings import digest_of, settings_of
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_window import FittedWindow
-from kornia_tidy.psf.scene_psfs import Derived, ScenePSFs
+from kornia_tidy.psf.scene_psfs import ScenePSFs
 from kornia_tidy.psf.state_bank import StateBank
+from kornia_tidy.psf.wide_model import Derived
 
 
 class PSFModel(ScenePSFs):

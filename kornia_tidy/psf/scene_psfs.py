@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from math import ceil, floor
 from typing import Any, NoReturn, Self, cast
@@ -28,42 +27,26 @@ from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
-from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur, blurs_widely, wide_blur, window_of
-from kornia_tidy.psf.wide_psfs import GroupBank, WideBank, held_nodes, is_flat, learnt_bank, wide_psfs
+from kornia_tidy.psf.wide_blur import BlurGroup
+from kornia_tidy.psf.wide_model import Derived, WidePSFs
+from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank
 from kornia_tidy.runtime.threads import SharedLock
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 
-class Derived:
-    """What follows from the parts of a PSF model and is found when it is first asked for: window, pupil, blur."""
-
-    def __init__(self, window: FittedWindow | None = None) -> None:
-        self.window: FittedWindow | None = window
-        self.pupil: Pupil | None = None
-        self.blur: WideBlur | None = None
-        self.blur_known = False
-
-
-class ScenePSFs:
+class ScenePSFs(WidePSFs):
     """The parts of a :class:`~kornia_tidy.psf.psf_model.PSFModel`, and the PSFs that a scene needs of them."""
 
     masks: PhaseMasks
-    camera: ThinLensCamera | DefocusRange
-    modulator: nn.Module
-    fidelity: Fidelity
-    spectrum: Spectrum
     aperture: Tensor | None
-    measured: PSFBank | None  # PSFs in the place of the masks' own
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
     shown: Timeline | None  # what a snapshot shows, which masks that change leave alone
     lock: SharedLock  # held while masks are read, and by whoever changes several of them at once
 
-    _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
-    _derived: Derived
-    # For each moment and state, for their averages, and for each number of threads.
-    _memories: dict[tuple[int | None, int | None, int, int | None], BankMemory]
+    # For each moment and state, for their averages, for each number of threads and each grid.
+    _memories: dict[tuple[int | None, int | None, int, int], BankMemory]
 
     def __init__(
         self,
@@ -140,22 +123,6 @@ class ScenePSFs:
         """Return the PSFs that a scene needs, averaged over the exposure. See :meth:`scene_banks`."""
         return self.scene_banks(channels, dtype, defocus)[0][1]
 
-    def wide_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor) -> WideBank | None:
-        """Return the PSFs that a scene needs on the grids of wide blur; None where the lens has evenly spaced layers.
-
-        Args:
-            channels: of the image.
-            dtype: float32 or float64.
-            defocus: map in radians, or its lowest and highest value, (2,).
-        """
-        if is_value_unknown() or (blur := self.wide_blur) is None:
-            return None
-        spectrum, groups = self.spectrum_of(channels), []
-        for group, nodes in held_nodes(blur, defocus):
-            bank = self._computed_bank(spectrum, dtype, nodes, None, (self.fidelity.stray_light, 1), group)
-            groups.append(GroupBank(group.grid, (group.nodes[0], group.nodes[-1]), bank))
-        return WideBank(tuple(groups), blur.window)
-
     def scene_banks(
         self, channels: int, dtype: torch.dtype, defocus: Tensor, each_state: bool = False
     ) -> list[tuple[Tensor | float, PSFBank]]:
@@ -224,14 +191,13 @@ class ScenePSFs:
         if group is not None:
             side = group.window
         build = partial(self._build, states, weights, spectrum, side, tolerance)
-        if self.wide_blur is not None and not traced and side in (self.wide_blur.window, group and group.window):
-            exact = partial(self._build_grid, spectrum, tolerance, grid)
-            if learning:
+        if self.wide_blur is not None and not traced:
+            if learning:  # the PSFs are remembered; their gradients are made in the backward pass
                 with torch.no_grad():
                     bank = self._computed_bank(spectrum, dtype, nodes, state, None, group)
-                bank = learnt_bank(bank, exact, states, weights)
+                bank = learnt_bank(bank, partial(self._exact_psfs, spectrum, grid), states, weights, grid)
                 return bank if stray_light is None else bank.with_stray_light(*stray_light)
-            build = partial(self._build_wide, partial(exact, states, weights), spectrum, grid, side, states)
+            build = partial(self._wide_psfs, states, weights, spectrum, grid, side)
         if learning or traced or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
@@ -239,7 +205,7 @@ class ScenePSFs:
         setting = [side, self.fidelity, self._aperture_mark, fill_factor]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
-        key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), group and group.grid
+        key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), grid
         memory = self._memories.get(key) or self._memories.setdefault(key, BankMemory())
         return memory.recall(spectrum, setting, states, weights, nodes, build, stray_light)
 
@@ -269,24 +235,6 @@ class ScenePSFs:
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
         step = self.pixel_step * grid
         return exact_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
-
-    def _build_grid(
-        self,
-        spectrum: Spectrum,
-        tolerance: float,
-        grid: int,
-        states: Tensor,
-        weights: Tensor,
-        nodes: tuple[float, ...],
-        side: int,
-    ) -> PSFBank:
-        return self._build(states, weights, spectrum, side, tolerance, nodes, grid)
-
-    def _build_wide(
-        self, exact: Any, spectrum: Spectrum, grid: int, side: int, like: Tensor, nodes: tuple[float, ...]
-    ) -> PSFBank:
-        shares, blur = [sum(row) for row in spectrum.plane_weights], cast("WideBlur", self.wide_blur)
-        return wide_psfs(exact, blur, self.pupil, float(self.pixel_step), grid, shares, side, nodes, like)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)
@@ -380,43 +328,9 @@ class ScenePSFs:
         if self.measured is not None:
             return FittedWindow.of_bank(self.measured)
         if (blur := self.wide_blur) is not None:
-            return FittedWindow(blur.window, self._wide_light(blur))
+            return FittedWindow(blur.window, self._wide_light())
         self._check_layers()
         return fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
-
-    @property
-    def wide_blur(self) -> WideBlur | None:
-        """Layers and grids of a fast lens without a mask; None where masks are shown, or the blur is narrow.
-
-        Found with the masks as they were at the first look, and dropped as soon as they are no longer flat.
-        """
-        derived = self._derived
-        if not derived.blur_known and not is_value_unknown():
-            derived.blur, derived.blur_known = self._find_wide_blur(), True
-        return derived.blur
-
-    def _find_wide_blur(self) -> WideBlur | None:
-        fidelity, camera, known = self.fidelity, self.camera, self._derived.window
-        shifts = (camera.chromatic_defocus(wavelength) for wavelength in self.spectrum.wavelengths)
-        if self.measured is not None or not fidelity.blurs_by_rays or self.spectrum.basis is not None:
-            return None
-        if next(camera.parameters(), None) is not None or any(shifts) or getattr(self.modulator, "fill_factor", 1) != 1:
-            return None
-        step, span = float(self.pixel_step), camera.defocus_range
-        if not blurs_widely(span, step) or not is_flat(self.states(torch.float32)[0]):
-            return None
-        blur = wide_blur(span, step, self.pupil.extent)
-        return blur if known is None or known.side == blur.window else None
-
-    @torch.no_grad()
-    def _wide_light(self, blur: WideBlur) -> tuple[float, float]:
-        """Return the least and largest share of the light that the windows of small discs hold: large ones hold more."""
-        states, step, shares = self.states(torch.float32), float(self.pixel_step), []
-        for radius in (0.0, 2.0, SMALLEST_WIDE_RADIUS):
-            nodes = (radius * math.pi * step / REFERENCE_WAVELENGTH,)
-            side = window_of(radius, step, self.pupil.extent)
-            shares.append(self._build(*states, self._sampled.flat(), side, 0.1, nodes).energy)
-        return float(torch.cat(shares).min()), float(torch.cat(shares).max())
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:

@@ -19,6 +19,7 @@ from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur, window_of
 
 Exact = Callable[[Tensor, Tensor, tuple[float, ...], int], PSFBank]
 """Exact PSFs of states and their weights, at nodes, in a window."""
+MOST_LEARNT = 257  # sensor pixels; waves cost the square of a window's side
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ def held_nodes(blur: WideBlur, defocus: Tensor) -> list[tuple[BlurGroup, tuple[f
     return found
 
 
-def learnt_bank(bank: PSFBank, exact: Exact, states: Tensor, weights: Tensor) -> PSFBank:
+def learnt_bank(bank: PSFBank, exact: Exact, states: Tensor, weights: Tensor, grid: int) -> PSFBank:
     """Return a bank whose gradients reach the masks: those of the exact PSFs, computed in the backward pass.
 
     Args:
@@ -130,27 +131,36 @@ def learnt_bank(bank: PSFBank, exact: Exact, states: Tensor, weights: Tensor) ->
         exact: makes them by wave optics.
         states: phases, (S, N, N).
         weights: share of the exposure of each.
+        grid: sensor pixels along a side of a pixel of the grid.
+
+    Raises:
+        RuntimeError: in the backward pass, if PSFs are wider than :data:`MOST_LEARNT`.
     """
     nodes = tuple(bank.defocus.tolist())
-    psfs: Any = _ExactGradient.apply(states, weights, bank.psfs, exact, nodes)
+    psfs: Any = _ExactGradient.apply(states, weights, bank.psfs, exact, nodes, grid)
     return PSFBank(psfs, bank.defocus, psfs.sum((2, 3)))
 
 
 class _ExactGradient(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, states: Tensor, weights: Tensor, psfs: Tensor, exact: Exact, nodes: tuple[float, ...]
+        ctx: Any, states: Tensor, weights: Tensor, psfs: Tensor, exact: Exact, nodes: tuple[float, ...], grid: int
     ) -> Tensor:
         ctx.save_for_backward(states, weights)
-        ctx.exact, ctx.nodes = exact, nodes
+        ctx.exact, ctx.nodes, ctx.grid = exact, nodes, grid
         return psfs.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,), saved = grad_outputs, ctx.saved_tensors
+        if (side := gradient.shape[-1] * ctx.grid) > MOST_LEARNT:
+            raise RuntimeError(
+                f"gradients of masks are computed through PSFs of at most {MOST_LEARNT} px, got {side} px: freeze the "
+                f"masks by masks.requires_grad_(False), or take a smaller aperture or a narrower depth_range"
+            )
         wanted = [i for i in (0, 1) if ctx.needs_input_grad[i]]
-        total: list[Tensor | None] = [torch.zeros_like(x) if i in wanted else None for i, x in enumerate(saved)]
+        total = [torch.zeros_like(x) for x in saved]
         for psi, own in zip(ctx.nodes, gradient, strict=True):  # one depth at a time: waves of large windows are large
             with torch.enable_grad():
                 leaves = [x.detach().requires_grad_(i in wanted) for i, x in enumerate(saved)]
@@ -158,7 +168,7 @@ class _ExactGradient(torch.autograd.Function):
                 found = torch.autograd.grad(psfs, [leaves[i] for i in wanted], own[None], allow_unused=True)
             for i, value in zip(wanted, found, strict=True):
                 total[i] = total[i] if value is None else total[i] + value
-        return *total, None, None, None
+        return *(x if i in wanted else None for i, x in enumerate(total)), None, None, None, None
 
 
 def is_flat(states: Tensor) -> bool:

@@ -87,7 +87,8 @@ def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str
     """Gather on the sensor's own pixels, after as much border as the PSFs reach."""
     radius, nodes = bank.psfs.shape[-1] // 2, bank.defocus
     height, width = seen.shape[-2:]
-    plane = _extended(image, (margin - radius, height + margin + radius), (margin - radius, width + margin + radius), border)
+    rows, columns = ((margin - radius, side + margin + radius) for side in (height, width))
+    plane = _extended(image, rows, columns, border)
     beyond = pad(seen, (radius,) * 4)  # not looked at
     return gather(plane, beyond, nodes, bank.psfs, border="valid")
 
