@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.wide_psfs import WideBank
+from kornia_tidy.render.coarse_gather import gather_groups
 
 Banks = list[tuple[Tensor | float, PSFBank]] | WideBank
 _BANKS = 3  # held at a time by scatter and occlusion: of layers, and their spectra
@@ -43,3 +44,15 @@ def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, 
                 f"depth_range, or a larger memory_budget"
             )
     return model.scene_banks(channels, dtype, reach, camera.compositing == "occlusion")
+
+
+def wide_irradiance(light: Tensor, defocus: Tensor, bank: WideBank, border: str) -> Tensor:
+    """Return the irradiance of a scene through wide blur. See :func:`kornia_tidy.render.coarse_gather.gather_groups`.
+
+    Args:
+        light: (B, C, H, W) linear light.
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+        bank: PSFs.
+        border: what lies beyond the image.
+    """
+    return gather_groups(light, defocus, bank.groups, bank.window, border).to(light.dtype)

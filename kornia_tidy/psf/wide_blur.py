@@ -1,12 +1,12 @@
 r"""Wide blur: layers, windows and grids for the discs of a fast lens without a mask.
 
 Where a pixel is wider than the diffraction pattern, a PSF depends on the radius r of the defocus disc in pixels, not on
-radians of phase. Layers then stand half a pixel of r apart near focus, and farther apart for larger discs,
+radians of phase. Layers then stand 0.4 pixels of r apart near focus, and farther apart for larger discs,
 
-.. math:: \Delta r = \tfrac{1}{2} \max(1, r / 3)^{3/4},
+.. math:: \Delta r = 0.4 \max(1, r / 3)^{3/4},
 
-because a change of a large disc is spread over its long edge. Discs of 16 pixels and more are smooth: their layers are
-convolved on a grid of 2, 4, 8, ... pixels, on which the radius is between 8 and 16. Errors are given in
+because a change of a large disc is spread over its long edge. Discs of 24 pixels and more are smooth: their layers are
+convolved on a grid of 2, 4, 8, ... pixels, on which the radius is between 12 and 24. Errors are given in
 :data:`GRID_ERROR`, :data:`LAYER_ERROR` and :func:`ray_error`, root mean square for a scene whose standard deviation is
 a fifth of full scale (the Aloe scene), in linear light.
 """
@@ -19,13 +19,13 @@ from dataclasses import dataclass
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.geometric_psf import blur_radius
 
-LAYER_ERROR = 5e-4  # measured: 4.7e-4 between discs of 2 and 2.5 px, 6e-4 between 8 and 9 px, less for larger ones
-GRID_ERROR = 6e-4  # measured: 5.6e-4 where the radius is 8 pixels of the grid, 3.5e-4 where it is 12
-RAY_TOLERANCE = 1e-3  # error of the geometric PSF from which on it is taken
-FINE_RADIUS = 16.0  # pixels; up to here layers are convolved on the sensor's own pixels
+LAYER_ERROR = 4.5e-4  # measured for discs of 2 to 50 px; half way between layers, which is the worst
+GRID_ERROR = 3.5e-4  # measured where the radius is 12 pixels of the grid; 1.5e-4 where it is 24
+RAY_TOLERANCE = 8e-4  # error of the geometric PSF from which on it is taken
+FINE_RADIUS = 24.0  # pixels; up to here layers are convolved on the sensor's own pixels
 SMALLEST_WIDE_RADIUS = 18.0  # pixels; the largest disc of a lens whose layers are worth this
 _MARGIN = 6.0  # cycles per pupil radius around the disc: holds 98 % of the light or more, also in focus
-_HALF_PIXEL = 0.5  # of the radius, between layers near focus
+_SPACING = 0.4  # pixels of the radius, between layers near focus
 _LARGE_RADIUS = 3.0  # pixels; layers of larger discs are farther apart
 
 
@@ -105,7 +105,7 @@ def wide_blur(defocus_range: tuple[float, float], step: float, extent: float) ->
     Example:
         >>> blur = wide_blur((-572.0, 572.0), 1.625e-6, 1.05)
         >>> [group.grid for group in blur.groups], blur.window, len(blur.nodes)
-        ([4, 2, 1, 2, 4], 131, 65)
+        ([4, 2, 1, 2, 4], 131, 83)
     """
     lo, hi = defocus_range
     per_pixel = math.pi * step / REFERENCE_WAVELENGTH  # radians of defocus for a pixel of radius
@@ -161,15 +161,15 @@ def _radii(largest: float) -> list[float]:
 
 def _count(radius: float) -> float:
     """Return the number of layers up to a radius: the integral of 1 / dr."""
-    inside = min(radius, _LARGE_RADIUS) / _HALF_PIXEL
-    return inside + 4 * _LARGE_RADIUS * (max(1.0, radius / _LARGE_RADIUS) ** 0.25 - 1) / _HALF_PIXEL
+    inside = min(radius, _LARGE_RADIUS) / _SPACING
+    return inside + 4 * _LARGE_RADIUS * (max(1.0, radius / _LARGE_RADIUS) ** 0.25 - 1) / _SPACING
 
 
 def _radius(count: float) -> float:
-    inside = _LARGE_RADIUS / _HALF_PIXEL
+    inside = _LARGE_RADIUS / _SPACING
     if count <= inside:
-        return count * _HALF_PIXEL
-    return _LARGE_RADIUS * (1 + (count - inside) * _HALF_PIXEL / (4 * _LARGE_RADIUS)) ** 4
+        return count * _SPACING
+    return _LARGE_RADIUS * (1 + (count - inside) * _SPACING / (4 * _LARGE_RADIUS)) ** 4
 
 
 def _grid(one: float, other: float) -> int:
