@@ -57,7 +57,7 @@ class TestWideCaptures(BaseTester):
         for x, step in ((image, 1e-2), (depth, 1e-6)):
             way = torch.rand_like(x) * step
             with torch.no_grad():
-                a, b = ([way, 0] if x is image else [0, way])
+                a, b = [way, 0] if x is image else [0, way]
                 ahead, back = ((optics(image + s * a, depth + s * b) * weight).sum() for s in (1, -1))
                 self.assert_close((x.grad * way).sum(), (ahead - back) / 2, rtol=2e-2, atol=0)
 
