@@ -47,8 +47,8 @@ class WidePlan(RenderPlan):
         missed = f", above the tolerance of {self.tolerance:g}" if self.predicted_error > self.tolerance else ""
         return "\n".join(
             [
-                f"{self.fidelity.name}, wide blur by rays: error {self.predicted_error:.1e} of full scale against exact "
-                f"PSFs of every depth{missed}",
+                f"{self.fidelity.name}, wide blur by rays: error {self.predicted_error:.1e} of full scale against "
+                f"exact PSFs of every depth{missed}",
                 f"  computes: {self.layers_present} of {self.layers_total} layers, spaced by the radius of the defocus "
                 f"disc (error {layers:.1e}), convolved on the sensor's pixels{names}",
                 f"  approximates: discs of {self.ray_radius:.1f} pixels of radius and more by geometric optics (error "

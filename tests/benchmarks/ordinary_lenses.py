@@ -104,7 +104,7 @@ def main() -> None:
           "RMSE | promised |")  # fmt: skip
     print("|---" * 10 + "|", flush=True)
     for name in LENSES:
-        subprocess.run([sys.executable, "-m", "tests.benchmarks.ordinary_lenses", name], check=True)  # noqa: S603
+        subprocess.run([sys.executable, "-m", "tests.benchmarks.ordinary_lenses", name], check=True)
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ class TestWideCaptures(BaseTester):
 
     def test_exception_of_occlusion_beyond_the_memory(self):
         optics = fast_camera(1.4, 0.5, compositing="occlusion")
-        with pytest.raises(ValueError, match="needs 155 layers of PSFs 699 px wide, some .* GiB"):
+        with pytest.raises(ValueError, match=r"needs 155 layers of PSFs 699 px wide, some .* GiB"):
             optics(light(64), stairs(64))
 
     @torch.no_grad()

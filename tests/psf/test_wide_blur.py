@@ -38,7 +38,7 @@ class TestGeometricPSFs(BaseTester):
         assert float(psf.min()) >= 0
 
     def test_feature_a_square_aperture_makes_a_uniform_square(self):
-        """Two cells of half a radius: the image has sides of r pixels, here 4, so 4 x 4 with half pixels at its edges."""
+        """Two cells of half a radius: the image is 4 pixels wide for r = 4, with half pixels at its edges."""
         psi = 4 * math.pi * STEP / REFERENCE_WAVELENGTH
         psf = geometric_psfs(torch.ones(2, 2), 0.5, [psi], STEP, 7)[0]
         line = torch.tensor([0, 0.5, 1, 1, 1, 0.5, 0], dtype=torch.float64) / 4
