@@ -24,7 +24,7 @@ GRID_ERROR = 3.5e-4  # measured where the radius is 12 pixels of the grid; 1.5e-
 RAY_TOLERANCE = 8e-4  # error of the geometric PSF from which on it is taken
 SCENE_DEVIATION = 0.19  # standard deviation of the light for which the errors above were measured
 FINE_RADIUS = 24.0  # pixels; up to here layers are convolved on the sensor's own pixels
-SMALLEST_WIDE_RADIUS = 18.0  # pixels; the largest disc of a lens whose layers are worth this
+SMALLEST_WIDE_RADIUS = 18.0  # pixels; lenses with smaller discs keep evenly spaced layers
 _MARGIN = 6.0  # cycles per pupil radius around the disc: holds 98 % of the light or more, also in focus
 _SPACING = 0.4  # pixels of the radius, between layers near focus
 _LARGE_RADIUS = 3.0  # pixels; layers of larger discs are farther apart
@@ -32,7 +32,7 @@ _LARGE_RADIUS = 3.0  # pixels; layers of larger discs are farther apart
 
 @dataclass(frozen=True)
 class BlurGroup:
-    """Layers whose discs are convolved on one grid.
+    """Layers that are convolved on the same grid.
 
     Args:
         grid: sensor pixels along a side of a pixel of the grid.
@@ -47,7 +47,7 @@ class BlurGroup:
 
 @dataclass(frozen=True)
 class WideBlur:
-    """Layers of a lens whose blur is wide, in groups of ascending defocus.
+    """Layers of wide blur, in groups of ascending defocus.
 
     Args:
         groups: see :class:`BlurGroup`.
@@ -96,7 +96,7 @@ def blurs_widely(defocus_range: tuple[float, float], step: float) -> bool:
 
 
 def wide_blur(defocus_range: tuple[float, float], step: float, extent: float) -> WideBlur:
-    """Return the layers of a lens whose blur is wide.
+    """Return the layers of wide blur, with their grids and windows.
 
     Args:
         defocus_range: in radians.
@@ -106,7 +106,7 @@ def wide_blur(defocus_range: tuple[float, float], step: float, extent: float) ->
     Example:
         >>> blur = wide_blur((-572.0, 572.0), 1.625e-6, 1.05)
         >>> [group.grid for group in blur.groups], blur.window, len(blur.nodes)
-        ([4, 2, 1, 2, 4], 131, 83)
+        ([4, 2, 1, 2, 4], 131, 85)
     """
     lo, hi = defocus_range
     per_pixel = math.pi * step / REFERENCE_WAVELENGTH  # radians of defocus for a pixel of radius

@@ -32,7 +32,7 @@ class Derived:
 
 
 class WidePSFs:
-    """Layers and PSFs of a lens whose blur is wide, see :mod:`kornia_tidy.psf.wide_blur`."""
+    """Layers and PSFs of wide blur, see :mod:`kornia_tidy.psf.wide_blur`."""
 
     camera: ThinLensCamera | DefocusRange
     modulator: nn.Module
