@@ -82,6 +82,10 @@ class Fidelity:
             ``"each"`` renders every state of the exposure and averages the images. ``"mean"`` renders once with the
             average PSFs, in a fifth of the time for five masks. With five random masks, the Aloe scene and
             ``balanced``, its error is 1.6e-5 RMS of full scale, 5e-4 at most.
+        wide_blur: layers and PSFs of a lens without a mask, of f/5.6 or faster on pixels of 6 um. ``"rays"`` spaces
+            layers by the radius of the disc, convolves large discs on coarser grids, and takes geometric-optics PSFs
+            for them, see :mod:`kornia_tidy.psf.wide_blur`. ``"waves"`` keeps evenly spaced layers of exact PSFs in one
+            window. Any mask that is not flat is always rendered by waves.
 
     Raises:
         ValueError: if a value is not allowed.
@@ -106,12 +110,14 @@ class Fidelity:
     double: bool = False
     correlate: bool = False
     occlusion_states: str = "each"
+    wide_blur: str = "rays"
 
     def __post_init__(self) -> None:
         check_choice("propagation", self.propagation, ("exact", "paper"))
         check_choice("layers", self.layers, LAYERS)
         check_choice("stray_light", self.stray_light, ("renormalize", "veil", "discard"))
         check_choice("occlusion_states", self.occlusion_states, ("each", "mean"))
+        check_choice("wide_blur", self.wide_blur, ("rays", "waves"))
         check_positive("pixel_tolerance", self.pixel_tolerance)
         check_positive("layer_spacing", self.layer_spacing, "radians")
         if not 0 < self.enclosed_energy < 1:
@@ -126,6 +132,12 @@ class Fidelity:
                     f"{name} must be at most {WIDEST_WINDOW} pixels, got {side}: a PSF of three colours would take "
                     f"{3 * 4 * side**2 / 2**30:.3g} GiB, at each depth"
                 )
+
+    @property
+    def blurs_by_rays(self) -> bool:
+        """Whether these settings allow the approximations of wide blur."""
+        usual = self.layers in ("nearest", "linear") and self.stray_light == "renormalize" and not self.correlate
+        return self.wide_blur == "rays" and self.propagation == "exact" and self.window is None and usual
 
     @classmethod
     def preset(cls, name: str) -> Fidelity:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from kornia_tidy.camera.samples import compute_dtype, read_sample, survey_defocus
+from kornia_tidy.psf.wide_psfs import WideBank
 from kornia_tidy.render.dispatch import Explanation, explain
 from kornia_tidy.render.scene import layered_scene
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: float) -> RenderPlan:
     """Return the cheapest fidelity for a scene within an error. See :meth:`TiDyOptics.plan`."""
     from kornia_tidy.planning.planner import Planner  # noqa: PLC0415 (a capture without a plan does not need it)
+    from kornia_tidy.planning.wide_plan import plan_wide  # noqa: PLC0415
 
     shape = (len(optics.spectrum.weights), *depth.shape[-2:])
     blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
@@ -26,7 +28,22 @@ def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: fl
         raise ValueError(f"a plan needs at least one image and its depth, got {found}")
     light = None if image is None else optics.decode(sample.image.to(sample.dtype))
     defocus = optics.defocus(sample.depth.to(compute_dtype(depth.dtype, optics.fidelity)))
+    if (wide := plan_wide(optics, defocus, light, tolerance)) is not None:
+        return wide
     return Planner(optics, sample.image.shape[1]).scene(defocus, light).plan(tolerance)
+
+
+def explain_groups(bank: WideBank, light: Tensor) -> Explanation:
+    """Return how wide blur is gathered: by groups of layers on their grids, whatever their times.
+
+    Args:
+        bank: of the scene.
+        light: (B, C, H, W).
+    """
+    groups = ", ".join(f"{len(group.bank.defocus)} on grids of {group.grid} px" for group in bank.groups)
+    (batch, channels, height, width) = light.shape
+    words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
+    return Explanation(words, "grids", {}, {})
 
 
 def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
@@ -37,6 +54,8 @@ def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
     light = optics.decode(sample.image.to(sample.dtype))
     defocus = optics.defocus(sample.depth.to(sample.dtype))
     reach = survey_defocus([defocus], optics).reach
+    if optics.compositing == "gather" and optics.psf_model.wide_blur is not None:
+        return explain_groups(optics.psf_model.wide_bank(light.shape[1], sample.dtype, defocus), light)
     (_, bank), *_ = optics.psf_model.scene_banks(light.shape[1], sample.dtype, reach, optics.compositing == "occlusion")
     fidelity = optics.psf_model.fidelity
     return explain(

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.capture_psfs import capture_psfs
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, cropped, survey_defocus
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.render.borders import check_border
@@ -54,7 +55,7 @@ def capture_in_bands(
     check_border(camera.border, *image.shape[-2:], camera.window)
     height, width = cropped(image, radius if camera.border == "valid" else 0).shape[-2:]
     span = survey_defocus((camera.defocus(part.to(dtype)) for part in depth.split(rows, dim=-2)), camera)
-    banks = camera.psf_model.scene_banks(image.shape[1], dtype, span.reach, camera.compositing == "occlusion")
+    banks = capture_psfs(camera, image.shape[1], dtype, span.reach, span.reach)
     sides = "replicate" if camera.border == "zero" else camera.border  # black has no depth of its own
     coded = image.new_empty(*image.shape[:2], height, width)
     for top in range(0, height, rows):

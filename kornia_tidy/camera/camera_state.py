@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.psf_model_owner import PSFModelOwner
 from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.psf.camera_settings import (
     EXTRA_STATE,
     check_settings,
@@ -58,7 +59,8 @@ class CameraState(PSFModelOwner):
                 check_choice(name, saved[name], tuple(allowed))
         fidelity = saved.get("fidelity")
         if isinstance(fidelity, dict):
-            saved = {**saved, "fidelity": {**fidelity, "window": saved.get("fixed_window")}}
+            own = {"wide_blur": Fidelity.wide_blur, **fidelity, "window": saved.get("fixed_window")}
+            saved = {**saved, "fidelity": own}
         take_over(self, saved, self.settings(), {name: name for name in (*PARTS, "aperture", *OWN_SETTINGS)})
         self.psf_model = self.psf_model.with_window(None)
 

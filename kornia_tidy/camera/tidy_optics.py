@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from kornia_tidy.camera.advice import explain_capture, plan_capture
 from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
+from kornia_tidy.camera.capture_psfs import Banks, capture_psfs, wide_irradiance
 from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
 from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus, tell_of_defocus, zero_of
@@ -20,7 +21,6 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from kornia_tidy.planning.render_plan import RenderPlan
     from kornia_tidy.render.dispatch import Explanation
 
-Banks = list[tuple[Tensor | float, PSFBank]]
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
 
@@ -205,10 +204,9 @@ class TiDyOptics(CameraState):
             light = now.decode(sample.image.to(sample.dtype))
             defocus = now.defocus(sample.depth.to(sample.dtype))
             reach = survey_defocus([defocus], now).reach
-            banks = now.psf_model.scene_banks(light.shape[1], sample.dtype, reach, now.compositing == "occlusion")
+            banks = capture_psfs(now, light.shape[1], sample.dtype, reach, defocus)
             irradiance = now.render(light, defocus, banks, now.border)
-            seen = irradiance if now.sensor is None else now.sensor(irradiance, params=params, generator=generator)
-            coded = now.encode(seen)
+            coded = now.encode(now.expose(irradiance, params, generator))
         return sample.coded(coded.to(sample.image.dtype))
 
     def capture(
@@ -271,6 +269,8 @@ class TiDyOptics(CameraState):
             banks: PSFs, each with its share of the exposure.
             border: what lies beyond the image.
         """
+        if not isinstance(banks, list):
+            return wide_irradiance(light, defocus, banks, border)
         # Where colours have spectra, each channel of the sensor sees a plane for each channel of the scene.
         reflectances = banks[0][1].psfs.shape[1] // light.shape[1]
         if reflectances > 1:

@@ -12,8 +12,9 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.psf.camera_settings import digest_of, settings_of
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_window import FittedWindow
-from kornia_tidy.psf.scene_psfs import Derived, ScenePSFs
+from kornia_tidy.psf.scene_psfs import ScenePSFs
 from kornia_tidy.psf.state_bank import StateBank
+from kornia_tidy.psf.wide_model import Derived
 
 
 class PSFModel(ScenePSFs):
@@ -188,6 +189,8 @@ class PSFModel(ScenePSFs):
         """Return what shapes the PSFs besides the weights, by the names of the parts."""
         fidelity = settings_of(self.fidelity)
         fidelity.pop("window")  # the window has an entry of its own
+        if fidelity["wide_blur"] == Fidelity.wide_blur:  # states of earlier versions do not have it
+            fidelity.pop("wide_blur")
         bank = self.measured
         return {
             **{name: settings_of(getattr(self, name)) for name in ("masks", "camera", "modulator", "spectrum")},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from functools import partial
 from math import ceil, floor
 from typing import Any, NoReturn, Self, cast
@@ -25,6 +24,7 @@ from kornia_tidy.psf.defocus_interpolation import (
     fine_nodes,
     interpolable_spacing,
     interpolated_bank,
+    nodes_around,
 )
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.lens_limits import PARTS, check_defocus_range, check_layer_spacing
@@ -34,39 +34,26 @@ from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
+from kornia_tidy.psf.wide_blur import BlurGroup
+from kornia_tidy.psf.wide_model import Derived, WidePSFs
+from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank
 from kornia_tidy.runtime.threads import SharedLock
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 
-class Derived:
-    """What follows from the parts of a PSF model and is found when it is first asked for: the window and the pupil."""
-
-    def __init__(self, window: FittedWindow | None = None) -> None:
-        self.window, self.pupil = window, None
-        self.window: FittedWindow | None
-        self.pupil: Pupil | None
-
-
-class ScenePSFs:
+class ScenePSFs(WidePSFs):
     """The parts of a :class:`~kornia_tidy.psf.psf_model.PSFModel`, and the PSFs that a scene needs of them."""
 
     masks: PhaseMasks
-    camera: ThinLensCamera | DefocusRange
-    modulator: nn.Module
-    fidelity: Fidelity
-    spectrum: Spectrum
     aperture: Tensor | None
-    measured: PSFBank | None  # PSFs in the place of the masks' own
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
     shown: Timeline | None  # what a snapshot shows, which masks that change leave alone
     lock: SharedLock  # held while masks are read, and by whoever changes several of them at once
 
-    _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
-    _derived: Derived
-    # For each moment and state, for their averages, and for each number of threads.
-    _memories: dict[tuple[int | None, int | None, int], BankMemory]
+    # For each moment and state, for their averages, for each number of threads and each grid.
+    _memories: dict[tuple[int | None, int | None, int, int], BankMemory]
 
     def __init__(
         self,
@@ -197,16 +184,27 @@ class ScenePSFs:
         nodes: tuple[float, ...],
         state: int | None = None,
         stray_light: tuple[str, int] | None = None,
+        group: BlurGroup | None = None,
     ) -> PSFBank:
-        """Return the PSFs at these nodes, computed or remembered."""
+        """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid."""
         states, weights = self.states(dtype)
         if state is not None:
             states, weights = states[state : state + 1], torch.ones_like(weights[:1])
         derived = self._derived
         side = self.window if derived.window is None else derived.window.side
-        build = partial(self._build, states, weights, spectrum, side, self.fidelity.pixel_tolerance)
+        tolerance, grid = self.fidelity.pixel_tolerance, 1 if group is None else group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
         traced = torch.compiler.is_compiling() or is_transformed()
+        if group is not None:
+            side = group.window
+        build = partial(self._build, states, weights, spectrum, side, tolerance)
+        if self.wide_blur is not None and not traced:
+            if learning:  # the PSFs are remembered; their gradients are made in the backward pass
+                with torch.no_grad():
+                    bank = self._computed_bank(spectrum, dtype, nodes, state, None, group)
+                bank = learnt_bank(bank, partial(self._exact_psfs, spectrum, grid), states, weights, grid)
+                return bank if stray_light is None else bank.with_stray_light(*stray_light)
+            build = partial(self._wide_psfs, states, weights, spectrum, grid, side)
         if learning or traced or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
@@ -214,7 +212,7 @@ class ScenePSFs:
         setting = [side, self.fidelity, self._aperture_mark, fill_factor]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
-        key = self.moment, state if self.state is None else self.state, torch.get_num_threads()
+        key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), grid
         memory = self._memories.get(key) or self._memories.setdefault(key, BankMemory())
         return memory.recall(spectrum, setting, states, weights, nodes, build, stray_light)
 
@@ -226,6 +224,7 @@ class ScenePSFs:
         window: int,
         tolerance: float,
         nodes: tuple[float, ...],
+        grid: int = 1,
     ) -> PSFBank:
         if not is_value_unknown():
             check_finite("the phase of the masks", states)
@@ -241,7 +240,7 @@ class ScenePSFs:
                     f"{pupil.fill_factor}"
                 )
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
-        step = self.pixel_step
+        step = self.pixel_step * grid
         return exact_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
@@ -286,7 +285,9 @@ class ScenePSFs:
         if self.shown is not None or torch.compiler.is_compiling() or is_transformed():
             return self
         with self.lock:
-            shown = settled_timeline(self.masks, self.modulator, dtype)
+            shown, derived = settled_timeline(self.masks, self.modulator, dtype), self._derived
+            if derived.blur is not None and not is_flat(shown.states):  # masks that were flat have been learnt
+                derived.blur, derived.window = None, None
             if self._derived.window is None:
                 _ = self.fitted, self.pupil  # found here, once for all threads
             model = object.__new__(type(self))
@@ -297,9 +298,11 @@ class ScenePSFs:
 
     @property
     def defocus_nodes(self) -> tuple[float, ...]:
-        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."""
+        """Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range, unless blur is wide."""
         if self.measured is not None:
             return tuple(self.measured.defocus.tolist())
+        if self.wide_blur is not None:
+            return self.wide_blur.nodes
         lo, hi = self.camera.defocus_range
         spacing = self.fidelity.layer_spacing
         if self.fidelity.layers == "bandlimited":
@@ -334,6 +337,8 @@ class ScenePSFs:
     def _fitted_window(self) -> FittedWindow:
         if self.measured is not None:
             return FittedWindow.of_bank(self.measured)
+        if (blur := self.wide_blur) is not None:
+            return FittedWindow(blur.window, self._wide_light())
         self._check_layers()
         return fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
 
@@ -382,15 +387,3 @@ class ScenePSFs:
         raise ValueError(
             f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )
-
-
-def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them where it is empty or cannot be looked at."""
-    if is_value_unknown() or not defocus.numel():
-        return nodes
-    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-    # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad or is_transformed())
-    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-    return nodes[min(first, last) : last + 1]

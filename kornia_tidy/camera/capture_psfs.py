@@ -1,0 +1,58 @@
+"""The PSFs of a capture: in groups of layers where blur is wide, else one bank, or one for each state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.wide_psfs import WideBank
+from kornia_tidy.render.coarse_gather import gather_groups
+
+Banks = list[tuple[Tensor | float, PSFBank]] | WideBank
+_BANKS = 3  # held at a time by scatter and occlusion: of layers, and their spectra
+
+
+def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, defocus: Tensor) -> Banks:
+    """Return the PSFs that a capture needs.
+
+    Args:
+        camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
+        channels: of the image.
+        dtype: float32 or float64.
+        reach: lowest and highest defocus of the scene, (2,), or its map, see
+            :func:`kornia_tidy.camera.samples.survey_defocus`.
+        defocus: the map in radians, or ``reach`` again where it is not at hand.
+
+    Raises:
+        ValueError: if blur is so wide that scatter or occlusion would need more than the camera's memory budget.
+    """
+    model = camera.psf_model
+    if camera.compositing == "gather" and defocus.numel():
+        wide = model.wide_bank(channels, dtype, defocus)
+        if wide is not None:
+            return wide
+    if (blur := model.wide_blur) is not None:
+        needed = _BANKS * len(blur.nodes) * channels * dtype.itemsize * blur.window**2
+        if needed > camera.memory_budget:
+            raise ValueError(
+                f"compositing {camera.compositing!r} of this lens needs {len(blur.nodes)} layers of PSFs {blur.window} "
+                f"px wide, some {needed / 2**30:.1f} GiB, of which memory_budget allows "
+                f"{camera.memory_budget / 2**30:.1f} GiB: take compositing='gather', a smaller aperture, a narrower "
+                f"depth_range, or a larger memory_budget"
+            )
+    return model.scene_banks(channels, dtype, reach, camera.compositing == "occlusion")
+
+
+def wide_irradiance(light: Tensor, defocus: Tensor, bank: WideBank, border: str) -> Tensor:
+    """Return the irradiance of a scene through wide blur. See :func:`kornia_tidy.render.coarse_gather.gather_groups`.
+
+    Args:
+        light: (B, C, H, W) linear light.
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+        bank: PSFs.
+        border: what lies beyond the image.
+    """
+    return gather_groups(light, defocus, bank.groups, bank.window, border).to(light.dtype)

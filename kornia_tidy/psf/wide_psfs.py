@@ -1,0 +1,182 @@
+"""PSFs of wide blur: exact near focus, geometric for large discs, on the grid of each group of layers."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from kornia_tidy.psf.defocus_interpolation import nodes_around
+from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur, window_of
+
+Exact = Callable[[Tensor, Tensor, tuple[float, ...], int], PSFBank]
+"""Exact PSFs of states and their weights, at nodes, in a window."""
+MOST_LEARNT = 257  # sensor pixels; waves cost the square of a window's side
+
+
+@dataclass(frozen=True, eq=False)
+class GroupBank:
+    """PSFs of a group of layers on its grid.
+
+    Args:
+        grid: sensor pixels along a side of a pixel of the grid.
+        span: defocus in radians between which pixels belong to the group.
+        bank: PSFs, each pixel of the grid with the light that falls on it.
+    """
+
+    grid: int
+    span: tuple[float, float]
+    bank: PSFBank
+
+
+@dataclass(frozen=True, eq=False)
+class WideBank:
+    """PSFs of the layers that a scene holds, in groups of ascending defocus.
+
+    Args:
+        groups: those that hold pixels of the scene.
+        window: side in sensor pixels that holds the PSFs of the lens at every depth.
+    """
+
+    groups: tuple[GroupBank, ...]
+    window: int
+
+    @property
+    def psfs(self) -> Tensor:
+        """PSFs of the first group, (D, C, P, P)."""
+        return self.groups[0].bank.psfs
+
+
+def wide_psfs(
+    exact: Callable[[tuple[float, ...], int], PSFBank],
+    blur: WideBlur,
+    pupil: Pupil,
+    step: float,
+    grid: int,
+    shares: Sequence[float],
+    window: int,
+    nodes: tuple[float, ...],
+    like: Tensor,
+) -> PSFBank:
+    """Return PSFs on one grid: exact for small discs, geometric for large ones.
+
+    Args:
+        exact: makes PSFs at nodes, in a window.
+        blur: says from which radius on PSFs are geometric.
+        pupil: the aperture.
+        step: a sensor pixel seen from the pupil in metres.
+        grid: sensor pixels along a side of a pixel of the grid.
+        shares: light that each channel sees of white.
+        window: side of the PSFs in pixels of the grid.
+        nodes: defocus in radians, ascending.
+        like: a tensor of the PSFs' type and device.
+    """
+    small = tuple(psi for psi in nodes if blur_radius(psi, step) < blur.ray_radius)
+    far = tuple(psi for psi in nodes if psi < 0 and psi not in small)
+    near = tuple(psi for psi in nodes if psi > 0 and psi not in small)
+    parts = []
+    for span in (far, near):
+        psfs = like.new_zeros(len(span), len(shares), window, window)
+        if span:
+            rays = geometric_psfs(pupil.amplitude.to(like.device), pupil.cell_pitch, span, step * grid, window)
+            psfs = psfs + rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
+        parts.append(psfs)
+    if small:
+        largest = max(blur_radius(psi, step) for psi in small)
+        side = min(window, window_of(largest, step, pupil.extent, grid))
+        psfs = exact(small, side).psfs
+        parts.insert(1, pad(psfs, ((window - side) // 2,) * 4))
+    psfs = torch.cat(parts)
+    return PSFBank(psfs, psfs.new_tensor(nodes), psfs.sum((2, 3)))
+
+
+def held_nodes(blur: WideBlur, defocus: Tensor) -> list[tuple[BlurGroup, tuple[float, ...]]]:
+    """Return the groups that hold pixels of a scene, and the nodes of each around those pixels.
+
+    Args:
+        blur: the lens.
+        defocus: map in radians, or its lowest and highest value, (2,), between which everything counts.
+    """
+    nodes = blur.nodes
+    if defocus.ndim == 1:
+        around = nodes_around(nodes, defocus)
+        first = min(nodes.index(around[0]), len(nodes) - 2)
+        present = set(range(first, max(first + 1, nodes.index(around[-1]))))
+    else:
+        inner = defocus.new_tensor(nodes[1:-1], dtype=torch.float64)
+        index = torch.bucketize(defocus.detach().double().contiguous(), inner, right=True)
+        present = set(torch.bincount(index.flatten(), minlength=len(nodes) - 1).nonzero().flatten().tolist())
+    found = []
+    for group in blur.groups:
+        start = bisect_right(nodes, group.nodes[0]) - 1
+        own = [i for i in range(len(group.nodes) - 1) if start + i in present]
+        if own:
+            found.append((group, tuple(group.nodes[i] for i in sorted({i + k for i in own for k in (0, 1)}))))
+    return found
+
+
+def learnt_bank(bank: PSFBank, exact: Exact, states: Tensor, weights: Tensor, grid: int) -> PSFBank:
+    """Return a bank whose gradients reach the masks: those of the exact PSFs, computed in the backward pass.
+
+    Args:
+        bank: PSFs of these states, without gradients.
+        exact: makes them by wave optics.
+        states: phases, (S, N, N).
+        weights: share of the exposure of each.
+        grid: sensor pixels along a side of a pixel of the grid.
+
+    Raises:
+        RuntimeError: in the backward pass, if PSFs are wider than :data:`MOST_LEARNT`.
+    """
+    nodes = tuple(bank.defocus.tolist())
+    psfs: Any = _ExactGradient.apply(states, weights, bank.psfs, exact, nodes, grid)
+    return PSFBank(psfs, bank.defocus, psfs.sum((2, 3)))
+
+
+class _ExactGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, states: Tensor, weights: Tensor, psfs: Tensor, exact: Exact, nodes: tuple[float, ...], grid: int
+    ) -> Tensor:
+        ctx.save_for_backward(states, weights)
+        ctx.exact, ctx.nodes, ctx.grid = exact, nodes, grid
+        return psfs.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), saved = grad_outputs, ctx.saved_tensors
+        if (side := gradient.shape[-1] * ctx.grid) > MOST_LEARNT:
+            raise RuntimeError(
+                f"gradients of masks are computed through PSFs of at most {MOST_LEARNT} px, got {side} px: freeze the "
+                f"masks by masks.requires_grad_(False), or take a smaller aperture or a narrower depth_range"
+            )
+        wanted = [i for i in (0, 1) if ctx.needs_input_grad[i]]
+        total = [torch.zeros_like(x) for x in saved]
+        for psi, own in zip(ctx.nodes, gradient, strict=True):  # one depth at a time: waves of large windows are large
+            with torch.enable_grad():
+                leaves = [x.detach().requires_grad_(i in wanted) for i, x in enumerate(saved)]
+                psfs = ctx.exact(*leaves, (psi,), gradient.shape[-1]).psfs
+                found = torch.autograd.grad(psfs, [leaves[i] for i in wanted], own[None], allow_unused=True)
+            for i, value in zip(wanted, found, strict=True):
+                total[i] = total[i] if value is None else total[i] + value
+        return *(x if i in wanted else None for i, x in enumerate(total)), None, None, None, None
+
+
+def is_flat(states: Tensor) -> bool:
+    """Return whether all states show the same phase at every pixel, so that the lens is one without a mask.
+
+    Example:
+        >>> is_flat(torch.zeros(2, 4, 4)), is_flat(torch.rand(2, 4, 4))
+        (True, False)
+    """
+    flat = states.detach().flatten(1)
+    return bool((flat == flat[:, :1]).all())

@@ -1,0 +1,173 @@
+r"""Gather on coarse grids: large discs are convolved with an image of fewer pixels, and interpolated to the sensor's.
+
+A layer with a large PSF is smooth. Its image is averaged over squares of k pixels, convolved there with the PSF of a
+camera with pixels k times as wide, and interpolated linearly. Averaging twice and interpolating widens the PSF by
+:math:`1/12 + 1/12 + 1/6 = 1/3` of a squared grid pixel on each axis; the PSF is sharpened by as much,
+:math:`h - \Delta h / 6`, so that what is left is of fourth order. Pixels blend their two layers as in
+:func:`kornia_tidy.render.compositing.gather`, and each belongs to the one group of layers that spans its defocus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, pad
+
+from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.compositing import Bank, gather
+
+_SHARPENED = 1 / 6  # half of the variance that averaging and interpolating add on each axis
+_LAYER_BYTES = 64 << 20  # of the layers held at a time
+
+
+class LayerGroup(Protocol):
+    """Layers on one grid, see :class:`kornia_tidy.psf.wide_psfs.GroupBank`."""
+
+    @property
+    def grid(self) -> int:
+        """Sensor pixels along a side of a pixel of the grid."""
+        ...
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest defocus of the group's pixels in radians."""
+        ...
+
+    @property
+    def bank(self) -> Bank:
+        """PSFs on the grid."""
+        ...
+
+
+def gather_groups(
+    image: Tensor, defocus: Tensor, groups: Iterable[LayerGroup], window: int, border: str = "reflect"
+) -> Tensor:
+    """Gather light through groups of layers, each on its own grid.
+
+    Args:
+        image: (B, C, H, W) linear light.
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians. Beyond the groups it is clamped to the ends.
+        groups: in ascending order of defocus; every pixel lies in one of them.
+        window: side of the PSFs in sensor pixels, for the border ``"valid"``.
+        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`. Images smaller than a PSF's radius
+            are reflected several times.
+
+    Returns:
+        (B, C, h, w) light. Gradients reach image, defocus and PSFs.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> bank = SimpleNamespace(psfs=torch.full((2, 1, 5, 5), 1 / 25), defocus=torch.tensor([8.0, 9.0]), veil=None)
+        >>> group = SimpleNamespace(grid=2, span=(8.0, 9.0), bank=bank)
+        >>> gather_groups(torch.ones(1, 1, 16, 16), torch.full((1, 1, 16, 16), 8.2), [group], 11).mean().round()
+        tensor(1.)
+    """
+    margin = window // 2 if border == "valid" else 0
+    height, width = image.shape[-2] - 2 * margin, image.shape[-1] - 2 * margin
+    seen = defocus[..., margin : margin + height, margin : margin + width]
+    parts = list(groups)
+    ends = seen.new_tensor([group.span[1] for group in parts[:-1]])
+    owner = torch.bucketize(seen.detach().contiguous(), ends, right=True)
+    fine = [group for group in parts if group.grid == 1]
+    if fine:
+        coded = _on_sensor(image, seen, fine[0].bank, margin, border).clone()
+    else:
+        coded = image.new_zeros(*image.shape[:2], height, width)
+    for number, group in enumerate(parts):
+        if group.grid > 1:
+            for b, pixels, light in _on_grid(image, seen, owner == number, group, margin, border):
+                coded.flatten(2)[b].index_copy_(1, pixels, light)
+    return coded
+
+
+def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str) -> Tensor:
+    """Gather on the sensor's own pixels, after as much border as the PSFs reach."""
+    radius, nodes = bank.psfs.shape[-1] // 2, bank.defocus
+    height, width = seen.shape[-2:]
+    rows, columns = ((margin - radius, side + margin + radius) for side in (height, width))
+    plane = _extended(image, rows, columns, border)
+    beyond = pad(seen, (radius,) * 4)  # not looked at
+    return gather(plane, beyond, nodes, bank.psfs, border="valid")
+
+
+def _on_grid(
+    image: Tensor, seen: Tensor, own: Tensor, group: LayerGroup, margin: int, border: str
+) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Yield images of the batch, pixels (n,) of the group and their light (C, n), some layers at a time."""
+    grid, radius = group.grid, group.bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening
+    rows, columns = ((margin - radius * grid, margin + (-(-side // grid) + radius) * grid) for side in seen.shape[-2:])
+    plane = avg_pool2d(_extended(image, rows, columns, border), grid)
+    psfs, nodes = _sharpened(group.bank.psfs.to(plane.dtype)), group.bank.defocus.to(seen)
+    size, lost = [next_fast_size(side) for side in plane.shape[-2:]], psfs.shape[-1] - 1
+    spectrum = torch.fft.rfft2(plane, s=size)
+    at_once = max(2, _LAYER_BYTES // max(1, plane.numel() * plane.element_size()))
+    for first in range(0, max(1, len(nodes) - 1), at_once - 1):
+        chunk = slice(first, min(first + at_once, len(nodes)))
+        inside = own & _between(seen.detach(), nodes, chunk)
+        if not bool(inside.any()):
+            continue
+        blurred = [torch.fft.irfft2(spectrum * torch.fft.rfft2(psf, s=size), s=size) for psf in psfs[chunk]]
+        layers = torch.stack(blurred, 2)[..., lost : plane.shape[-2], lost : plane.shape[-1]]
+        for b in range(len(image)):
+            of_scene = b if len(seen) > 1 else 0
+            pixels = inside[of_scene].flatten().nonzero().flatten()
+            row, column = pixels // seen.shape[-1], pixels % seen.shape[-1]
+            layer = _layer_of(seen[of_scene].flatten()[pixels], nodes[chunk])
+            yield b, pixels, _interpolated(layers[b], layer, (row + 0.5) / grid + 0.5, (column + 0.5) / grid + 0.5)
+
+
+def _between(defocus: Tensor, nodes: Tensor, chunk: slice) -> Tensor:
+    """Return where defocus lies in the intervals of a chunk of layers; the outermost reach to infinity."""
+    inside = torch.ones_like(defocus, dtype=torch.bool)
+    if chunk.start > 0:
+        inside &= defocus >= nodes[chunk.start]
+    if chunk.stop < len(nodes):
+        inside &= defocus < nodes[chunk.stop - 1]
+    return inside
+
+
+def _layer_of(defocus: Tensor, nodes: Tensor) -> Tensor:
+    """Return the layer of each pixel as a real number between 0 and the last one."""
+    if len(nodes) == 1:
+        return torch.zeros_like(defocus)
+    clamped = defocus.clamp(nodes[0], nodes[-1])
+    index = torch.bucketize(clamped.detach(), nodes[1:-1].contiguous(), right=True)
+    return index + (clamped - nodes[index]) / nodes.diff()[index]
+
+
+def _interpolated(layers: Tensor, layer: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """Return values between layers and pixels, (C, n), of layers (C, D, h, w)."""
+    sizes = [max(1, side - 1) for side in layers.shape[1:]]
+    where = torch.stack([2 * column / sizes[2] - 1, 2 * row / sizes[1] - 1, 2 * layer / sizes[0] - 1], -1).to(layers)
+    sampled = grid_sample(layers[None], where.view(1, 1, 1, -1, 3), align_corners=True)
+    return sampled[0, :, 0, 0]
+
+
+def _sharpened(psfs: Tensor) -> Tensor:
+    """Return PSFs less a sixth of their Laplacian, with one more pixel around."""
+    wide = pad(psfs, (2,) * 4)
+    middle = wide[..., 1:-1, 1:-1]
+    around = wide[..., :-2, 1:-1] + wide[..., 2:, 1:-1] + wide[..., 1:-1, :-2] + wide[..., 1:-1, 2:]
+    return middle - _SHARPENED * (around - 4 * middle)
+
+
+def _extended(image: Tensor, rows: tuple[int, int], columns: tuple[int, int], border: str) -> Tensor:
+    """Return rows and columns of an image that reach beyond it; ``"valid"`` repeats what nobody looks at."""
+    for axis, (first, last) in ((-2, rows), (-1, columns)):
+        side = image.shape[axis]
+        at = torch.arange(first, last, device=image.device)
+        outside = (at < 0) | (at >= side)
+        if border == "reflect":
+            period = max(1, 2 * side - 2)
+            at = at.remainder(period)
+            at = torch.minimum(at, period - at)
+        elif border == "circular":
+            at = at.remainder(side)
+        image = image.index_select(axis, at.clamp(0, side - 1))
+        if border == "zero":
+            shape = (-1, 1) if axis == -2 else (-1,)
+            image = image * (~outside).to(image.dtype).view(shape)
+    return image

@@ -1,0 +1,105 @@
+"""Captures through ordinary fast lenses, against exact PSFs of every depth."""
+
+import pytest
+import torch
+
+from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.render.compositing import gather
+from tests.base import BaseTester
+from tests.render.test_coarse_gather import light
+
+
+def fast_camera(f_number: float = 2.8, focus: float = 2.0, **options) -> TiDyOptics:
+    lens = ThinLensCamera(50e-3, 50e-3 / f_number, focus, 6e-6)
+    options = {"sensor": None, "color_space": "linear", **options}
+    return TiDyOptics(PixelwiseMask(1, initial="flat"), lens, **options)
+
+
+def stairs(size: int = 128) -> torch.Tensor:
+    """Depths of 1.6, 1.95, 2.3 and 15 m in strips; none of them has a layer of its own."""
+    return torch.tensor([1.6, 1.95, 2.3, 15.0]).repeat_interleave(size // 4).expand(1, 1, size, size)
+
+
+class TestWideCaptures(BaseTester):
+    @torch.no_grad()
+    def test_feature_captures_agree_with_exact_psfs_of_each_depth(self):
+        optics, image, depth = fast_camera(), light(128), stairs()
+        psi = optics.defocus(depth)
+        nodes = sorted(psi.unique().tolist())
+        psfs = exact_psf_bank(
+            torch.zeros(1, 23, 23), torch.ones(1), optics.pupil, Spectrum.monochrome(), [1.0], nodes,
+            float(optics.psf_model.pixel_step), 101, 1e-2,
+        ).psfs  # fmt: skip
+        psfs = psfs / psfs.sum((2, 3), keepdim=True)
+        exact = gather(image, psi, psi.new_tensor(nodes), psfs, layers="nearest")
+        error = float((optics(image, depth) - exact).square().mean().sqrt())
+        assert error < 1.3 * optics.psf_model.wide_blur.error < 2e-3
+
+    @torch.no_grad()
+    def test_feature_windows_follow_the_discs_and_hold_the_light(self):
+        optics = fast_camera(1.4, 0.5)
+        assert optics.window > 661  # diameter of the disc of infinity
+        assert optics.light_held[0] > 0.97
+        far = torch.full((1, 1, 64, 64), float("inf"))
+        assert torch.isfinite(optics(light(64), far)).all()
+
+    def test_feature_gradients_are_those_of_the_capture(self):
+        optics = fast_camera()
+        optics.masks.requires_grad_(False)
+        image, depth = light(64, torch.float64), stairs(64).double().clone()
+        image.requires_grad_()
+        depth.requires_grad_()
+        torch.manual_seed(5)
+        weight = torch.randn(1, 1, 64, 64, dtype=torch.float64)
+        (optics(image, depth) * weight).sum().backward()
+        for x, step in ((image, 1e-2), (depth, 1e-6)):
+            way = torch.rand_like(x) * step
+            with torch.no_grad():
+                a, b = [way, 0] if x is image else [0, way]
+                ahead, back = ((optics(image + s * a, depth + s * b) * weight).sum() for s in (1, -1))
+                self.assert_close((x.grad * way).sum(), (ahead - back) / 2, rtol=2e-2, atol=0)
+
+    def test_feature_gradients_reach_a_flat_mask_and_values_do_not_change(self):
+        optics, image = fast_camera(2.8), light(64)
+        depth = torch.full((1, 1, 64, 64), 1.9)
+        coded = optics(image, depth)
+        with torch.no_grad():
+            assert torch.equal(optics(image, depth), coded)
+        coded.square().mean().backward()
+        assert float(optics.masks.phase.grad.abs().max()) > 0
+
+    @torch.no_grad()
+    def test_feature_bands_are_the_whole(self):
+        optics, image, depth = fast_camera(), light(192), stairs(192)
+        whole = optics(image, depth)
+        optics.memory_budget = 1
+        self.assert_close(optics(image, depth), whole, rtol=0, atol=2e-6)
+
+    @torch.no_grad()
+    @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
+    def test_feature_one_depth_looks_the_same_by_other_compositing(self, compositing):
+        image, depth = light(96), torch.full((1, 1, 96, 96), 2.4)
+        gathered = fast_camera()(image, depth)
+        other = fast_camera(compositing=compositing)(image, depth)
+        assert float((gathered - other).square().mean().sqrt()) < 1e-3
+
+    def test_exception_of_occlusion_beyond_the_memory(self):
+        optics = fast_camera(1.4, 0.5, compositing="occlusion")
+        with pytest.raises(ValueError, match=r"needs 155 layers of PSFs 699 px wide, some .* GiB"):
+            optics(light(64), stairs(64))
+
+    @torch.no_grad()
+    def test_smoke_the_plan_names_the_approximations_and_their_error(self):
+        optics, depth = fast_camera(1.8), stairs(64)
+        plan = optics.plan(depth)
+        assert plan.predicted_error < 1e-3
+        assert "geometric optics" in str(plan)
+        assert "above the tolerance of 1e-05" in str(optics.plan(depth, tolerance=1e-5))
+        assert "layers of wide blur" in optics.explain(light(64), depth).scene
+
+    def test_smoke_states_of_wide_lenses_load(self):
+        optics, other = fast_camera(), fast_camera()
+        other.load_state_dict(optics.state_dict())
+        assert other.psf_model.wide_blur == optics.psf_model.wide_blur is not None
