@@ -122,6 +122,8 @@ def table(rows: Sequence[Row], scale: str) -> str:
     """Return a table for each task."""
     parts = []
     for task, words in (("edof", "Extended depth of field, PSNR in dB"), ("depth", "Depth, RMSE (times 20)")):
+        if not any(row["task"] == task for row in rows):
+            continue
         parts.append(f"**{words}**; painted scenes / real scenes, mean ± standard error over seeds:")
         lines = []
         kinds = dict.fromkeys((row["masks"], row["learnt"]) for row in rows if row["task"] == task)
@@ -141,10 +143,11 @@ def table(rows: Sequence[Row], scale: str) -> str:
 JUDGED = """\
 From left to right, each column takes away one thing that the training had: first the colour cast, then the wrapped and
 cropped PSFs, then light that is encoded before it is blurred. The step from *as trained* to *scaled to sum one* is what
-the network had from the colour cast. The last two columns ask for the masks alone: a closed form behind them in a
-physical camera, after and before training. Judged can be these differences for masks of so few steps. Not judged can be
-masks trained to convergence, which may exploit aliasing more. The paper did not measure this. The noise is 0.01 of full
-scale in all rows but that of the lens without masks, whose shot noise at a fifth of full scale is 0.01 at f/17.6."""
+the network had from the colour cast and from the light that the crop loses, which it learns to make up for. The last
+two columns ask for the masks alone: a closed form behind them in a physical camera, after and before training. Judged
+can be these differences for masks of so few steps. Not judged can be masks trained to convergence, which may exploit
+aliasing more. The paper did not measure this. The noise is 0.01 of full scale in all rows but that of the lens without
+masks, whose shot noise at a fifth of full scale is 0.01 at f/17.6."""
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:

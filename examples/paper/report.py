@@ -82,7 +82,8 @@ def bars(panels: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], path
         axes.set_title(heading, fontsize=9, color=INK)
         axes.set_xlabel(below, fontsize=8, color=INK)
         open_chart(axes, 7.5)
-        axes.legend(fontsize=7.5, frameon=False)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=7.5, frameon=False)
     figure.savefig(path, dpi=110)
 
 

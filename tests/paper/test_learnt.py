@@ -41,8 +41,8 @@ class TestEveryExperiment(BaseTester):
             assert all(math.isfinite(float(value)) for key, value in row.items() if key.endswith(("psnr", "rmse")))
         text = (tmp_path / f"{name}-smoke.md").read_text(encoding="utf-8")
         assert text.startswith(f"## {experiment.title}\n")
-        assert "Judged can be" in text
-        assert "ot judged can be" in text
+        assert "Judged can be" in " ".join(text.split())
+        assert "Not judged can be" in " ".join(text.split())
         assert f"{len(rows)} of {len(rows)} trials" in text
         assert (tmp_path / f"{name}-smoke.png").exists() == (experiment.draw is not None)
 
