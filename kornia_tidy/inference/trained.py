@@ -22,6 +22,7 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
@@ -85,6 +86,10 @@ def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
     if settings.head in CLOSED_FORMS:
         return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=settings.encoded)
+    if settings.depth_classes and settings.closed_form:
+        channels = closed_form_channels(settings.refocus, likelihood=True)
+        head = make_head(settings.head, settings.depth_classes + 3, settings.width, channels)
+        return JointClosedFormHead(head, settings.refocus, encoded=settings.encoded)
     if settings.depth_classes:
         return LayeredJointHead(
             make_head(settings.head, settings.depth_classes, settings.width, 3 + 2 * settings.refocus),

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.closed_form import LEAST, SHARPNESS
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, interpolated_classes, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
@@ -18,9 +19,6 @@ from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 
 WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
-SHARPNESS = 4.0  # temperature of the likelihood in closed form, which takes patches for uniform in depth; RMSE is least
-# at 1 (.188 of the range on 18 real scenes, .197 at 4), calibration best at 8 (off by 19 %, 26 % at 4)
-LEAST = -12.0  # of the logarithm of a likelihood: no depth is excluded for certain
 REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
 
 
