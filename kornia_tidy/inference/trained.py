@@ -115,13 +115,12 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
     takes the noise of the sensor too. Other networks are not changed.
     """
     for module in head.modules():
-        if isinstance(module, Refocused | LayeredJointHead):
-            channels = 1 if isinstance(module, Refocused) else 3
-            module.set_psfs(optics.psf_bank(channels, defocus=_nodes(optics, module.layers)))
-        elif isinstance(module, ClosedForm):
+        if isinstance(module, Refocused):
+            module.set_psfs(optics.psf_bank(1, defocus=_nodes(optics, module.layers)))
+        elif isinstance(module, ClosedForm | LayeredJointHead):
             bank = optics.psf_bank(3, defocus=_nodes(optics, module.layers or NODES))
             module.set_psfs(bank, correlate=optics.fidelity.correlate)
-            if isinstance(optics.sensor, SensorNoise):
+            if isinstance(module, ClosedForm) and isinstance(optics.sensor, SensorNoise):
                 module.set_noise(optics.sensor)
 
 

@@ -137,14 +137,20 @@ class LayeredJointHead(ReconstructionHead):
             self.register_buffer(name, torch.zeros(0), persistent=False)
         self.register_buffer("temperature", torch.ones(()))
 
-    def set_psfs(self, bank: PSFBank) -> None:
-        """Compute the filters from a camera's PSFs, which are evenly spaced over its range of defocus."""
-        if tuple(bank.psfs.shape[:2]) != (self.layers, 3):
+    def set_psfs(self, bank: PSFBank, *, correlate: bool = False) -> None:
+        """Compute the filters from a camera's PSFs, which are evenly spaced over its range of defocus.
+
+        Args:
+            bank: PSFs of three channels for each of the layers.
+            correlate: captures are correlations, as with fidelity ``"paper"``: PSFs are flipped by 180 degrees.
+        """
+        psfs = bank.psfs.flip((-2, -1)) if correlate else bank.psfs
+        if tuple(psfs.shape[:2]) != (self.layers, 3):
             raise ValueError(
-                f"a network for {self.layers} layers of 3 colours needs as many PSFs, got {tuple(bank.psfs.shape[:2])}"
+                f"a network for {self.layers} layers of 3 colours needs as many PSFs, got {tuple(psfs.shape[:2])}"
             )
-        self.filters = deconvolution_filters(bank.psfs)
-        self.whitening, self.log_determinants = likelihood_filters(bank.psfs.mean(1))
+        self.filters = deconvolution_filters(psfs)
+        self.whitening, self.log_determinants = likelihood_filters(psfs.mean(1))
 
     def predict(self, image: Tensor) -> Tensor:
         """Return the logits of the depth's classes and the image."""
