@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.reconstruction.closed_form import LEAST, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form import LEAST
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
@@ -41,6 +41,7 @@ class JointClosedFormHead(ClosedFormHead):
 
     Example:
         >>> from kornia_tidy.psf.psf_bank import PSFBank
+        >>> from kornia_tidy.reconstruction.closed_form import closed_form_channels
         >>> from kornia_tidy.reconstruction.joint import JointHead
         >>> from kornia_tidy.reconstruction.nafnet import NAFNet
         >>> channels = closed_form_channels(layers=4, likelihood=True)
@@ -65,15 +66,17 @@ class JointClosedFormHead(ClosedFormHead):
         restored = self.closed_form(*image.split(3, 1))
         residual = self.network(restored.maps)
         logits, image = residual.split([residual.shape[1] - 3, 3], 1)
-        likelihood = LEAST * (1 - restored.maps[:, -self.closed_form.layers :])
-        logits = logits + interpolated_classes(likelihood, logits.shape[1])
+        logits = logits + self._initial_logits(restored.maps)
         if not self.training:
             logits = logits / self.temperature.to(logits.dtype)
         return torch.cat([logits, image + restored.image], 1)
 
     def closed_form_logits(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
         """Return the logits of the classes by the likelihood in closed form alone, (B, D, H, W)."""
-        maps = self.closed_form(capture, noise).maps
+        return self._initial_logits(self.closed_form(capture, noise).maps)
+
+    def _initial_logits(self, maps: Tensor) -> Tensor:
+        """Return the logarithm of the likelihood for each class, from the maps of the closed form."""
         return interpolated_classes(LEAST * (1 - maps[:, -self.closed_form.layers :]), self.out_channels - 3)
 
     def extra_repr(self) -> str:
