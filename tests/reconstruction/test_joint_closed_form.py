@@ -151,7 +151,7 @@ class TestJointClosedFormHead(BaseTester):
 
     def test_feature_onnx(self):
         capture = photo(18, 21, dtype=torch.float32)
-        assert len(check_onnx(JointHead(joint(trained=True, kind=PlainHead)), capture, capture.flip(-1))) == 3
+        assert len(check_onnx(JointHead(joint(layers=2, trained=True, kind=PlainHead)), capture, capture.flip(-1))) == 3
 
     def test_feature_half_precision_autocast_is_near(self):
         """Depth differs by a few roundings of 2^-9 of its logits."""
