@@ -187,7 +187,7 @@ def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) 
             head = build_head(settings)
     except RuntimeError as error:
         raise ValueError(f"cannot read {name}: no network can be made by its settings: {error}") from error
-    prefix = _head_prefix(state["state_dict"])
+    prefix = head_prefix(state["state_dict"])
     check_weights(head, below(state["state_dict"], prefix), f"{name}, {prefix.removesuffix('.')}")
 
 
@@ -212,7 +212,7 @@ def load_weights(
     state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
     name = name or str(checkpoint)
     weights: dict[str, Tensor] = state["state_dict"]
-    parts = [(optics, "optics."), (head, _head_prefix(weights))]
+    parts = [(optics, "optics."), (head, head_prefix(weights))]
     wanted = [(part, below(weights, prefix), prefix) for part, prefix in parts if part is not None]
     for part, own, prefix in wanted:
         check_weights(part, own, f"{name}, {prefix.removesuffix('.')}")
@@ -238,7 +238,7 @@ def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
     optics.masks.load_state_dict(own)
 
 
-def _head_prefix(weights: Mapping[str, Tensor]) -> str:
+def head_prefix(weights: Mapping[str, Tensor]) -> str:
     """Return the prefix of the network's weights in a checkpoint; of the averaged ones, if there are any."""
     return "average.network." if any(key.startswith("average.") for key in weights) else "head."
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from collections.abc import Mapping
 
-from kornia_tidy.reconstruction.closed_form import LEAST
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
@@ -41,7 +43,6 @@ class JointClosedFormHead(ClosedFormHead):
 
     Example:
         >>> from kornia_tidy.psf.psf_bank import PSFBank
-        >>> from kornia_tidy.reconstruction.closed_form import closed_form_channels
         >>> from kornia_tidy.reconstruction.joint import JointHead
         >>> from kornia_tidy.reconstruction.nafnet import NAFNet
         >>> channels = closed_form_channels(layers=4, likelihood=True)
@@ -83,3 +84,35 @@ class JointClosedFormHead(ClosedFormHead):
         """Return layers, classes and temperature."""
         classes, temperature = self.out_channels - 3, self.temperature.item()
         return f"layers={self.closed_form.layers}, classes={classes}, temperature={temperature:.3g}"
+
+
+def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) -> dict[str, Tensor]:
+    """Return the weights of a network for the image as those of a network for image and depth, which begins as it does.
+
+    The image stays what it was, up to the number of depths, over which the weights of the first convolution are
+    interpolated. The likelihood has zero weights in the first convolution and the classes have them in the last.
+
+    Args:
+        weights: state of a :class:`ClosedFormHead` whose network has the kind and width of that in ``head``.
+        head: whose PSFs, noise and temperature are taken; it is not changed.
+
+    Returns:
+        A state for ``head``; weights of another kind of network stay as they are.
+    """
+    assert head.network is not None
+    convolutions = [name for name, part in head.named_modules() if isinstance(part, nn.Conv2d)]
+    first, last = f"{convolutions[0]}.weight", f"{convolutions[-1]}.weight"
+    found, own = dict(weights), head.state_dict()
+    found |= {name: own[name] for name in own if name.startswith("closed_form.") or name == "temperature"}
+    common, layers = closed_form_channels(), head.closed_form.layers
+    if first in weights and weights[first].shape[1] >= common:
+        shared, by_depth = weights[first][:, :common], weights[first][:, common:]
+        zeros = shared.new_zeros(len(shared), layers, *shared.shape[2:])
+        given = by_depth.shape[1]
+        stretched = interpolated_classes(by_depth, layers) * given / layers if given else zeros
+        found[first] = torch.cat([shared, stretched, zeros], 1)
+    for name in (last, last.removesuffix("weight") + "bias"):
+        if name in weights and len(weights[name]) == 3:
+            classes = weights[name].new_zeros(head.out_channels - 3, *weights[name].shape[1:])
+            found[name] = torch.cat([classes, weights[name]])
+    return found

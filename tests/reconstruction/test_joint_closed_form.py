@@ -12,6 +12,7 @@ from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import build_head
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import (
+    ClosedFormHead,
     JointClosedFormHead,
     JointHead,
     LayeredJointHead,
@@ -24,6 +25,7 @@ from kornia_tidy.reconstruction import (
 from kornia_tidy.reconstruction.closed_form import LEAST, LIKELIHOOD_WINDOW, SHARPNESS, ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
+from kornia_tidy.reconstruction.joint_closed_form import widened_for_depth
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo
@@ -162,6 +164,20 @@ class TestJointClosedFormHead(BaseTester):
                 found = head(capture, 0.01).float()
         depths = [depth_moments(output[:, :CLASSES])[0] for output in (expected, found)]
         self.assert_close(depths[1], depths[0], atol=0.02, rtol=0)
+
+    @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
+    @pytest.mark.parametrize("layers", [0, LAYERS])
+    def test_feature_begins_as_a_network_for_the_image(self, kind, layers):
+        """With as many depths it makes the same image; its depth is the closed form's."""
+        image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
+        image.closed_form.set_psfs(bank(LAYERS, dtype=torch.float32))
+        for parameter in image.parameters():
+            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
+        head, capture = joint(kind=kind), photo(16, 16, dtype=torch.float32)
+        head.load_state_dict(widened_for_depth(image.state_dict(), head))
+        with torch.no_grad():
+            self.assert_close(head(capture, 0.01)[:, -3:], image(capture, 0.01), atol=1e-5, rtol=1e-5)
+            self.assert_close(head(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
 
     def test_exception(self):
         with pytest.raises(ValueError, match="number of classes of network must be a whole number of at least 2"):
