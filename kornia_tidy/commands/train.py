@@ -159,8 +159,8 @@ def add_parser(subparsers: Any) -> None:
         "depth_classes",
         type=int,
         metavar="D",
-        help="joint: depth as a distribution over D classes, with its uncertainty; the image begins as a blend of "
-        "--refocus deconvolved depths; 32 and 11 do; 0: one depth a pixel",
+        help="joint: depth as a distribution over D classes, with its uncertainty, from --refocus depths; with "
+        "--closed-form the default is 21 classes from 9 depths; without, 32 and 11 do; 0: one depth a pixel",
     )
     _setting(
         system,

@@ -59,9 +59,11 @@ class SystemSettings:
             best of them, see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
         refocus: number of depths that the capture is refocused to before it enters the network, see
             :class:`~kornia_tidy.reconstruction.Refocused`. 0: none.
-        depth_classes: classes of a distribution of depth, for the task ``"joint"``, see
-            :class:`~kornia_tidy.reconstruction.LayeredJointHead`: the image then begins as the capture deconvolved for
-            each of ``refocus`` depths, blended by the distribution. 0: one depth a pixel without uncertainty.
+        depth_classes: classes of a distribution of depth, for the task ``"joint"``. It begins as the likelihood of
+            ``refocus`` depths in closed form; the image begins as with ``closed_form``, see
+            :class:`~kornia_tidy.reconstruction.JointClosedFormHead`, or without it as the capture deconvolved for each
+            of these depths, blended by the distribution, see :class:`~kornia_tidy.reconstruction.LayeredJointHead`.
+            0: one depth a pixel without uncertainty.
         seed: of the initial masks, and of everything random in a run.
 
     Raises:

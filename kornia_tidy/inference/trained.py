@@ -22,6 +22,7 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
@@ -85,6 +86,10 @@ def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
     if settings.head in CLOSED_FORMS:
         return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=settings.encoded)
+    if settings.depth_classes and settings.closed_form:
+        channels = closed_form_channels(settings.refocus, likelihood=True)
+        head = make_head(settings.head, settings.depth_classes + 3, settings.width, channels)
+        return JointClosedFormHead(head, settings.refocus, encoded=settings.encoded)
     if settings.depth_classes:
         return LayeredJointHead(
             make_head(settings.head, settings.depth_classes, settings.width, 3 + 2 * settings.refocus),
@@ -110,13 +115,12 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
     takes the noise of the sensor too. Other networks are not changed.
     """
     for module in head.modules():
-        if isinstance(module, Refocused | LayeredJointHead):
-            channels = 1 if isinstance(module, Refocused) else 3
-            module.set_psfs(optics.psf_bank(channels, defocus=_nodes(optics, module.layers)))
-        elif isinstance(module, ClosedForm):
+        if isinstance(module, Refocused):
+            module.set_psfs(optics.psf_bank(1, defocus=_nodes(optics, module.layers)))
+        elif isinstance(module, ClosedForm | LayeredJointHead):
             bank = optics.psf_bank(3, defocus=_nodes(optics, module.layers or NODES))
             module.set_psfs(bank, correlate=optics.fidelity.correlate)
-            if isinstance(optics.sensor, SensorNoise):
+            if isinstance(module, ClosedForm) and isinstance(optics.sensor, SensorNoise):
                 module.set_noise(optics.sensor)
 
 
@@ -183,7 +187,7 @@ def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) 
             head = build_head(settings)
     except RuntimeError as error:
         raise ValueError(f"cannot read {name}: no network can be made by its settings: {error}") from error
-    prefix = _head_prefix(state["state_dict"])
+    prefix = head_prefix(state["state_dict"])
     check_weights(head, below(state["state_dict"], prefix), f"{name}, {prefix.removesuffix('.')}")
 
 
@@ -208,7 +212,7 @@ def load_weights(
     state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
     name = name or str(checkpoint)
     weights: dict[str, Tensor] = state["state_dict"]
-    parts = [(optics, "optics."), (head, _head_prefix(weights))]
+    parts = [(optics, "optics."), (head, head_prefix(weights))]
     wanted = [(part, below(weights, prefix), prefix) for part, prefix in parts if part is not None]
     for part, own, prefix in wanted:
         check_weights(part, own, f"{name}, {prefix.removesuffix('.')}")
@@ -234,7 +238,7 @@ def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
     optics.masks.load_state_dict(own)
 
 
-def _head_prefix(weights: Mapping[str, Tensor]) -> str:
+def head_prefix(weights: Mapping[str, Tensor]) -> str:
     """Return the prefix of the network's weights in a checkpoint; of the averaged ones, if there are any."""
     return "average.network." if any(key.startswith("average.") for key in weights) else "head."
 

@@ -8,6 +8,7 @@ from kornia_tidy.reconstruction.closed_form import ClosedForm, Restoration, clos
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.joint import JointEstimate, JointHead, UncertainJointEstimate
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
 from kornia_tidy.reconstruction.nafnet import NAFNet
@@ -23,6 +24,7 @@ __all__ = [
     "AttentionUNet",
     "ClosedForm",
     "ClosedFormHead",
+    "JointClosedFormHead",
     "JointEstimate",
     "JointHead",
     "LayeredJointHead",

@@ -24,6 +24,7 @@ class ClosedFormHead(ReconstructionHead):
         layers: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         bilateral: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
+        likelihood: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
 
     Shape:
         - image: (B, 3, H, W), captures of the camera, of any size.
@@ -62,13 +63,14 @@ class ClosedFormHead(ReconstructionHead):
         *,
         bilateral: bool = True,
         encoded: bool = True,
+        likelihood: bool = False,
     ) -> None:
         super().__init__(3, 3 if network is None else network.out_channels)
-        self.closed_form = ClosedForm(layers, bilateral=bilateral, encoded=encoded)
+        self.closed_form = ClosedForm(layers, bilateral=bilateral, encoded=encoded, likelihood=likelihood)
         self.network = network
         self.stride = 1 if network is None else network.stride
         if network is not None:
-            if network.in_channels != (wanted := closed_form_channels(layers)):
+            if network.in_channels != (wanted := closed_form_channels(layers, likelihood=likelihood)):
                 raise ValueError(f"the network must take {wanted} channels, got in_channels={network.in_channels}")
             if network.out_channels >= 3:
                 zero_last_convolution(network, 3)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.closed_form import LEAST, SHARPNESS
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, interpolated_classes, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
@@ -19,9 +20,6 @@ from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 
 WEIGHT = 1e-2  # of the prior in deconvolution, in units of the square of a PSF's energy
-SHARPNESS = 4.0  # temperature of the likelihood in closed form, which takes patches for uniform in depth; RMSE is least
-# at 1 (.188 of the range on 18 real scenes, .197 at 4), calibration best at 8 (off by 19 %, 26 % at 4)
-LEAST = -12.0  # of the logarithm of a likelihood: no depth is excluded for certain
 REFINED_FROM = 3 + 3 + 2  # channels: capture, blended image, mean and deviation of depth
 
 
@@ -140,14 +138,20 @@ class LayeredJointHead(ReconstructionHead):
             self.register_buffer(name, torch.zeros(0), persistent=False)
         self.register_buffer("temperature", torch.ones(()))
 
-    def set_psfs(self, bank: PSFBank) -> None:
-        """Compute the filters from a camera's PSFs, which are evenly spaced over its range of defocus."""
-        if tuple(bank.psfs.shape[:2]) != (self.layers, 3):
+    def set_psfs(self, bank: PSFBank, *, correlate: bool = False) -> None:
+        """Compute the filters from a camera's PSFs, which are evenly spaced over its range of defocus.
+
+        Args:
+            bank: PSFs of three channels for each of the layers.
+            correlate: captures are correlations, as with fidelity ``"paper"``: PSFs are flipped by 180 degrees.
+        """
+        psfs = bank.psfs.flip((-2, -1)) if correlate else bank.psfs
+        if tuple(psfs.shape[:2]) != (self.layers, 3):
             raise ValueError(
-                f"a network for {self.layers} layers of 3 colours needs as many PSFs, got {tuple(bank.psfs.shape[:2])}"
+                f"a network for {self.layers} layers of 3 colours needs as many PSFs, got {tuple(psfs.shape[:2])}"
             )
-        self.filters = deconvolution_filters(bank.psfs)
-        self.whitening, self.log_determinants = likelihood_filters(bank.psfs.mean(1))
+        self.filters = deconvolution_filters(psfs)
+        self.whitening, self.log_determinants = likelihood_filters(psfs.mean(1))
 
     def predict(self, image: Tensor) -> Tensor:
         """Return the logits of the depth's classes and the image."""

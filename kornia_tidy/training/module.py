@@ -16,6 +16,7 @@ from kornia_tidy.inference.trained import build_head, build_optics, check_weight
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.head import takes_noise
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
@@ -249,7 +250,7 @@ class TidyTraining(pl.LightningModule):
 
     def _set_temperature(self, temperature: float) -> None:
         for module in self.modules():
-            if isinstance(module, LayeredJointHead):
+            if isinstance(module, JointClosedFormHead | LayeredJointHead):
                 module.temperature.fill_(temperature)
 
     def configure_optimizers(self) -> Any:

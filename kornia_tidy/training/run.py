@@ -16,10 +16,13 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
+from torch import nn
 from torch.utils.data import Dataset
 
 from kornia_tidy.files import only_here
-from kornia_tidy.inference.trained import fix_window, load_masks, load_weights
+from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, widened_for_depth
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
@@ -56,7 +59,9 @@ def train(
             (weights of the best epoch), ``training.csv``, ``validation.csv``, ``pictures/`` and a TensorBoard log;
             with ``pretrain_epochs`` the same files of that stage in ``pretrain/``.
         resume: resume the run in the folder, if there is one.
-        head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens.
+        head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens. That of
+            a network for the image may begin one for image and depth, see
+            :func:`~kornia_tidy.reconstruction.joint_closed_form.widened_for_depth`.
         masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
             as ``camera.safetensors`` of ``kornia-tidy design``.
         captures: folder of the noise-free captures, for ``learn="network"``. Runs with the same camera and scenes may
@@ -122,7 +127,7 @@ def _train(
         module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)
         module.settings = module.settings.replace(window=fix_window(module.optics).window)
     if head_from is not None and checkpoint is None:
-        load_weights(head_from, head=module.head)
+        _begin_network(head_from, module.head)
         if module.average is not None:
             module.average.network.load_state_dict(module.head.state_dict())
     module.settings.write(folder / SETTINGS)
@@ -163,6 +168,16 @@ def _train(
         )
         _fit(trainer, module, data, checkpoint)
     return module
+
+
+def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
+    """Load the initial weights of a network; those of one for the image alone are widened for depth."""
+    state = read_state(path)
+    weights = below(state["state_dict"], head_prefix(state["state_dict"]))
+    if isinstance(head, JointClosedFormHead) and "temperature" not in weights:
+        widened = widened_for_depth(weights, head)
+        state = {**state, "state_dict": {f"head.{name}": value for name, value in widened.items()}}
+    load_weights(state, head=head, name=str(path))
 
 
 def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path) -> NoisyCrops:

@@ -24,6 +24,10 @@ NETWORK_RUN: dict[str, Any] = {
 }  # fmt: skip
 """Settings of a run of the network alone that differ from the defaults, which are the paper's for both."""
 
+JOINT_RUN: dict[str, Any] = {"depth_classes": 21, "refocus": 9, "depth_weight": 0.03}
+"""Settings of a run for image and depth that begins with the closed form: the loss of a distribution of depth is about
+a hundred times that of an image."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings(SystemSettings):
@@ -146,10 +150,11 @@ class TrainingSettings(SystemSettings):
 
 
 def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the defaults of a training run in which only the network learns; an empty dictionary for other runs.
+    """Return the defaults of a training run that differ from those of :class:`TrainingSettings`.
 
-    They are those of :data:`NETWORK_RUN`, without the closed form where the head cannot have it or has its own:
-    networks of three channels, heads without a network, ``residual`` and ``depth_classes``.
+    Where only the network learns they are those of :data:`NETWORK_RUN`, without the closed form where the head cannot
+    have it or does without: networks of three channels, heads without a network, and ``residual``. Runs for image and
+    depth with the closed form have those of :data:`JOINT_RUN` too.
 
     Args:
         given: settings that the user chose, by name.
@@ -157,14 +162,17 @@ def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
     Example:
         >>> usual_settings({"learn": "network"})["width"], usual_settings({"learn": "both"})
         (16, {})
+        >>> usual_settings({"task": "joint", "closed_form": True})["depth_classes"]
+        21
     """
-    if given.get("learn") != "network":
-        return {}
-    usual = dict(NETWORK_RUN)
+    usual = dict(NETWORK_RUN) if given.get("learn") == "network" else {}
     if given.get("head") in (*FIXED, *CLOSED_FORMS):
-        del usual["closed_form"], usual["width"]
-    elif given.get("residual") or given.get("depth_classes"):
-        del usual["closed_form"]
+        usual.pop("closed_form", None)
+        usual.pop("width", None)
+    elif given.get("residual"):
+        usual.pop("closed_form", None)
+    if given.get("task") == "joint" and {**usual, **given}.get("closed_form"):
+        usual |= JOINT_RUN
     return usual
 
 

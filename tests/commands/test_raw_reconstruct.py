@@ -99,8 +99,10 @@ class TestRawReconstruct(BaseTester):
         assert record["size"] == [110, 90]
         assert record["depth_png"] == "metres = value * 0.001; 65535 is 65.535 m or farther"
 
-    def test_feature_uncertainty_is_a_second_map(self, tmp_path, capsys):
-        weights = checkpoint(tmp_path / "joint.safetensors", task="joint", depth_classes=6, refocus=2)
+    @pytest.mark.parametrize("closed_form", [True, False])
+    def test_feature_uncertainty_is_a_second_map(self, closed_form, tmp_path, capsys):
+        options = {"task": "joint", "depth_classes": 6, "refocus": 2, "closed_form": closed_form}
+        weights = checkpoint(tmp_path / "joint.safetensors", **options)
         folder, file = tmp_path / "out", capture(tmp_path / "a.png")
         assert reconstruct([file], weights, folder, "--linear", "--depth-unit", "0.01") == 0
         maps = [f"a_deviation{end}" for end in (".png", ".pfm", ".npy")]

@@ -70,6 +70,9 @@ class TestTrain(BaseTester):
         assert load_trained(run / "best.safetensors").step in (2, 4)
         both = ["--closed-form", "--head-from", str(run / "best.safetensors"), "--epochs", "1", "--fidelity", "draft"]
         assert main(["train", *SMALL, *both, "-o", str(tmp_path / "both")]) == 0
+        joint = ["--task", "joint", "--depth-classes", "5", "--refocus", "2", *both]
+        assert main(["train", *SMALL, *joint, "-o", str(tmp_path / "joint")]) == 0
+        assert load_trained(tmp_path / "joint" / "best.safetensors").head.out_channels == 5 + 3
 
     @pytest.mark.parametrize(
         ("options", "sentence"),

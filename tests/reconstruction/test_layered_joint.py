@@ -169,6 +169,15 @@ class TestLayeredJointHead(BaseTester):
         head(torch.rand(1, 3, 20, 20))[:, -3:].square().sum().backward()
         assert psfs.grad.abs().max() > 0
 
+    def test_feature_correlated_captures_have_flipped_psfs(self):
+        psfs = make_psfs(LAYERS, 3, 5, dtype=torch.float32)
+        flipped = PSFBank.from_measured(psfs.flip((-2, -1)), torch.arange(float(LAYERS)))
+        head, other = layered(), layered()
+        head.set_psfs(PSFBank.from_measured(psfs, torch.arange(float(LAYERS))), correlate=True)
+        other.set_psfs(flipped)
+        self.assert_close(head.filters, other.filters)
+        self.assert_close(head.whitening, other.whitening)
+
     def test_feature_temperature_widens_the_distribution_and_leaves_the_image(self):
         head, capture = layered(), torch.rand(1, 3, 20, 24)
         with torch.no_grad():

@@ -112,9 +112,10 @@ class TestTidyTraining(BaseTester):
         difference = module(coded) - module.eval()(coded)
         self.assert_close(difference, torch.ones_like(difference))
 
-    def test_feature_the_temperature_is_fitted_to_what_validation_sees(self, tmp_path):
+    @pytest.mark.parametrize("closed_form", [True, False])
+    def test_feature_the_temperature_is_fitted_to_what_validation_sees(self, closed_form, tmp_path):
         """Weights do not depend on it, and a checkpoint holds it."""
-        module = made(depth_classes=6, refocus=2, masks=1)
+        module = made(depth_classes=6, refocus=2, masks=1, closed_form=closed_form)
         module.head.temperature.fill_(5.0)
         loader = SceneLoader(DeadLeaves(2, 48, 48), 2, train=False)
         trainer(tmp_path).validate(module, loader, verbose=False)
@@ -225,8 +226,9 @@ class TestCheckpoint(BaseTester):
         # PSFs with and without gradients are computed in two ways, equal to round-off.
         torch.testing.assert_close(system.head(coded), module(coded), rtol=1e-5, atol=1e-5)
 
-    def test_feature_a_network_with_a_distribution_of_depth_comes_back(self, tmp_path):
-        module = made(depth_classes=6, refocus=2, masks=1, ema=0)
+    @pytest.mark.parametrize("closed_form", [True, False])
+    def test_feature_a_network_with_a_distribution_of_depth_comes_back(self, closed_form, tmp_path):
+        module = made(depth_classes=6, refocus=2, masks=1, ema=0, closed_form=closed_form)
         module.head.temperature.fill_(1.5)
         trainer(tmp_path).fit(module, SceneLoader(DeadLeaves(2, 48, 48), 2))
         state = {"settings": module.settings.as_dict(), "state_dict": module.state_dict(), "global_step": 2}

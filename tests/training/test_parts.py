@@ -28,7 +28,7 @@ from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
-from kornia_tidy.training.settings import NETWORK_RUN, TrainingSettings, usual_settings
+from kornia_tidy.training.settings import JOINT_RUN, NETWORK_RUN, TrainingSettings, usual_settings
 from kornia_tidy.training.task_loss import LOSSES, task_loss
 from tests.base import BaseTester
 
@@ -200,16 +200,25 @@ class TestSettings(BaseTester):
         ("given", "changes"),
         [
             ({"learn": "both"}, None),
+            ({"learn": "network", "task": "joint", "depth_classes": 8, "refocus": 2, "closed_form": False}, set()),
+            ({"learn": "network", "task": "joint", "residual": True}, {"closed_form"}),
             ({"learn": "network"}, set()),
             ({"learn": "network", "head": "midas-small"}, {"closed_form", "width"}),
             ({"learn": "network", "residual": True}, {"closed_form"}),
-            ({"learn": "network", "task": "joint", "depth_classes": 8, "refocus": 2}, {"closed_form"}),
         ],
     )
     def test_feature_defaults_of_the_network_alone_fit_what_is_given(self, given, changes):
         usual = usual_settings(given)
         assert TrainingSettings(**{**usual, **given}).learn == given["learn"]
         assert set(usual) == (set() if changes is None else set(NETWORK_RUN) - changes)
+
+    def test_feature_image_and_depth_with_the_closed_form_have_a_distribution_of_depth(self):
+        alone = usual_settings({"learn": "network", "task": "joint"})
+        assert set(alone) == set(NETWORK_RUN) | set(JOINT_RUN)
+        given = {"task": "joint", "closed_form": True, "refocus": 5}
+        settings = TrainingSettings(**{**usual_settings(given), **given})
+        assert (settings.depth_classes, settings.refocus) == (JOINT_RUN["depth_classes"], 5)
+        assert usual_settings({"task": "edof", "closed_form": True}) == {}
 
     def test_feature_settings_stored_before_there_was_a_choice_of_loss_are_read(self):
         values = TrainingSettings(head="plain").as_dict()

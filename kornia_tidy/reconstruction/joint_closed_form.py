@@ -1,0 +1,118 @@
+"""Depth as a distribution and image from one network that refines the closed forms of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.depth_distribution import interpolated_classes
+from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+
+
+class JointClosedFormHead(ClosedFormHead):
+    r"""Estimates image and distribution of depth by one network that refines the closed forms of both.
+
+    The network takes what :class:`ClosedFormHead` gives it, and the likelihood of each of L depths. Its last three maps
+    are added to the restored image, all others to the logarithm of the likelihood, interpolated to D classes of depth.
+    The last convolution is initialised with zeros: before training both are the closed forms.
+
+    Args:
+        network: takes :func:`~kornia_tidy.reconstruction.closed_form.closed_form_channels` maps with the likelihood,
+            returns D + 3, and ends in a convolution. The classes are evenly spaced over normalised inverse depth.
+        layers: number L of depths, at least 2.
+        encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
+
+    Shape:
+        - image, noise: as for :class:`ClosedFormHead`.
+        - output: (B, D + 3, H, W): the logits of the classes, then the image.
+
+    Raises:
+        ValueError: as :class:`ClosedFormHead`, or if the network has no two classes.
+
+    Convention:
+        - In eval mode logits are divided by ``temperature``, a number in the state that is fitted after training (see
+          :func:`~kornia_tidy.reconstruction.depth_distribution.fit_temperature`).
+        - PSFs and noise of the camera are part of the state, as for :class:`ClosedFormHead`.
+
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), for one network for both; for the
+    likelihood see :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`.
+
+    Example:
+        >>> from kornia_tidy.psf.psf_bank import PSFBank
+        >>> from kornia_tidy.reconstruction.joint import JointHead
+        >>> from kornia_tidy.reconstruction.nafnet import NAFNet
+        >>> channels = closed_form_channels(layers=4, likelihood=True)
+        >>> head = JointClosedFormHead(NAFNet(channels, 16 + 3, width=4), layers=4).eval()
+        >>> head.closed_form.set_psfs(PSFBank.from_measured(torch.rand(4, 3, 5, 5), torch.arange(4.0)))
+        >>> with torch.no_grad():
+        ...     estimate = JointHead(head)(torch.rand(2, 3, 32, 48))
+        >>> estimate.depth.shape, estimate.deviation.shape, estimate.image.shape
+        (torch.Size([2, 1, 32, 48]), torch.Size([2, 1, 32, 48]), torch.Size([2, 3, 32, 48]))
+    """
+
+    temperature: Tensor
+
+    def __init__(self, network: ReconstructionHead, layers: int = 9, *, encoded: bool = True) -> None:
+        check_count("the number of classes of network", network.out_channels - 3, 2)
+        super().__init__(network, layers, encoded=encoded, likelihood=True)
+        self.register_buffer("temperature", torch.ones(()))
+
+    def predict(self, image: Tensor) -> Tensor:
+        """Return the logits of the classes and the image, from the capture and the map of its noise, (B, 6, H, W)."""
+        assert self.network is not None
+        restored = self.closed_form(*image.split(3, 1))
+        residual = self.network(restored.maps)
+        logits, image = residual.split([residual.shape[1] - 3, 3], 1)
+        logits = logits + self._initial_logits(restored.maps)
+        if not self.training:
+            logits = logits / self.temperature.to(logits.dtype)
+        return torch.cat([logits, image + restored.image], 1)
+
+    def closed_form_logits(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
+        """Return the logits of the classes by the likelihood in closed form alone, (B, D, H, W)."""
+        return self._initial_logits(self.closed_form(capture, noise).maps)
+
+    def _initial_logits(self, maps: Tensor) -> Tensor:
+        """Return the logarithm of the likelihood for each class, from the maps of the closed form."""
+        return interpolated_classes(LEAST * (1 - maps[:, -self.closed_form.layers :]), self.out_channels - 3)
+
+    def extra_repr(self) -> str:
+        """Return layers, classes and temperature."""
+        classes, temperature = self.out_channels - 3, self.temperature.item()
+        return f"layers={self.closed_form.layers}, classes={classes}, temperature={temperature:.3g}"
+
+
+def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) -> dict[str, Tensor]:
+    """Return the weights of a network for the image as those of a network for image and depth, which begins as it does.
+
+    The image stays what it was, up to the number of depths, over which the weights of the first convolution are
+    interpolated. The likelihood has zero weights in the first convolution and the classes have them in the last.
+
+    Args:
+        weights: state of a :class:`ClosedFormHead` whose network has the kind and width of that in ``head``.
+        head: whose PSFs, noise and temperature are taken; it is not changed.
+
+    Returns:
+        A state for ``head``; weights of another kind of network stay as they are.
+    """
+    assert head.network is not None
+    convolutions = [name for name, part in head.named_modules() if isinstance(part, nn.Conv2d)]
+    first, last = f"{convolutions[0]}.weight", f"{convolutions[-1]}.weight"
+    found, own = dict(weights), head.state_dict()
+    found |= {name: own[name] for name in own if name.startswith("closed_form.") or name == "temperature"}
+    common, layers = closed_form_channels(), head.closed_form.layers
+    if first in weights and weights[first].shape[1] >= common:
+        shared, by_depth = weights[first][:, :common], weights[first][:, common:]
+        zeros = shared.new_zeros(len(shared), layers, *shared.shape[2:])
+        given = by_depth.shape[1]
+        stretched = interpolated_classes(by_depth, layers) * given / layers if given else zeros
+        found[first] = torch.cat([shared, stretched, zeros], 1)
+    for name in (last, last.removesuffix("weight") + "bias"):
+        if name in weights and len(weights[name]) == 3:
+            classes = weights[name].new_zeros(head.out_channels - 3, *weights[name].shape[1:])
+            found[name] = torch.cat([classes, weights[name]])
+    return found

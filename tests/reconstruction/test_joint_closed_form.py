@@ -1,0 +1,188 @@
+"""Image and distribution of depth by one network that refines the closed forms of both."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kornia.color import rgb_to_linear_rgb
+from torch.nn import functional
+
+from kornia_tidy.inference.heads import PlainHead
+from kornia_tidy.inference.settings import SystemSettings
+from kornia_tidy.inference.trained import build_head
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction import (
+    ClosedFormHead,
+    JointClosedFormHead,
+    JointHead,
+    LayeredJointHead,
+    NAFNet,
+    UncertainJointEstimate,
+    closed_form_channels,
+    receptive_field,
+    reconstruct_tiled,
+)
+from kornia_tidy.reconstruction.closed_form import LEAST, LIKELIHOOD_WINDOW, SHARPNESS, ClosedForm
+from kornia_tidy.reconstruction.depth_distribution import depth_moments
+from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
+from kornia_tidy.reconstruction.joint_closed_form import widened_for_depth
+from tests.base import BaseTester
+from tests.reconstruction.onnx_export import check_onnx
+from tests.reconstruction.test_closed_form import bank, photo
+from tests.reconstruction.test_layered_joint import box_bank, scene
+
+LAYERS, CLASSES = 4, 7
+
+
+def joint(psfs=None, layers=LAYERS, dtype=torch.float32, *, trained=False, kind=NAFNet, **options):
+    torch.manual_seed(0)
+    network = kind(closed_form_channels(layers, likelihood=True), CLASSES + 3, width=2)
+    head = JointClosedFormHead(network, layers, **options).eval().to(dtype)
+    head.closed_form.set_psfs(bank(layers, dtype=dtype) if psfs is None else psfs)
+    if trained:
+        generator = torch.Generator().manual_seed(1)
+        for parameter in head.parameters():
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.02, generator=generator)
+    return head
+
+
+class TestJointClosedFormHead(BaseTester):
+    def test_smoke_begins_as_the_closed_forms(self):
+        head, capture = joint(), photo(20, 33, dtype=torch.float32)
+        with torch.no_grad():
+            output = head(capture, 0.01)
+            restored = head.closed_form(functional.pad(capture, (7, 8, 6, 6), "reflect"), 0.01)
+            likelihood = head.closed_form_logits(functional.pad(capture, (7, 8, 6, 6), "reflect"), 0.01)
+        assert output.shape == (2, CLASSES + 3, 20, 33)
+        assert torch.equal(output[:, -3:], restored.image[..., 6:26, 7:40])
+        assert torch.equal(output[:, :CLASSES], likelihood[..., 6:26, 7:40])
+
+    def test_feature_the_last_maps_are_the_likelihood_of_each_depth(self):
+        """Of the light's brightness; every other class is one of the layers."""
+        head, capture = joint(dtype=torch.float64), photo(32, 48)
+        light = rgb_to_linear_rgb(capture).mean(1, keepdim=True)
+        fits = depth_likelihood(light, *likelihood_filters(bank(LAYERS).psfs.mean(1)))
+        expected = (fits / SHARPNESS).clamp(min=LEAST)
+        self.assert_close(head.closed_form(capture).maps[:, -LAYERS:], 1 - expected / LEAST)
+        self.assert_close(head(capture)[:, :CLASSES:2], expected)
+
+    def test_feature_finds_on_which_side_of_an_edge_a_texture_is_near(self):
+        _, depth, capture = scene()
+        head = joint(box_bank(), 3, encoded=False)
+        with torch.no_grad():
+            found = JointHead(head)(capture).depth
+        assert found[depth == 1].mean() > found[depth == 0].mean() + 0.2
+
+    def test_feature_stray_light_is_taken_away_first(self):
+        """A bank with stray light and a capture with it give the depth that both have without it."""
+        plain, capture = bank(LAYERS), photo(32, 32)
+        share = torch.full((LAYERS, 3), 0.1, dtype=torch.float64)
+        light = rgb_to_linear_rgb(capture)
+        with_veil = 0.9 * light + 0.1 * light.mean((-2, -1), keepdim=True)
+        dim = PSFBank(0.9 * plain.psfs, plain.defocus, 0.9 * plain.energy, share)
+        without = joint(PSFBank(dim.psfs, dim.defocus, dim.energy), dtype=torch.float64, encoded=False)
+        expected = without(0.9 * light)[:, :CLASSES]
+        self.assert_close(joint(dim, dtype=torch.float64, encoded=False)(with_veil)[:, :CLASSES], expected)
+
+    def test_feature_correlated_captures_have_flipped_psfs(self):
+        flipped = PSFBank.from_measured(bank(LAYERS).psfs.flip((-2, -1)), bank(LAYERS).defocus)
+        head, other = joint(dtype=torch.float64), joint(flipped, dtype=torch.float64)
+        head.closed_form.set_psfs(bank(LAYERS), correlate=True)
+        capture = photo(32, 32)
+        self.assert_close(head(capture), other(capture))
+
+    def test_feature_the_likelihood_takes_the_middle_of_wide_psfs(self):
+        side = LIKELIHOOD_WINDOW
+        narrow = torch.rand(2, 3, side, side)
+        wide = functional.pad(narrow, (4, 4, 4, 4))
+        restore = ClosedForm(2, likelihood=True)
+        for psfs in (narrow, wide):
+            restore.set_psfs(PSFBank.from_measured(psfs, torch.arange(2.0)))
+            assert restore.whitening.shape[-1] == 3 * side
+        expected, _ = likelihood_filters(restore.psfs[..., 4:-4, 4:-4].mean(1))
+        self.assert_close(restore.whitening, expected)
+
+    def test_feature_temperature_widens_the_distribution_and_leaves_the_image(self):
+        head, capture = joint(trained=True), photo(16, 16, dtype=torch.float32)
+        with torch.no_grad():
+            before = head(capture)
+            head.temperature.fill_(2.0)
+            after, in_training = head(capture), head.train()(capture)
+        self.assert_close(after[:, :CLASSES], before[:, :CLASSES] / 2)
+        assert torch.equal(after[:, CLASSES:], before[:, CLASSES:])
+        assert torch.equal(in_training, before)
+        assert "temperature" in head.state_dict()
+
+    def test_feature_learns_image_and_depth_from_zero(self):
+        head = joint().train()
+        optimizer = torch.optim.Adam(head.parameters(), 1e-3)
+        capture = photo(32, 32, dtype=torch.float32)
+        for _ in range(3):
+            optimizer.zero_grad()
+            output = head(capture, 0.01)
+            ((output[:, -3:] - capture.flip(1)).square().mean() + output[:, 0].mean()).backward()
+            optimizer.step()
+        assert all(parameter.grad.any() for parameter in head.parameters())
+
+    def test_feature_a_state_needs_no_camera(self):
+        head, other = joint(trained=True), joint(bank(LAYERS, side=7, dtype=torch.float32))
+        other.load_state_dict(head.state_dict())
+        capture = photo(16, 16, dtype=torch.float32)
+        with torch.no_grad():
+            assert torch.equal(other(capture), head(capture))
+
+    @pytest.mark.parametrize("closed_form", [True, False])
+    def test_feature_settings_choose_the_head(self, closed_form):
+        settings = SystemSettings(
+            task="joint", depth_classes=5, refocus=3, head="nafnet", width=2, closed_form=closed_form
+        )
+        head = build_head(settings)
+        assert type(head) is (JointClosedFormHead if closed_form else LayeredJointHead)
+        assert head.out_channels == 5 + 3
+
+    def test_feature_tiles_are_the_whole(self):
+        head = JointHead(joint(trained=True)).eval()
+        margin = receptive_field(head)
+        image = photo(40, 2 * margin + 80, dtype=torch.float32)[:1]
+        with torch.no_grad():
+            whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 2 * margin + 32))
+        assert isinstance(tiled, UncertainJointEstimate)
+        for part, expected in zip(tiled, whole, strict=True):
+            self.assert_close(part, expected, atol=1e-4, rtol=0)
+
+    def test_feature_onnx(self):
+        capture = photo(18, 21, dtype=torch.float32)
+        assert len(check_onnx(JointHead(joint(layers=2, trained=True, kind=PlainHead)), capture, capture.flip(-1))) == 3
+
+    def test_feature_half_precision_autocast_is_near(self):
+        """Depth differs by a few roundings of 2^-9 of its logits."""
+        head, capture = joint(trained=True), photo(32, 32, dtype=torch.float32)
+        with torch.no_grad():
+            expected = head(capture, 0.01)
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                found = head(capture, 0.01).float()
+        depths = [depth_moments(output[:, :CLASSES])[0] for output in (expected, found)]
+        self.assert_close(depths[1], depths[0], atol=0.02, rtol=0)
+
+    @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
+    @pytest.mark.parametrize("layers", [0, LAYERS])
+    def test_feature_begins_as_a_network_for_the_image(self, kind, layers):
+        """With as many depths it makes the same image; its depth is the closed form's."""
+        image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
+        image.closed_form.set_psfs(bank(LAYERS, dtype=torch.float32))
+        for parameter in image.parameters():
+            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
+        head, capture = joint(kind=kind), photo(16, 16, dtype=torch.float32)
+        head.load_state_dict(widened_for_depth(image.state_dict(), head))
+        with torch.no_grad():
+            self.assert_close(head(capture, 0.01)[:, -3:], image(capture, 0.01), atol=1e-5, rtol=1e-5)
+            self.assert_close(head(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
+
+    def test_exception(self):
+        with pytest.raises(ValueError, match="number of classes of network must be a whole number of at least 2"):
+            JointClosedFormHead(NAFNet(closed_form_channels(2, likelihood=True), 4, width=2), 2)
+        with pytest.raises(ValueError, match="layers must be a whole number of at least 2, got 1"):
+            JointClosedFormHead(NAFNet(21, 8, width=2), 1)
+        with pytest.raises(ValueError, match="the network must take 23 channels, got in_channels=3"):
+            JointClosedFormHead(NAFNet(3, 8, width=2), 2)
