@@ -30,11 +30,11 @@ def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, 
         ValueError: if blur is so wide that scatter or occlusion would need more than the camera's memory budget.
     """
     model = camera.psf_model
-    if camera.compositing == "gather" and defocus.numel():
-        wide = model.wide_bank(channels, dtype, defocus)
-        if wide is not None:
-            return wide
     if (blur := model.wide_blur) is not None:
+        if camera.compositing == "gather" and defocus.numel():
+            wide = model.wide_bank(channels, dtype, defocus)
+            if wide is not None:
+                return wide
         needed = _BANKS * len(blur.nodes) * channels * dtype.itemsize * blur.window**2
         if needed > camera.memory_budget:
             raise ValueError(

@@ -206,7 +206,8 @@ class TiDyOptics(CameraState):
             reach = survey_defocus([defocus], now).reach
             banks = capture_psfs(now, light.shape[1], sample.dtype, reach, defocus)
             irradiance = now.render(light, defocus, banks, now.border)
-            coded = now.encode(now.expose(irradiance, params, generator))
+            seen = irradiance if now.sensor is None else now.sensor(irradiance, params=params, generator=generator)
+            coded = now.encode(seen)
         return sample.coded(coded.to(sample.image.dtype))
 
     def capture(
@@ -305,9 +306,8 @@ class TiDyOptics(CameraState):
             return {}
         height, width = cropped(image, self.window // 2 if self.border == "valid" else 0).shape[-2:]
         shape = (*(image.shape[:2] if image.ndim == 4 else (1, image.shape[0])), height, width)
-        sensor = cast("SensorNoise", self.sensor)
         dtype = compute_dtype(image.dtype, self.fidelity)
-        return sensor.draw(shape, device=image.device, dtype=dtype, generator=generator)
+        return cast("SensorNoise", self.sensor).draw(shape, device=image.device, dtype=dtype, generator=generator)
 
     # ------------------------------------------------------------------ how exactly to compute
 

@@ -25,8 +25,7 @@ from tests.base import BaseTester
 pytest.importorskip("lightning.pytorch")
 SMOKE = BUDGETS["smoke"]
 NAMES = (
-    "theorem", "point_psf", "sequence_length", "initialisation", "state_of_the_art", "transfer", "switching",
-    "discretisation", "boundaries",
+    "point_psf", "sequence_length", "initialisation", "state_of_the_art", "transfer", "discretisation",
 )  # fmt: skip
 
 
