@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.psf.batched_energies import batched_energies, energy_matrices
 from kornia_tidy.psf.propagation import pixel_energies, sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
@@ -18,6 +21,7 @@ Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, ex
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
 Key = tuple[float, float, Geometry, Gaps, torch.device, torch.dtype, int]  # the last is the number of threads
 _CACHE: OrderedDict[Key, Tensor] = OrderedDict()
+_MATRICES: OrderedDict[tuple[Hashable, ...], tuple[Tensor, Tensor]] = OrderedDict()  # of accelerators
 _CACHE_BYTES = 256 * 2**20
 
 
@@ -71,22 +75,74 @@ def exact_psf_bank(
     cells = pupil.amplitude.shape[-1]
     gaps = None if pupil.fill_factor == 1 else (cells // phase.shape[-1], pupil.fill_factor)
     field = pupil_field if gaps is None else gapped_pupil_field
+    shifts = chromatic_defocus or [0.0] * len(spectrum.wavelengths)
+    geometry = (window, cells, pupil.cell_pitch, pupil.extent, tolerance)
+    dtype = torch.complex128 if phase.dtype == torch.float64 else torch.complex64
+
+    def kernels_of(psi: Sequence[float], w: int, device: torch.device) -> Tensor:
+        scale = REFERENCE_WAVELENGTH / spectrum.wavelengths[w]
+        at = tuple((p + shifts[w]) * scale for p in psi)
+        return _kernels(at, pixel_step / spectrum.wavelengths[w], geometry, gaps, device, dtype)
+
+    if phase.device.type != "cpu" and not is_followed() and isinstance(pixel_step, float):
+        columns = cells if gaps is None else 2 * cells
+        if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _CACHE_BYTES:
+            constants = (tuple(spectrum.wavelengths), tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device)
+            left, pixels = _matrices_of(kernels_of, tuple(defocus), constants)
+            scales, amplitude, share, nodes = _constants_of(
+                pupil, tuple(dispersion), per_channel, tuple(defocus), phase.device, phase.dtype
+            )
+            energies = batched_energies(field(phase, amplitude, scales), weights.to(phase.dtype), left, pixels)
+            psfs = torch.einsum("dwyx,cw->dcyx", energies, share)
+            return PSFBank(psfs, nodes, psfs.sum((2, 3)))
+
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
-    for w, wavelength in enumerate(spectrum.wavelengths):
-        shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]
-        kernels = _kernels(
-            tuple((p + shift) * (REFERENCE_WAVELENGTH / wavelength) for p in defocus),
-            pixel_step / wavelength,
-            (window, cells, pupil.cell_pitch, pupil.extent, tolerance),
-            gaps,
-            phase.device,
-            torch.complex128 if phase.dtype == torch.float64 else torch.complex64,
-        )
+    for w in range(len(spectrum.wavelengths)):
+        kernels = kernels_of(defocus, w, phase.device)
         light = pixel_energies(field(phase, pupil.amplitude, dispersion[w]), weights, kernels)
         energies = light / pupil.light
         share = phase.new_tensor([channel[w] for channel in per_channel])
         psfs = psfs + energies[:, None] * share[:, None, None]
     return PSFBank(psfs, phase.new_tensor(defocus), psfs.sum((2, 3)))
+
+
+def _matrices_of(
+    kernels_of: Callable[..., Tensor], defocus: tuple[float, ...], constants: tuple[Hashable, ...]
+) -> tuple[Tensor, Tensor]:
+    """Return what :func:`batched_energies` multiplies with, made once for each depth, on the CPU, and remembered."""
+    keys = [(psi, constants) for psi in defocus]
+    missing = [key for key in keys if key not in _MATRICES]
+    if missing:
+        at, device = [key[0] for key in missing], cast("torch.device", constants[-1])
+        with torch.inference_mode(False), torch.no_grad():
+            waves = range(len(cast("tuple[float, ...]", constants[0])))
+            made = energy_matrices([kernels_of(at, w, torch.device("cpu")) for w in waves])
+            left, pixels = (matrix.to(device).unbind() for matrix in made)
+        _MATRICES.update(zip(missing, zip(left, pixels, strict=True), strict=True))
+    for key in keys:
+        _MATRICES.move_to_end(key)
+    found = tuple(torch.stack(matrices) for matrices in zip(*(_MATRICES[key] for key in keys), strict=True))
+    one = sum(matrix.nbytes for matrix in _MATRICES[keys[-1]])
+    while len(_MATRICES) * one > _CACHE_BYTES and len(_MATRICES) > len(keys):
+        _MATRICES.popitem(last=False)
+    return found[0], found[1]
+
+
+@lru_cache(maxsize=32)
+def _constants_of(
+    pupil: Pupil,
+    dispersion: tuple[float, ...],
+    per_channel: tuple[tuple[float, ...], ...],
+    defocus: tuple[float, ...],
+    device: torch.device,
+    dtype: torch.dtype,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return dispersion, amplitude, share of the light by channel and wavelength, and nodes, on an accelerator."""
+    with torch.inference_mode(False):
+        scales = torch.tensor(dispersion, dtype=torch.float64)[:, None, None, None]
+        share = torch.tensor(per_channel, dtype=dtype) / pupil.light
+        nodes = torch.tensor(defocus, dtype=dtype)
+        return scales.to(device), pupil.amplitude.to(device, dtype), share.to(device), nodes.to(device)
 
 
 def _kernels(

@@ -85,16 +85,16 @@ def pupil_over(mask_shape: Sequence[int], aperture: Tensor | None, fill_factor: 
     return Pupil(amplitude, MASK_SPAN / amplitude.shape[-1], fill_factor)
 
 
-def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
+def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> Tensor:
     """Return the complex field behind the mask at one wavelength.
 
     Args:
         phase: radians at 530 nm, (K, N, N), float32 or float64.
         aperture: amplitude on the same grid or one with a whole number of cells for each mask pixel, (sN, sN).
-        dispersion: factor that takes the phase at 530 nm to the wavelength.
+        dispersion: factor that takes the phase at 530 nm to the wavelength, or such factors, (W, 1, 1, 1).
 
     Returns:
-        (K, sN, sN) complex.
+        (K, sN, sN) complex, or (W, K, sN, sN).
 
     Convention:
         - Whole waves are taken off the phase in float64: in float32 the product of 1e4 rad with ``dispersion`` would be
@@ -113,7 +113,7 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
     return torch.complex(amplitude * cosine, amplitude * sine)
 
 
-def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
+def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> Tensor:
     r"""Return the field behind a mask with gaps between its pixels, to be used with :func:`gapped_cells`.
 
     Light through the gaps keeps its phase, so the field is that of the open aperture, A on whole cells, plus what the
@@ -122,10 +122,10 @@ def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Te
     Args:
         phase: radians at 530 nm, (K, N, N), float32 or float64.
         aperture: amplitude, (n, n), as for :func:`pupil_field`.
-        dispersion: factor that takes the phase at 530 nm to the wavelength.
+        dispersion: as for :func:`pupil_field`.
 
     Returns:
-        (K, 2n, 2n) complex: the change and the open aperture as blocks on the diagonal.
+        (K, 2n, 2n) complex, or (W, K, 2n, 2n): the change and the open aperture as blocks on the diagonal.
 
     Example:
         >>> gapped_pupil_field(torch.zeros(1, 2, 2), torch.ones(2, 2), 1.0)[0].real
