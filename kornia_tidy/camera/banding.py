@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, cropped, survey_defocus
+from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, check_light, cropped, survey_defocus
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.render.borders import check_border
 from kornia_tidy.runtime.tracing import is_followed
@@ -53,6 +53,8 @@ def capture_in_bands(
     image, depth, dtype, radius = sample.image, sample.depth, sample.dtype, camera.window // 2
     check_border(camera.border, *image.shape[-2:], camera.window)
     height, width = cropped(image, radius if camera.border == "valid" else 0).shape[-2:]
+    if image.device.type != "cpu":
+        check_light(image, camera)
     span = survey_defocus((camera.defocus(part.to(dtype)) for part in depth.split(rows, dim=-2)), camera)
     banks = camera.psf_model.scene_banks(image.shape[1], dtype, span.reach, camera.compositing == "occlusion")
     sides = "replicate" if camera.border == "zero" else camera.border  # black has no depth of its own

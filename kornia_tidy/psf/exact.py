@@ -36,6 +36,7 @@ def exact_psf_bank(
     window: int,
     tolerance: float = 1e-2,
     chromatic_defocus: Sequence[float] | None = None,
+    each_state: bool = False,
 ) -> PSFBank:
     r"""Return the PSFs of a mask sequence with every mask pixel and sensor pixel integrated.
 
@@ -54,6 +55,7 @@ def exact_psf_bank(
         tolerance: error allowed to the integrals over sensor pixels, see :func:`sensor_kernels`.
         chromatic_defocus: for each wavelength, what it has more of defocus than the nodes, in radians at 530 nm.
             Default: nothing, a lens corrected for colour.
+        each_state: return the PSFs of each mask, not their average: (D, K C, P, P), those of a mask follow each other.
 
     Returns:
         A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
@@ -92,9 +94,19 @@ def exact_psf_bank(
             scales, amplitude, share, nodes = _constants_of(
                 pupil, tuple(dispersion), per_channel, tuple(defocus), phase.device, phase.dtype
             )
-            energies = batched_energies(field(phase, amplitude, scales), weights.to(phase.dtype), left, pixels)
-            psfs = torch.einsum("dwyx,cw->dcyx", energies, share)
+            waves = field(phase, amplitude, scales)
+            if each_state:  # in the place of more wavelengths
+                waves, left, pixels = waves.transpose(0, 1).flatten(0, 1)[:, None], *(x.repeat(1, len(phase), *[1] * (x.ndim - 2)) for x in (left, pixels))
+                weights = torch.ones_like(weights[:1])
+            energies = batched_energies(waves, weights.to(phase.dtype), left, pixels)
+            by_state = energies.unflatten(1, (-1, len(share[0])))
+            psfs = torch.einsum("dswyx,cw->dscyx", by_state, share).flatten(1, 2)
             return PSFBank(psfs, nodes, psfs.sum((2, 3)))
+    if each_state:
+        rest = pupil, spectrum, dispersion, defocus, pixel_step, window, tolerance, chromatic_defocus
+        banks = [exact_psf_bank(own[None], torch.ones_like(weights[:1]), *rest) for own in phase]
+        psfs, energies = (torch.cat(own, 1) for own in zip(*((b.psfs, b.energy) for b in banks), strict=True))
+        return PSFBank(psfs, banks[0].defocus, energies)
 
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
     for w in range(len(spectrum.wavelengths)):
