@@ -1,9 +1,9 @@
 """A simulated accelerator: tensors that live on the CPU, claim another device, and keep its rules.
 
-It is torch's device for backends written in Python, here under the name ``simulated``. A tensor of it wraps one of the CPU, on which
-every operation is made. What an accelerator refuses is refused: operations that mix its tensors with those of the CPU,
-``numpy()``, and, where ``float64=False``, double precision, as on Apple's ``mps``. Operators of the package run their
-implementation for other devices, so what they launch is counted, not hidden.
+It is torch's device for backends written in Python, here under the name ``simulated``. A tensor of it wraps one of the
+CPU, on which every operation is made. What an accelerator refuses is refused: operations that mix its tensors with
+those of the CPU, ``numpy()``, and, where ``float64=False``, double precision, as on Apple's ``mps``. Operators of the
+package run their implementation for other devices, so what they launch is counted, not hidden.
 
     with SimulatedDevice() as device:
         coded = device.put(optics)(device.put(image), device.put(depth))
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +22,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter, tree_map_only
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
+from kornia_tidy.runtime.precision import WITHOUT_FLOAT64
+
 # Operators that give another view of the same memory and launch nothing, besides those that the schema tells of.
-_NO_LAUNCH = {"detach", "lift_fresh", "alias", "_unsafe_view", "_conj", "empty", "empty_like", "empty_strided", "new_empty"}
-_NO_LAUNCH |= {"_reshape_alias", "resize_", "set_", "_local_scalar_dense", "new_empty_strided", "is_same_size"}
+_NO_LAUNCH = {"detach", "lift_fresh", "alias", "_unsafe_view", "_conj", "_reshape_alias", "set_", "is_same_size"}
+_NO_LAUNCH |= {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "resize_"}
+_NO_LAUNCH |= {"_local_scalar_dense"}
 # Operators whose result or its shape the host must know before it goes on.
 _WAITS = {"_local_scalar_dense", "equal", "nonzero", "masked_select", "_unique2", "unique_dim", "unique_consecutive"}
 _WAITS |= {"bincount", "repeat_interleave", "is_nonzero", "_linalg_check_errors"}
@@ -82,7 +85,7 @@ class SimulatedTensor(Tensor):
     on_cpu: Tensor
 
     @staticmethod
-    def __new__(cls, on_cpu: Tensor) -> SimulatedTensor:
+    def __new__(cls, on_cpu: Tensor) -> Self:
         return Tensor._make_wrapper_subclass(
             cls,
             on_cpu.shape,
@@ -135,12 +138,15 @@ class SimulatedDevice(TorchDispatchMode):
         self.launches = self.waits = self.uploads = 0
         self.callers: Counter[tuple[str, str]] = Counter()
 
-    def __enter__(self) -> SimulatedDevice:
+    def __enter__(self) -> Self:
         _active.append(self)
+        if not self.float64:
+            WITHOUT_FLOAT64.add(DEVICE.type)
         return super().__enter__()
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: object) -> None:
         _active.pop()
+        WITHOUT_FLOAT64.discard(DEVICE.type)
         super().__exit__(*error)
 
     def put(self, value: Any) -> Any:
@@ -208,9 +214,9 @@ class SimulatedDevice(TorchDispatchMode):
     def _count(self, operator: Any, name: str, args: Any, given: list[Tensor], there: bool, target: bool) -> None:
         kinds = []
         if name in _COPIES:
-            source_there = isinstance(args[1] if name == "copy_" else args[0], SimulatedTensor)
+            source = isinstance(args[1] if name == "copy_" else args[0], SimulatedTensor)
             into = isinstance(args[0], SimulatedTensor) if name == "copy_" else target
-            kinds = ["waits"] if source_there and not into else ["uploads"] if into and not source_there else ["launches"]
+            kinds = ["launches" if source and into else "waits" if source else "uploads"]
         else:
             launched = not (operator.is_view or name in _NO_LAUNCH)
             kinds = ["launches"] if launched and (there or target) else []

@@ -42,7 +42,7 @@ def render_banks(
         total = light
         for index, (share, bank) in enumerate(banks):
             scene = light, defocus, bank.defocus, bank.psfs, bank.veil
-            seen = render_layers(*scene, method=method, nodes_known=True, **options)
+            seen = render_layers(*scene, method=method, **options)
             seen = seen if len(banks) == 1 else seen * share
             total = total + seen if index else seen
     if states is not None:

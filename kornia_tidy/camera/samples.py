@@ -14,8 +14,8 @@ from torch.utils.data import get_worker_info
 
 from kornia_tidy.checks import check_finite, check_float_tensor, check_generator
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.optics.thin_lens import DefocusRange
+from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.runtime.precision import widest
 from kornia_tidy.runtime.reading import is_unread

@@ -15,6 +15,7 @@ from kornia_tidy.psf.batched_energies import batched_energies, energy_matrices
 from kornia_tidy.psf.propagation import pixel_energies, sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
+from kornia_tidy.runtime.precision import widest
 from kornia_tidy.runtime.tracing import is_followed
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
@@ -91,13 +92,13 @@ def exact_psf_bank(
         if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _CACHE_BYTES:
             constants = (tuple(spectrum.wavelengths), tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device)
             left, pixels = _matrices_of(kernels_of, tuple(defocus), constants)
-            scales, amplitude, share, nodes = _constants_of(
-                pupil, tuple(dispersion), per_channel, tuple(defocus), phase.device, phase.dtype
-            )
+            lens = pupil, tuple(dispersion), per_channel
+            scales, amplitude, share = _constants_of(*lens, phase.device, phase.dtype)
+            nodes = _nodes_of(tuple(defocus), phase.device, phase.dtype)
             waves = field(phase, amplitude, scales)
             if each_state:  # in the place of more wavelengths
-                waves, left, pixels = waves.transpose(0, 1).flatten(0, 1)[:, None], *(x.repeat(1, len(phase), *[1] * (x.ndim - 2)) for x in (left, pixels))
-                weights = torch.ones_like(weights[:1])
+                waves, weights = waves.transpose(0, 1).flatten(0, 1)[:, None], torch.ones_like(weights[:1])
+                left, pixels = (x.repeat(1, len(phase), *[1] * (x.ndim - 2)) for x in (left, pixels))
             energies = batched_energies(waves, weights.to(phase.dtype), left, pixels)
             by_state = energies.unflatten(1, (-1, len(share[0])))
             psfs = torch.einsum("dswyx,cw->dscyx", by_state, share).flatten(1, 2)
@@ -140,21 +141,25 @@ def _matrices_of(
     return found[0], found[1]
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def _constants_of(
     pupil: Pupil,
     dispersion: tuple[float, ...],
     per_channel: tuple[tuple[float, ...], ...],
-    defocus: tuple[float, ...],
     device: torch.device,
     dtype: torch.dtype,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return dispersion, amplitude, share of the light by channel and wavelength, and nodes, on an accelerator."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return dispersion, amplitude, and share of the light by channel and wavelength, on an accelerator."""
     with torch.inference_mode(False):
-        scales = torch.tensor(dispersion, dtype=torch.float64)[:, None, None, None]
+        scales = torch.tensor(dispersion, dtype=widest(device))[:, None, None, None]
         share = torch.tensor(per_channel, dtype=dtype) / pupil.light
-        nodes = torch.tensor(defocus, dtype=dtype)
-        return scales.to(device), pupil.amplitude.to(device, dtype), share.to(device), nodes.to(device)
+        return scales.to(device), pupil.amplitude.to(dtype).to(device), share.to(device)
+
+
+@lru_cache(maxsize=1024)  # a scene's layers are some that follow each other
+def _nodes_of(defocus: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(defocus, dtype=dtype).to(device)
 
 
 def _kernels(

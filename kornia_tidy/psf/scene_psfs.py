@@ -32,7 +32,6 @@ from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.threads import SharedLock
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
-
 EACH = -1  # in the place of a state: all of them, each for itself, in one bank
 
 
@@ -159,8 +158,7 @@ class ScenePSFs:
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
             each_state: return a bank for each state of the exposure, not their average, unless the fidelity takes the
-                mean PSFs in any case. On an accelerator it is one bank, with as many channels for each state, and the
-                share is (S,).
+                mean PSFs in any case. In one bank, (D, S C, P, P), with shares (S,), where values are left unread.
             device: of measured PSFs. Default: that of ``defocus``.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)

@@ -24,6 +24,7 @@ from kornia_tidy.render.dispatch import (
 )
 from kornia_tidy.render.layers import check_nodes
 from kornia_tidy.render.scene import SceneArguments, assigned_scene, check_scene, layered_scene, remembered_scene
+from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 _SCENE = (
@@ -49,7 +50,6 @@ def render_layers(
     border: str,
     correlate: bool,
     method: str,
-    nodes_known: bool = False,
 ) -> Tensor:
     """Render a scene by the cheapest backend, or by one that is named: operator ``kornia_tidy::render_layers``.
 
@@ -65,7 +65,6 @@ def render_layers(
         border: as there.
         correlate: as there.
         method: ``"auto"`` or the name of a backend, see :func:`kornia_tidy.render.dispatch.choose`.
-        nodes_known: the nodes ascend, and an accelerator is not to be waited for to see it.
 
     Returns:
         (B, C, h, w) in the image's dtype, computed in float32 or better, autocast or not. It has gradients with respect
@@ -82,7 +81,7 @@ def render_layers(
         scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
         return render_scene(scene, method)
     check_scene(image, defocus, nodes, psfs, stray_light, border)
-    if nodes.device.type != "cpu" and not nodes_known:
+    if nodes.device.type != "cpu" and not is_unread():
         check_nodes(nodes)
     return torch.ops.kornia_tidy.render_layers(
         image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method

@@ -82,7 +82,7 @@ def occlusion_gradients(planes: OcclusionPlanes, gradient: Tensor, part_bytes: i
                     if found[0] is not None:
                         found[0][:, :, part] = back[:, :, 0]
                     if found[1] is not None:
-                        found[1] += back[:, :, 1:].sum(3)
+                        found[1] += back[:, :, 1:].sum(3).sum_to_size(found[1].shape)
         pairs += [(x, own) for x, own in zip(layers, found, strict=True) if own is not None]
     return pairs if of_psfs is None else [*pairs, (planes.psfs, of_psfs)]
 
