@@ -48,8 +48,6 @@ class _Hook(torch._C._acc.PrivateUse1Hooks):
 class _Backend:
     """What ``torch.simulated`` must offer for autocast and random numbers."""
 
-    _initialised = True
-
     @staticmethod
     def is_available() -> bool:
         return bool(_active)
@@ -73,6 +71,10 @@ class _Backend:
     @staticmethod
     def _is_in_bad_fork() -> bool:
         return False
+
+    @staticmethod
+    def manual_seed_all(seed: int) -> None:
+        """Do nothing: its random numbers are the CPU's."""
 
 
 _setup_privateuseone_for_python_backend("simulated", backend_module=_Backend, hook=_Hook())
