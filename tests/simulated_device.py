@@ -12,6 +12,7 @@ package run their implementation for other devices, so what they launch is count
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, Self
@@ -152,11 +153,12 @@ class SimulatedDevice(TorchDispatchMode):
         super().__exit__(*error)
 
     def put(self, value: Any) -> Any:
-        """Return a tensor on the device, or a module with its parameters and buffers there. Nothing is counted."""
+        """Return a copy of a tensor on the device, or of a module with its parameters and buffers. Nothing is counted."""
         if isinstance(value, Tensor):
             self._check_type(value)
             leaf = SimulatedTensor(value.detach().clone())
             return leaf.requires_grad_(value.requires_grad)
+        value = copy.deepcopy(value)
         for module in value.modules():
             for name, parameter in module._parameters.items():
                 if parameter is not None:
