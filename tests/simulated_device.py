@@ -153,7 +153,7 @@ class SimulatedDevice(TorchDispatchMode):
         super().__exit__(*error)
 
     def put(self, value: Any) -> Any:
-        """Return a copy of a tensor on the device, or of a module with its parameters and buffers. Nothing is counted."""
+        """Return a copy of a tensor or module on the device. Nothing is counted."""
         if isinstance(value, Tensor):
             self._check_type(value)
             leaf = SimulatedTensor(value.detach().clone())

@@ -10,6 +10,8 @@ import torch
 
 from kornia_tidy import Fidelity, SensorNoise, TiDyOptics
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.pupil import pupil_field
+from kornia_tidy.render.compositing import gather
 from kornia_tidy.systems import SYSTEMS
 from tests.base import BaseTester
 from tests.benchmarks.launches import step_counts
@@ -73,7 +75,9 @@ class TestCaptures(AcceleratorTester):
     @pytest.mark.parametrize("name", list(SYSTEMS))
     def test_feature_published_systems_agree_with_the_cpu(self, name):
         fidelity = replace(fidelity_of("draft"), window=9)
-        optics = TiDyOptics.from_preset(name, fidelity=fidelity, sensor=None, generator=torch.Generator().manual_seed(0))
+        optics = TiDyOptics.from_preset(
+            name, fidelity=fidelity, sensor=None, generator=torch.Generator().manual_seed(0)
+        )
         image, depth = scene(1, 20)
         lo, hi = optics.camera.defocus_range
         depth = optics.camera.depth(lo + (hi - lo) * (depth - depth.min()) / (depth.max() - depth.min()) * 0.99)
@@ -120,6 +124,50 @@ class TestCaptures(AcceleratorTester):
         self.assert_close(on_cpu(found), expected, rtol=0, atol=ROUNDING)
 
 
+class TestWithoutFloat64(AcceleratorTester):
+    """As on Apple's mps: every tensor in double precision is refused by the device."""
+
+    @pytest.mark.parametrize("border", ["reflect", "zero"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_captures_agree_with_the_cpu(self, compositing, border):
+        fidelity = fidelity_of("balanced", stray_light="veil")
+        optics = TiDyOptics(fidelity=fidelity, compositing=compositing, border=border, sensor=None)
+        self.assert_agrees(optics, *scene(1), float64=False)
+
+    def test_feature_reference_computes_in_float32(self):
+        image, depth = scene(1, 24)
+        optics = TiDyOptics(fidelity=fidelity_of("reference"), sensor=None)
+        self.assert_agrees(optics, image, depth.clamp(0.5, 0.73), float64=False)
+
+    def test_feature_occlusion_agrees_to_its_epsilon(self):
+        """A divisor of 1e-3 more, where a layer is seen by a tenth of a PSF or more, is 1e-2 of the light at most."""
+        optics = TiDyOptics(fidelity=fidelity_of("balanced"), compositing="occlusion", sensor=None)
+        image, depth = scene(1, 24)
+        expected = optics(image, depth).detach()
+        with SimulatedDevice(float64=False) as device:
+            found = device.put(optics)(device.put(image), device.put(depth))
+        self.assert_close(on_cpu(found), expected, rtol=0, atol=1e-2)
+
+    def test_feature_steep_masks_keep_their_phase(self):
+        """1e4 rad, where a product in float32 would be off by up to 1e-3 rad."""
+        phase = (torch.rand(2, 8, 8, dtype=torch.float64) * 2e4 - 1e4).float()
+        for dispersion in (1.0, 1.137, 0.87):
+            expected = (phase.double() * dispersion).sin()
+            with SimulatedDevice(float64=False) as device:
+                field = pupil_field(device.put(phase), device.put(torch.ones(8, 8)), dispersion)
+            self.assert_close(on_cpu(field).imag.double(), expected, rtol=0, atol=1e-5)
+
+    def test_gradcheck_phase_without_whole_waves(self):
+        phase = torch.rand(1, 4, 4) * 100
+        gradients = []
+        for options in ({}, {"float64": False}):
+            with SimulatedDevice(**options) as device:
+                own = device.put(phase).requires_grad_()
+                field = pupil_field(own, device.put(torch.ones(4, 4)), 1.2)
+                gradients.append(on_cpu(torch.autograd.grad(field.imag.sum(), own)[0]))
+        self.assert_close(*gradients, rtol=0, atol=1e-5)
+
+
 class TestChecks(BaseTester):
     """What the one look finds is told as on the CPU."""
 
@@ -132,9 +180,10 @@ class TestChecks(BaseTester):
         ],
     )
     def test_exception_bad_scene(self, image, depth, message):
+        optics = TiDyOptics(fidelity=fidelity_of("draft"))
+        given = torch.full((1, 3, 24, 24), image), torch.full((1, 1, 24, 24), depth)
         with SimulatedDevice() as device, pytest.raises(ValueError, match=message):
-            optics = device.put(TiDyOptics(fidelity=fidelity_of("draft")))
-            optics(device.put(torch.full((1, 3, 24, 24), image)), device.put(torch.full((1, 1, 24, 24), depth)))
+            device.put(optics)(*map(device.put, given))
 
     def test_exception_masks_that_are_not_finite(self):
         optics = TiDyOptics(fidelity=fidelity_of("draft"))
@@ -144,12 +193,9 @@ class TestChecks(BaseTester):
             device.put(optics)(*map(device.put, scene(1, 24)))
 
     def test_exception_nodes_that_do_not_ascend(self):
-        from kornia_tidy.render.compositing import gather
-
-        image, depth = scene(1, 24)
+        given = *scene(1, 24), torch.tensor([1.0, 0.0]), torch.ones(2, 3, 3, 3) / 9
         with SimulatedDevice() as device, pytest.raises(ValueError, match="nodes must ascend strictly"):
-            nodes, psfs = torch.tensor([1.0, 0.0]), torch.ones(2, 3, 3, 3) / 9
-            gather(*map(device.put, (image, depth, nodes, psfs)))
+            gather(*map(device.put, given))
 
     def test_feature_pixels_beyond_the_range_are_counted_and_told_once(self):
         image, depth = scene(1, 24)

@@ -15,7 +15,7 @@ from kornia_tidy.psf.batched_energies import batched_energies, energy_matrices
 from kornia_tidy.psf.propagation import pixel_energies, sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
-from kornia_tidy.runtime.precision import widest
+from kornia_tidy.runtime.precision import has_float64
 from kornia_tidy.runtime.tracing import is_followed
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
@@ -151,9 +151,11 @@ def _constants_of(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return dispersion, amplitude, and share of the light by channel and wavelength, on an accelerator."""
     with torch.inference_mode(False):
-        scales = torch.tensor(dispersion, dtype=widest(device))[:, None, None, None]
+        scales = torch.tensor(dispersion, dtype=torch.float64)[:, None, None, None]
         share = torch.tensor(per_channel, dtype=dtype) / pupil.light
-        return scales.to(device), pupil.amplitude.to(dtype).to(device), share.to(device)
+        if has_float64(device):  # otherwise its digits are split on the CPU
+            scales = scales.to(device)
+        return scales, pupil.amplitude.to(dtype).to(device), share.to(device)
 
 
 @lru_cache(maxsize=1024)  # a scene's layers are some that follow each other
@@ -172,6 +174,9 @@ def _kernels(
 ) -> Tensor:
     """Return the sensor kernels, remembered where the geometry is fixed: they depend on nothing else."""
     spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
+    if not has_float64(device):
+        cpu = torch.device("cpu")
+        return _kernels(defocus, step.to(cpu) if isinstance(step, Tensor) else step, geometry, gaps, cpu, dtype).to(device)
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
     if is_followed():

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from kornia_tidy.masks.base import MASK_SPAN
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.runtime.precision import has_float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,7 @@ class Pupil:
 
     Example:
         >>> from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.runtime.precision import has_float64
         >>> pupil = Pupil(circular_aperture(23), 0.1)
         >>> round(pupil.light, 2), round(pupil.extent, 2)
         (3.17, 1.05)
@@ -98,19 +100,47 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> 
 
     Convention:
         - Whole waves are taken off the phase in float64: in float32 the product of 1e4 rad with ``dispersion`` would be
-          off by up to 1e-3 rad.
+          off by up to 1e-3 rad. A device without float64 multiplies halves of the numbers, whose products are exact.
 
     Example:
         >>> pupil_field(torch.zeros(1, 2, 2), torch.ones(4, 4), 1.0).shape
         torch.Size([1, 4, 4])
     """
     cells = aperture.shape[-1] // phase.shape[-1]
-    angle = ((phase.double() * dispersion + math.pi).remainder(2 * math.pi) - math.pi).to(phase.dtype)
+    if has_float64(phase.device):
+        angle = ((phase.double() * dispersion + math.pi).remainder(2 * math.pi) - math.pi).to(phase.dtype)
+    else:
+        angle = 2 * math.pi * _waves_off(phase, dispersion)
     amplitude = aperture.to(angle)
     cosine, sine = angle.cos(), angle.sin()
     if cells > 1:
         cosine, sine = (x.repeat_interleave(cells, -1).repeat_interleave(cells, -2) for x in (cosine, sine))
     return torch.complex(amplitude * cosine, amplitude * sine)
+
+
+def _waves_off(phase: Tensor, dispersion: float | Tensor) -> Tensor:
+    """Return float32 phases times a factor, in waves and without whole waves: to 1e-6 for phases up to 1e4 rad.
+
+    Source: Dekker, A floating-point technique for extending the available precision, Numer. Math. 18, 224 (1971).
+    """
+    factor = torch.as_tensor(dispersion, dtype=torch.float64, device="cpu") / (2 * math.pi)
+    first = _upper_digits(factor)
+    second = _upper_digits(factor - first)
+    parts = torch.stack([first, second, factor - first - second]).to(phase.dtype)
+    first, second, third = parts.to(phase.device).unbind()
+    scaled = phase * 4097  # a product of 12 and 12 digits is exact
+    high = scaled - (scaled - phase)
+    low = phase - high
+    waves = torch.zeros_like(phase * first)
+    for product in (high * first, high * second, low * first):
+        waves = waves + (product - product.detach().round())
+    return waves + (high * third + low * second)
+
+
+def _upper_digits(number: Tensor) -> Tensor:
+    """Return numbers rounded to 12 binary digits."""
+    mantissa, exponent = torch.frexp(number)
+    return torch.ldexp((mantissa * 4096).round(), exponent - 12)
 
 
 def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> Tensor:
