@@ -176,7 +176,9 @@ def _kernels(
     spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
     if not has_float64(device):
         cpu = torch.device("cpu")
-        return _kernels(defocus, step.to(cpu) if isinstance(step, Tensor) else step, geometry, gaps, cpu, dtype).to(device)
+        return _kernels(defocus, step.to(cpu) if isinstance(step, Tensor) else step, geometry, gaps, cpu, dtype).to(
+            device
+        )
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
     if is_followed():

@@ -20,16 +20,16 @@ class Pupil:
     """The aperture on a grid of square cells, a whole number of them for each mask pixel.
 
     Args:
-        amplitude: (n, n) in [0, 1].
-        cell_pitch: side of a cell in pupil radii.
-        fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
+            amplitude: (n, n) in [0, 1].
+            cell_pitch: side of a cell in pupil radii.
+            fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
 
     Example:
-        >>> from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.runtime.precision import has_float64
-        >>> pupil = Pupil(circular_aperture(23), 0.1)
-        >>> round(pupil.light, 2), round(pupil.extent, 2)
-        (3.17, 1.05)
+            >>> from kornia_tidy.optics.aperture import circular_aperture
+    from kornia_tidy.runtime.precision import has_float64
+            >>> pupil = Pupil(circular_aperture(23), 0.1)
+            >>> round(pupil.light, 2), round(pupil.extent, 2)
+            (3.17, 1.05)
     """
 
     amplitude: Tensor
@@ -121,7 +121,7 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> 
 def _waves_off(phase: Tensor, dispersion: float | Tensor) -> Tensor:
     """Return float32 phases times a factor, in waves and without whole waves: to 1e-6 for phases up to 1e4 rad.
 
-    Source: Dekker, A floating-point technique for extending the available precision, Numer. Math. 18, 224 (1971).
+    Source: Dekker, A floating-point technique for extending the available precision, Numerische Mathematik 18 (1971).
     """
     factor = torch.as_tensor(dispersion, dtype=torch.float64, device="cpu") / (2 * math.pi)
     first = _upper_digits(factor)

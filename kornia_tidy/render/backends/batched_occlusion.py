@@ -10,8 +10,8 @@ Its gradients need what shines through from behind each layer, :math:`R_{d+1} = 
 :math:`\partial I / \partial l_d = s_d T_d`, :math:`\partial I / \partial a_d = -s_d T_d R_d` and
 :math:`\partial I / \partial E_d = -s_d^2 T_d (l_d - a_d R_d)`.
 
-On a device without float64 transforms are made in float32, and :math:`\epsilon` is 1e-3, as in Ikoma et al. 2021, so that
-round-off stays below some 1e-3 of the light.
+On a device without float64 transforms are made in float32, and :math:`\epsilon` is 1e-3, as in Ikoma et al. 2021: the
+round-off of a transform, some 1e-7, is divided by no less.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from kornia_tidy.render.backends.dense_occlusion import EPSILON, OcclusionPlanes
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
 from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.runtime.precision import widest
-
 
 EPSILON_FLOAT32 = 1e-3  # as in the source: on devices without float64 round-off is some 1e-7 of the light
 
