@@ -37,7 +37,8 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
 
     Returns:
         (height, width) float64, or float32 on a device without it, in [0, 1): how much of a pixel's stray light lands
-        in the image, and as much of its own comes from there. Zero where the window is at least ``2 * max(height, width) - 1`` pixels wide.
+        in the image, and as much of its own comes from there. Zero where the window is at least
+        ``2 * max(height, width) - 1`` pixels wide.
 
     Source: Born and Wolf, Principles of Optics, 8.5.2: encircled energy of a circular aperture.
 
