@@ -76,7 +76,8 @@ class Fidelity:
         stray_light: treatment of the light outside the window. ``"renormalize"`` scales the window to sum one,
             ``"veil"`` spreads the light evenly over the image (with the border ``"zero"`` only the part that stays
             inside it), and ``"discard"`` drops it.
-        double: compute in float64 whatever the type of the image.
+        double: compute in float64 whatever the type of the image; in float32 on a device without float64, such as
+            Apple's ``mps``.
         correlate: rotate PSFs by 180 degrees, as the PhaseCam3D family does.
         occlusion_states: time average for occlusion-aware compositing, for which averaging PSFs is not exact.
             ``"each"`` renders every state of the exposure and averages the images. ``"mean"`` renders once with the

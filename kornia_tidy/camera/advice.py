@@ -27,7 +27,7 @@ def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: fl
         found = f"{len(sample.image)} and {len(sample.depth)}"
         raise ValueError(f"a plan needs at least one image and its depth, got {found}")
     light = None if image is None else optics.decode(sample.image.to(sample.dtype))
-    defocus = optics.defocus(sample.depth.to(compute_dtype(depth.dtype, optics.fidelity)))
+    defocus = optics.defocus(sample.depth.to(compute_dtype(depth.dtype, optics.fidelity, depth.device)))
     if (wide := plan_wide(optics, defocus, light, tolerance)) is not None:
         return wide
     return Planner(optics, sample.image.shape[1]).scene(defocus, light).plan(tolerance)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.camera.capture_psfs import capture_psfs
-from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, cropped, survey_defocus
+from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, check_light, cropped, survey_defocus
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.render.borders import check_border
 from kornia_tidy.runtime.tracing import is_followed
@@ -54,6 +54,8 @@ def capture_in_bands(
     image, depth, dtype, radius = sample.image, sample.depth, sample.dtype, camera.window // 2
     check_border(camera.border, *image.shape[-2:], camera.window)
     height, width = cropped(image, radius if camera.border == "valid" else 0).shape[-2:]
+    if image.device.type != "cpu":
+        check_light(image, camera)
     span = survey_defocus((camera.defocus(part.to(dtype)) for part in depth.split(rows, dim=-2)), camera)
     banks = capture_psfs(camera, image.shape[1], dtype, span.reach, span.reach)
     sides = "replicate" if camera.border == "zero" else camera.border  # black has no depth of its own

@@ -43,7 +43,7 @@ def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, 
                 f"{camera.memory_budget / 2**30:.1f} GiB: take compositing='gather', a smaller aperture, a narrower "
                 f"depth_range, or a larger memory_budget"
             )
-    return model.scene_banks(channels, dtype, reach, camera.compositing == "occlusion")
+    return model.scene_banks(channels, dtype, reach, camera.compositing == "occlusion", defocus.device)
 
 
 def wide_irradiance(light: Tensor, defocus: Tensor, bank: WideBank, border: str) -> Tensor:

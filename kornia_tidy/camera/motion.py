@@ -75,7 +75,7 @@ def moving_capture(
     check_light(images, optics)
     if not batched:
         images, depths = images[None], depths[None]
-    dtype = compute_dtype(images.dtype, optics.fidelity)
+    dtype = compute_dtype(images.dtype, optics.fidelity, images.device)
     optics = optics.snapshot(dtype)  # every moment is of the same masks
     with torch.autocast(images.device.type, enabled=False):
         durations = optics.timeline(dtype).durations

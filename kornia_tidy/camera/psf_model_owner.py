@@ -34,6 +34,7 @@ class PSFModelOwner(nn.Module):
     """
 
     psf_model: PSFModel
+    fixed_defocus: tuple[float, float] | None = None  # of every scene, see with_fixed_layers
     masks: PhaseMasks
     camera: ThinLensCamera | DefocusRange
     modulator: nn.Module
@@ -188,6 +189,32 @@ class PSFModelOwner(nn.Module):
             fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
         """
         return self._replace(psf_model=self.psf_model.with_fidelity(fidelity))
+
+    def with_fixed_layers(self, depth: Tensor | None = None) -> Self:
+        """Return this camera with the same defocus layers for every scene. The parts are shared, so masks learn.
+
+        A capture usually looks at the scene: it checks its values, and convolves the layers between its nearest and its
+        farthest point. An accelerator has to be waited for to know them. With fixed layers a capture on an accelerator
+        looks at no value: the host never waits, and a training step can be captured in a CUDA graph, once one was made
+        before. On the CPU values are checked as ever.
+
+        Args:
+            depth: depths whose range all scenes keep to, in what the camera takes, such as metres. Default: all of the
+                camera's range. What lies beyond is rendered as its nearest layer.
+
+        Raises:
+            ValueError: if a depth is NaN or not positive.
+
+        Example:
+            >>> from kornia_tidy import TiDyOptics
+            >>> optics = TiDyOptics().with_fixed_layers(torch.tensor([0.5, 2.0]))
+            >>> [round(psi, 2) for psi in optics.fixed_defocus]
+            [3.8, -14.06]
+        """
+        if depth is None:
+            return self._replace(fixed_defocus=self.psf_model.camera.defocus_range)
+        reach = torch.stack(torch.aminmax(self.psf_model.camera.defocus(depth.detach())))
+        return self._replace(fixed_defocus=tuple(reach.tolist()))
 
     def through_state(self, state: int) -> Self:
         """Return this camera with one state of its modulator shown all the time. The parts and the window are shared.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,10 +12,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
-from kornia_tidy.checks import check_float_tensor, check_generator
+from kornia_tidy.checks import check_finite, check_float_tensor, check_generator
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.runtime.precision import widest
+from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.threads import CaptureNotes
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
@@ -77,7 +81,9 @@ class Sample:
         return {**self.form, "image": coded, "all_in_focus": cropped(self.form["image"], margin), **maps}
 
 
-def read_sample(image: Any, depth: Any, camera: Watchful, generator: object = None) -> Sample:
+def read_sample(
+    image: Any, depth: Any, camera: Watchful, generator: object = None, *, deferred: bool = False
+) -> Sample:
     """Return a sample given as tensors, a tuple or a mapping, with its types, shapes and light checked.
 
     Args:
@@ -85,6 +91,7 @@ def read_sample(image: Any, depth: Any, camera: Watchful, generator: object = No
         depth: the depth map, if ``image`` is a tensor.
         camera: says what it takes.
         generator: source of the noise, to be checked before any work.
+        deferred: leave the light on an accelerator to :func:`survey_scene`.
 
     Raises:
         TypeError: if image or depth are not floating-point tensors, or the generator is none.
@@ -122,18 +129,20 @@ def read_sample(image: Any, depth: Any, camera: Watchful, generator: object = No
             f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
             f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
         )
-    if camera.check_inputs and not is_value_unknown() and image.numel():
+    at_once = image.device.type == "cpu" or not deferred
+    if camera.check_inputs and at_once and not is_value_unknown() and image.numel():
         lowest, highest = torch.aminmax(image.detach())
         if not bool((lowest >= 0) & (highest <= 1)):  # NaN too
             check_light(image, camera)
-    wide = model.fidelity.double or image.dtype == torch.float64
+    wide = compute_dtype(image.dtype, model.fidelity, image.device) == torch.float64
     bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * (2 if wide else 1)
     return Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once)
 
 
-def compute_dtype(dtype: torch.dtype, fidelity: Fidelity) -> torch.dtype:
-    """Return the type that images of a type are computed in: float64 where either asks for it."""
-    return torch.float64 if fidelity.double or dtype == torch.float64 else torch.float32
+def compute_dtype(dtype: torch.dtype, fidelity: Fidelity, device: torch.device) -> torch.dtype:
+    """Return the type that images of a type are computed in: float64 where either asks for it and the device has it."""
+    wide = fidelity.double or dtype == torch.float64
+    return widest(device) if wide else torch.float32
 
 
 def check_light(image: Tensor, camera: Watchful) -> None:
@@ -220,6 +229,47 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
         tell_of_defocus(extremes, camera, pixels, int(clamped))
     return DefocusSpan(extremes if reach is None else reach, clamped)
+
+
+def survey_scene(sample: Sample, defocus: Tensor, camera: Any) -> Tensor:
+    """Return how far the defocus of a scene reaches, as :func:`survey_defocus` does; on an accelerator check it too.
+
+    The host waits for an accelerator once, for the extremes of image, depth, defocus and masks together, and not at all
+    where the camera has fixed layers. Where a check finds something it waits again, to say what.
+
+    Args:
+        sample: image and depth.
+        defocus: of the scene in radians.
+        camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
+
+    Returns:
+        Lowest and highest defocus in radians, (2,), or the defocus map, as far as PSFs are needed for it.
+    """
+    fixed, lens = camera.fixed_defocus, camera.psf_model.camera
+    if not is_unread():
+        span = survey_defocus([defocus], camera)
+        return span.reach if fixed is None else torch.tensor(fixed, requires_grad=defocus.requires_grad)
+    own, (lo, hi) = defocus.detach(), lens.defocus_range
+    camera.notes.of_thread.clamped = ((own < lo - ROUNDING) | (own > hi + ROUNDING)).sum() if own.numel() else 0
+    if fixed is not None or not own.numel():
+        return torch.tensor(fixed or (lo, hi), requires_grad=defocus.requires_grad)
+    states, weights = camera.psf_model.states(sample.dtype)
+    looked_at = sample.image, sample.depth, own, states, weights
+    pairs = [torch.aminmax(x.detach()) for x in looked_at if x.numel()]
+    numbers = torch.stack([end.to(sample.dtype) for pair in pairs for end in pair]).tolist()
+    (dark, bright), (near, far), reach, *rest = zip(numbers[::2], numbers[1::2], strict=True)
+    if not all(map(math.isfinite, (x for pair in rest for x in pair))):
+        check_finite("the phase of the masks", states)
+        check_finite("the weights of the modulator", weights)
+    if camera.check_inputs:
+        if not (dark >= 0 and bright <= 1):  # NaN too
+            check_light(sample.image, camera)
+        if not (near > 0 and (far <= 1 or not isinstance(lens, DefocusRange))):
+            lens.defocus(sample.depth)
+        beyond = reach[0] < lo - ROUNDING or reach[1] > hi + ROUNDING
+        if beyond or reach[1] <= lo + SAME_FOCUS:
+            tell_of_defocus(torch.tensor(reach), camera, own.numel(), int(camera.notes.clamped) if beyond else 0)
+    return torch.tensor(reach, requires_grad=defocus.requires_grad)
 
 
 def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped: int = 0) -> None:

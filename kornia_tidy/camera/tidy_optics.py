@@ -15,7 +15,8 @@ from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.capture_psfs import Banks, capture_psfs, wide_irradiance
 from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
-from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_defocus, tell_of_defocus, zero_of
+from kornia_tidy.camera.exposure import render_banks
+from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_scene, tell_of_defocus
 from kornia_tidy.checks import check_choice, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
@@ -24,7 +25,7 @@ from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.render.render_ops import render_layers
+from kornia_tidy.runtime.reading import is_unread, values_unread
 from kornia_tidy.runtime.threads import CaptureNotes
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
 from kornia_tidy.sensor.noise import SensorNoise
@@ -196,14 +197,15 @@ class TiDyOptics(CameraState):
             params: noise drawn before by :meth:`draw`, to repeat a capture or to compile one.
             generator: source of the noise (not while compiling).
         """
-        sample = read_sample(image, depth, self, generator)
-        with torch.autocast(sample.image.device.type, enabled=False):  # float32 or better throughout
+        sample = read_sample(image, depth, self, generator, deferred=True)
+        device = sample.image.device
+        with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             now = self.snapshot(sample.dtype)
             if sample.bytes_at_once > now.memory_budget and (rows := rows_at_once(now, sample)):
                 return sample.coded(capture_in_bands(now, sample, rows, params, generator))
             light = now.decode(sample.image.to(sample.dtype))
             defocus = now.defocus(sample.depth.to(sample.dtype))
-            reach = survey_defocus([defocus], now).reach
+            reach = survey_scene(sample, defocus, now)
             banks = capture_psfs(now, light.shape[1], sample.dtype, reach, defocus)
             irradiance = now.render(light, defocus, banks, now.border)
             seen = irradiance if now.sensor is None else now.sensor(irradiance, params=params, generator=generator)
@@ -259,7 +261,8 @@ class TiDyOptics(CameraState):
         Raises:
             ValueError: if the camera checks its inputs and a depth is NaN or not positive.
         """
-        return self.psf_model.camera.defocus(depth, check_inputs=self.check_inputs and not is_value_unknown())
+        checked = self.check_inputs and not is_value_unknown() and not is_unread()
+        return self.psf_model.camera.defocus(depth, check_inputs=checked)
 
     def render(self, light: Tensor, defocus: Tensor, banks: Banks, border: str) -> Tensor:
         """Return the irradiance of a scene on the sensor, over the whole exposure.
@@ -272,22 +275,8 @@ class TiDyOptics(CameraState):
         """
         if not isinstance(banks, list):
             return wide_irradiance(light, defocus, banks, border)
-        # Where colours have spectra, each channel of the sensor sees a plane for each channel of the scene.
-        reflectances = banks[0][1].psfs.shape[1] // light.shape[1]
-        if reflectances > 1:
-            light = light.repeat(1, reflectances, 1, 1)
-        if len(light) == 0:  # an empty batch: gradients are zero
-            margin = banks[0][1].window // 2 if border == "valid" else 0
-            return cropped(light, margin) + zero_of(defocus, *(bank.psfs for _, bank in banks))
-        fidelity = self.psf_model.fidelity
-        options: dict[str, Any] = {"compositing": self.compositing, "border": border, "correlate": fidelity.correlate}
-        options["layers"] = "nearest" if fidelity.layers == "nearest" else "linear"
-        total = light
-        for index, (share, bank) in enumerate(banks):
-            seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, method="auto", **options)
-            seen = seen if len(banks) == 1 else seen * share
-            total = total + seen if index else seen
-        return total.unflatten(1, (-1, reflectances)).sum(2) if reflectances > 1 else total
+        method = "batched" if self.fixed_defocus is not None and light.device.type != "cpu" else "auto"
+        return render_banks(light, defocus, banks, self.psf_model.fidelity, self.compositing, border, method)
 
     def expose(
         self, irradiance: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
@@ -306,7 +295,7 @@ class TiDyOptics(CameraState):
             return {}
         height, width = cropped(image, self.window // 2 if self.border == "valid" else 0).shape[-2:]
         shape = (*(image.shape[:2] if image.ndim == 4 else (1, image.shape[0])), height, width)
-        dtype = compute_dtype(image.dtype, self.fidelity)
+        dtype = compute_dtype(image.dtype, self.fidelity, image.device)
         return cast("SensorNoise", self.sensor).draw(shape, device=image.device, dtype=dtype, generator=generator)
 
     # ------------------------------------------------------------------ how exactly to compute

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.psf.batched_energies import batched_energies, energy_matrices
 from kornia_tidy.psf.propagation import pixel_energies, sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
+from kornia_tidy.runtime.precision import has_float64
 from kornia_tidy.runtime.tracing import is_followed
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
 Key = tuple[float, float, Geometry, Gaps, torch.device, torch.dtype, int]  # the last is the number of threads
 _CACHE: OrderedDict[Key, Tensor] = OrderedDict()
+_MATRICES: OrderedDict[tuple[Hashable, ...], tuple[Tensor, Tensor]] = OrderedDict()  # of accelerators
 _CACHE_BYTES = 256 * 2**20
 
 
@@ -32,6 +37,7 @@ def exact_psf_bank(
     window: int,
     tolerance: float = 1e-2,
     chromatic_defocus: Sequence[float] | None = None,
+    each_state: bool = False,
 ) -> PSFBank:
     r"""Return the PSFs of a mask sequence with every mask pixel and sensor pixel integrated.
 
@@ -50,6 +56,7 @@ def exact_psf_bank(
         tolerance: error allowed to the integrals over sensor pixels, see :func:`sensor_kernels`.
         chromatic_defocus: for each wavelength, what it has more of defocus than the nodes, in radians at 530 nm.
             Default: nothing, a lens corrected for colour.
+        each_state: return the PSFs of each mask, not their average: (D, K C, P, P), those of a mask follow each other.
 
     Returns:
         A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
@@ -71,22 +78,90 @@ def exact_psf_bank(
     cells = pupil.amplitude.shape[-1]
     gaps = None if pupil.fill_factor == 1 else (cells // phase.shape[-1], pupil.fill_factor)
     field = pupil_field if gaps is None else gapped_pupil_field
+    shifts = chromatic_defocus or [0.0] * len(spectrum.wavelengths)
+    geometry = (window, cells, pupil.cell_pitch, pupil.extent, tolerance)
+    dtype = torch.complex128 if phase.dtype == torch.float64 else torch.complex64
+
+    def kernels_of(psi: Sequence[float], w: int, device: torch.device) -> Tensor:
+        scale = REFERENCE_WAVELENGTH / spectrum.wavelengths[w]
+        at = tuple((p + shifts[w]) * scale for p in psi)
+        return _kernels(at, pixel_step / spectrum.wavelengths[w], geometry, gaps, device, dtype)
+
+    if phase.device.type != "cpu" and not is_followed() and isinstance(pixel_step, float):
+        columns = cells if gaps is None else 2 * cells
+        if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _CACHE_BYTES:
+            constants = (tuple(spectrum.wavelengths), tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device)
+            left, pixels = _matrices_of(kernels_of, tuple(defocus), constants)
+            lens = pupil, tuple(dispersion), per_channel
+            scales, amplitude, share = _constants_of(*lens, phase.device, phase.dtype)
+            nodes = _nodes_of(tuple(defocus), phase.device, phase.dtype)
+            waves = field(phase, amplitude, scales)
+            if each_state:  # in the place of more wavelengths
+                waves, weights = waves.transpose(0, 1).flatten(0, 1)[:, None], torch.ones_like(weights[:1])
+                left, pixels = (x.repeat(1, len(phase), *[1] * (x.ndim - 2)) for x in (left, pixels))
+            energies = batched_energies(waves, weights.to(phase.dtype), left, pixels)
+            by_state = energies.unflatten(1, (-1, len(share[0])))
+            psfs = torch.einsum("dswyx,cw->dscyx", by_state, share).flatten(1, 2)
+            return PSFBank(psfs, nodes, psfs.sum((2, 3)))
+    if each_state:
+        rest = pupil, spectrum, dispersion, defocus, pixel_step, window, tolerance, chromatic_defocus
+        banks = [exact_psf_bank(own[None], torch.ones_like(weights[:1]), *rest) for own in phase]
+        psfs, energies = (torch.cat(own, 1) for own in zip(*((b.psfs, b.energy) for b in banks), strict=True))
+        return PSFBank(psfs, banks[0].defocus, energies)
+
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
-    for w, wavelength in enumerate(spectrum.wavelengths):
-        shift = 0.0 if chromatic_defocus is None else chromatic_defocus[w]
-        kernels = _kernels(
-            tuple((p + shift) * (REFERENCE_WAVELENGTH / wavelength) for p in defocus),
-            pixel_step / wavelength,
-            (window, cells, pupil.cell_pitch, pupil.extent, tolerance),
-            gaps,
-            phase.device,
-            torch.complex128 if phase.dtype == torch.float64 else torch.complex64,
-        )
+    for w in range(len(spectrum.wavelengths)):
+        kernels = kernels_of(defocus, w, phase.device)
         light = pixel_energies(field(phase, pupil.amplitude, dispersion[w]), weights, kernels)
         energies = light / pupil.light
         share = phase.new_tensor([channel[w] for channel in per_channel])
         psfs = psfs + energies[:, None] * share[:, None, None]
     return PSFBank(psfs, phase.new_tensor(defocus), psfs.sum((2, 3)))
+
+
+def _matrices_of(
+    kernels_of: Callable[..., Tensor], defocus: tuple[float, ...], constants: tuple[Hashable, ...]
+) -> tuple[Tensor, Tensor]:
+    """Return what :func:`batched_energies` multiplies with, made once for each depth, on the CPU, and remembered."""
+    keys = [(psi, constants) for psi in defocus]
+    missing = [key for key in keys if key not in _MATRICES]
+    if missing:
+        at, device = [key[0] for key in missing], cast("torch.device", constants[-1])
+        with torch.inference_mode(False), torch.no_grad():
+            waves = range(len(cast("tuple[float, ...]", constants[0])))
+            made = energy_matrices([kernels_of(at, w, torch.device("cpu")) for w in waves])
+            left, pixels = (matrix.to(device).unbind() for matrix in made)
+        _MATRICES.update(zip(missing, zip(left, pixels, strict=True), strict=True))
+    for key in keys:
+        _MATRICES.move_to_end(key)
+    found = tuple(torch.stack(matrices) for matrices in zip(*(_MATRICES[key] for key in keys), strict=True))
+    one = sum(matrix.nbytes for matrix in _MATRICES[keys[-1]])
+    while len(_MATRICES) * one > _CACHE_BYTES and len(_MATRICES) > len(keys):
+        _MATRICES.popitem(last=False)
+    return found[0], found[1]
+
+
+@lru_cache(maxsize=16)
+def _constants_of(
+    pupil: Pupil,
+    dispersion: tuple[float, ...],
+    per_channel: tuple[tuple[float, ...], ...],
+    device: torch.device,
+    dtype: torch.dtype,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return dispersion, amplitude, and share of the light by channel and wavelength, on an accelerator."""
+    with torch.inference_mode(False):
+        scales = torch.tensor(dispersion, dtype=torch.float64)[:, None, None, None]
+        share = torch.tensor(per_channel, dtype=dtype) / pupil.light
+        if has_float64(device):  # otherwise its digits are split on the CPU
+            scales = scales.to(device)
+        return scales, pupil.amplitude.to(dtype).to(device), share.to(device)
+
+
+@lru_cache(maxsize=1024)  # a scene's layers are some that follow each other
+def _nodes_of(defocus: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(defocus, dtype=dtype).to(device)
 
 
 def _kernels(
@@ -99,6 +174,11 @@ def _kernels(
 ) -> Tensor:
     """Return the sensor kernels, remembered where the geometry is fixed: they depend on nothing else."""
     spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
+    if not has_float64(device):
+        cpu = torch.device("cpu")
+        return _kernels(defocus, step.to(cpu) if isinstance(step, Tensor) else step, geometry, gaps, cpu, dtype).to(
+            device
+        )
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
     if is_followed():

@@ -85,16 +85,16 @@ def _matrices(field: Tensor, weights: Tensor, kernels: Tensor) -> tuple[Tensor, 
     left = torch.view_as_real(kernels.resolve_conj()).flatten(-2)
     with torch.autocast(left.device.type, enabled=False):
         # B is packed as real less imaginary part: with J's sum of both, that leaves the real part of their product.
-        pixels = (_real_rows(kernels).mT @ _real_rows(kernels * (1 - 1j))).flatten(-2)
+        pixels = (real_rows(kernels).mT @ real_rows(kernels * (1 - 1j))).flatten(-2)
     return plain, turned, left, pixels
 
 
 def _columns(field: Tensor) -> Tensor:
     """Return the real matrix (2N, K 2N) that takes (re, im) of a kernel's cells to real and imaginary parts of K U."""
-    return _real_rows(torch.stack((field, 1j * field), 1).permute(2, 1, 0, 3)).flatten(2).flatten(0, 1)
+    return real_rows(torch.stack((field, 1j * field), 1).permute(2, 1, 0, 3)).flatten(2).flatten(0, 1)
 
 
-def _real_rows(numbers: Tensor) -> Tensor:
+def real_rows(numbers: Tensor) -> Tensor:
     """Return (..., R, N) complex as (..., 2R, N): rows of real and of imaginary parts by turns."""
     return torch.view_as_real(numbers).movedim(-1, -2).flatten(-3, -2)
 

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from kornia_tidy.masks.base import MASK_SPAN
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.runtime.precision import has_float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,15 +20,16 @@ class Pupil:
     """The aperture on a grid of square cells, a whole number of them for each mask pixel.
 
     Args:
-        amplitude: (n, n) in [0, 1].
-        cell_pitch: side of a cell in pupil radii.
-        fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
+            amplitude: (n, n) in [0, 1].
+            cell_pitch: side of a cell in pupil radii.
+            fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
 
     Example:
-        >>> from kornia_tidy.optics.aperture import circular_aperture
-        >>> pupil = Pupil(circular_aperture(23), 0.1)
-        >>> round(pupil.light, 2), round(pupil.extent, 2)
-        (3.17, 1.05)
+            >>> from kornia_tidy.optics.aperture import circular_aperture
+    from kornia_tidy.runtime.precision import has_float64
+            >>> pupil = Pupil(circular_aperture(23), 0.1)
+            >>> round(pupil.light, 2), round(pupil.extent, 2)
+            (3.17, 1.05)
     """
 
     amplitude: Tensor
@@ -85,27 +87,30 @@ def pupil_over(mask_shape: Sequence[int], aperture: Tensor | None, fill_factor: 
     return Pupil(amplitude, MASK_SPAN / amplitude.shape[-1], fill_factor)
 
 
-def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
+def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> Tensor:
     """Return the complex field behind the mask at one wavelength.
 
     Args:
         phase: radians at 530 nm, (K, N, N), float32 or float64.
         aperture: amplitude on the same grid or one with a whole number of cells for each mask pixel, (sN, sN).
-        dispersion: factor that takes the phase at 530 nm to the wavelength.
+        dispersion: factor that takes the phase at 530 nm to the wavelength, or such factors, (W, 1, 1, 1).
 
     Returns:
-        (K, sN, sN) complex.
+        (K, sN, sN) complex, or (W, K, sN, sN).
 
     Convention:
         - Whole waves are taken off the phase in float64: in float32 the product of 1e4 rad with ``dispersion`` would be
-          off by up to 1e-3 rad.
+          off by up to 1e-3 rad. A device without float64 multiplies halves of the numbers, whose products are exact.
 
     Example:
         >>> pupil_field(torch.zeros(1, 2, 2), torch.ones(4, 4), 1.0).shape
         torch.Size([1, 4, 4])
     """
     cells = aperture.shape[-1] // phase.shape[-1]
-    angle = ((phase.double() * dispersion + math.pi).remainder(2 * math.pi) - math.pi).to(phase.dtype)
+    if has_float64(phase.device):
+        angle = ((phase.double() * dispersion + math.pi).remainder(2 * math.pi) - math.pi).to(phase.dtype)
+    else:
+        angle = 2 * math.pi * _waves_off(phase, dispersion)
     amplitude = aperture.to(angle)
     cosine, sine = angle.cos(), angle.sin()
     if cells > 1:
@@ -113,7 +118,32 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
     return torch.complex(amplitude * cosine, amplitude * sine)
 
 
-def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Tensor:
+def _waves_off(phase: Tensor, dispersion: float | Tensor) -> Tensor:
+    """Return float32 phases times a factor, in waves and without whole waves: to 1e-6 for phases up to 1e4 rad.
+
+    Source: Dekker, A floating-point technique for extending the available precision, Numerische Mathematik 18 (1971).
+    """
+    factor = torch.as_tensor(dispersion, dtype=torch.float64, device="cpu") / (2 * math.pi)
+    first = _upper_digits(factor)
+    second = _upper_digits(factor - first)
+    parts = torch.stack([first, second, factor - first - second]).to(phase.dtype)
+    first, second, third = parts.to(phase.device).unbind()
+    scaled = phase * 4097  # a product of 12 and 12 digits is exact
+    high = scaled - (scaled - phase)
+    low = phase - high
+    waves = torch.zeros_like(phase * first)
+    for product in (high * first, high * second, low * first):
+        waves = waves + (product - product.detach().round())
+    return waves + (high * third + low * second)
+
+
+def _upper_digits(number: Tensor) -> Tensor:
+    """Return numbers rounded to 12 binary digits."""
+    mantissa, exponent = torch.frexp(number)
+    return torch.ldexp((mantissa * 4096).round(), exponent - 12)
+
+
+def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> Tensor:
     r"""Return the field behind a mask with gaps between its pixels, to be used with :func:`gapped_cells`.
 
     Light through the gaps keeps its phase, so the field is that of the open aperture, A on whole cells, plus what the
@@ -122,10 +152,10 @@ def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float) -> Te
     Args:
         phase: radians at 530 nm, (K, N, N), float32 or float64.
         aperture: amplitude, (n, n), as for :func:`pupil_field`.
-        dispersion: factor that takes the phase at 530 nm to the wavelength.
+        dispersion: as for :func:`pupil_field`.
 
     Returns:
-        (K, 2n, 2n) complex: the change and the open aperture as blocks on the diagonal.
+        (K, 2n, 2n) complex, or (W, K, 2n, 2n): the change and the open aperture as blocks on the diagonal.
 
     Example:
         >>> gapped_pupil_field(torch.zeros(1, 2, 2), torch.ones(2, 2), 1.0)[0].real

@@ -37,8 +37,11 @@ from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.psf.wide_blur import BlurGroup
 from kornia_tidy.psf.wide_model import Derived, WidePSFs
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank
+from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.threads import SharedLock
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
+
+EACH = -1  # in the place of a state: all of them, each for itself, in one bank
 
 
 class ScenePSFs(WidePSFs):
@@ -131,7 +134,12 @@ class ScenePSFs(WidePSFs):
         return self.scene_banks(channels, dtype, defocus)[0][1]
 
     def scene_banks(
-        self, channels: int, dtype: torch.dtype, defocus: Tensor, each_state: bool = False
+        self,
+        channels: int,
+        dtype: torch.dtype,
+        defocus: Tensor,
+        each_state: bool = False,
+        device: torch.device | None = None,
     ) -> list[tuple[Tensor | float, PSFBank]]:
         """Return the PSFs that a scene needs, with shares of the exposure; of depths it does not hold there are none.
 
@@ -143,11 +151,12 @@ class ScenePSFs(WidePSFs):
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
             each_state: return a bank for each state of the exposure, not their average, unless the fidelity takes the
-                mean PSFs in any case.
+                mean PSFs in any case. In one bank, (D, S C, P, P), with shares (S,), where values are left unread.
+            device: of measured PSFs. Default: that of ``defocus``.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
         if self.measured is not None:
-            return [(1.0, self._measured_bank(spectrum, dtype, defocus.device))]
+            return [(1.0, self._measured_bank(spectrum, dtype, device or defocus.device))]
         nodes, kind = self.defocus_nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         interpolated = kind not in ("nearest", "linear")
@@ -155,7 +164,8 @@ class ScenePSFs(WidePSFs):
         targets = nodes_around(around, defocus)
         states: list[tuple[Tensor | float, int | None]] = [(1.0, None)]
         if each_state and self.fidelity.occlusion_states == "each":
-            states = [(share, state) for state, share in enumerate(self.states(dtype)[1])]
+            shares = self.states(dtype)[1]
+            states = [(shares, EACH)] if is_unread() else [(share, state) for state, share in enumerate(shares)]
         banks: list[tuple[Tensor | float, PSFBank]] = []
         for share, state in states:
             if interpolated:
@@ -188,7 +198,7 @@ class ScenePSFs(WidePSFs):
     ) -> PSFBank:
         """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid."""
         states, weights = self.states(dtype)
-        if state is not None:
+        if state is not None and state != EACH:
             states, weights = states[state : state + 1], torch.ones_like(weights[:1])
         derived = self._derived
         side = self.window if derived.window is None else derived.window.side
@@ -197,15 +207,15 @@ class ScenePSFs(WidePSFs):
         traced = torch.compiler.is_compiling() or is_transformed()
         if group is not None:
             side = group.window
-        build = partial(self._build, states, weights, spectrum, side, tolerance)
-        if self.wide_blur is not None and not traced:
+        build = partial(self._build, states, weights, spectrum, side, tolerance, each_state=state == EACH)
+        if self.wide_blur is not None and not traced and state != EACH:
             if learning:  # the PSFs are remembered; their gradients are made in the backward pass
                 with torch.no_grad():
                     bank = self._computed_bank(spectrum, dtype, nodes, state, None, group)
                 bank = learnt_bank(bank, partial(self._exact_psfs, spectrum, grid), states, weights, grid)
                 return bank if stray_light is None else bank.with_stray_light(*stray_light)
             build = partial(self._wide_psfs, states, weights, spectrum, grid, side)
-        if learning or traced or next(self.camera.parameters(), None) is not None:
+        if learning or traced or is_unread() or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
         fill_factor = getattr(self.modulator, "fill_factor", 1.0)
@@ -225,8 +235,9 @@ class ScenePSFs(WidePSFs):
         tolerance: float,
         nodes: tuple[float, ...],
         grid: int = 1,
+        each_state: bool = False,
     ) -> PSFBank:
-        if not is_value_unknown():
+        if not (is_value_unknown() or is_unread()):
             check_finite("the phase of the masks", states)
             check_finite("the weights of the modulator", weights)
         # How the phase of the masks and the focus of the lens change from wavelength to wavelength.
@@ -240,8 +251,8 @@ class ScenePSFs(WidePSFs):
                     f"{pupil.fill_factor}"
                 )
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
-        step = self.pixel_step * grid
-        return exact_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, step, window, tolerance, shift)
+        lens = dispersion, nodes, self.pixel_step * grid, window, tolerance, shift
+        return exact_psf_bank(states, weights, pupil, spectrum, *lens, each_state=each_state)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)

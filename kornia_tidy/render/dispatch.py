@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.render.backend import Backend, GradientPairs
+from kornia_tidy.render.backends.batched import MOST_SAMPLES, BatchedBackend
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
@@ -25,7 +26,8 @@ from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
 
 BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
-METHODS = ("auto", *BACKENDS)
+BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an estimate
+METHODS = ("auto", *BACKENDS, BATCHED.name)
 LARGEST_PLANE = 32 << 20  # bytes of all channels of an image, up to which "auto" may take dense
 REMEMBERED = 256  # choices, each of some 500 bytes and a grid
 
@@ -142,10 +144,13 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """
     if method != "auto":
         check_choice("method", method, METHODS)
-        why = refusal(BACKENDS[method], scene)
+        backend = BATCHED if method == BATCHED.name else BACKENDS[method]
+        why = refusal(backend, scene)
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
-        return BACKENDS[method]
+        return backend
+    if scene.image.device.type != "cpu" and not is_transformed() and BATCHED.samples(scene) <= MOST_SAMPLES:
+        return BATCHED
     # With occlusion the values of PSFs matter too.
     layout = {} if scene.layout is None or scene.compositing == "occlusion" else scene.layout
     if "fingerprint" not in layout:

@@ -54,7 +54,8 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         layer i + 1 the weight t. For ``"nearest"`` t is zero.
 
     Raises:
-        ValueError: if ``mode`` is not known, or the nodes do not ascend (not checked while compiling).
+        ValueError: if ``mode`` is not known, or the nodes do not ascend (not checked while compiling, nor on an
+            accelerator: see :func:`check_nodes`).
 
     Convention:
         - Half way between two nodes, nearest takes the lower one (the farther from the camera).
@@ -70,8 +71,8 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     """
     check_choice("layers", mode, LAYER_MODES)
     check_float_tensor("nodes", nodes, 1, "(D,)")
-    if not is_value_unknown() and not bool((nodes.diff() > 0).all()):
-        raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
+    if nodes.device.type == "cpu":
+        check_nodes(nodes)
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
     spacing = None if is_transformed() else _even_spacing(nodes)
@@ -90,6 +91,16 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     # Inner nodes only: the end nodes belong to the first and last interval.
     index = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
     return index, (clamped - nodes.take(index)) / nodes.diff().take(index)
+
+
+def check_nodes(nodes: Tensor) -> None:
+    """Raise ``ValueError`` if the nodes do not ascend strictly, unless their values are unknown. Waits for the device.
+
+    Args:
+        nodes: (D,) defocus of the layers in radians.
+    """
+    if not is_value_unknown() and not bool((nodes.diff() > 0).all()):
+        raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
 
 
 def _even_spacing(nodes: Tensor) -> Tensor | None:

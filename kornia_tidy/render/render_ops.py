@@ -22,7 +22,9 @@ from kornia_tidy.render.dispatch import (
     render_unrecorded,
     scene_gradients,
 )
+from kornia_tidy.render.layers import check_nodes
 from kornia_tidy.render.scene import SceneArguments, assigned_scene, check_scene, layered_scene, remembered_scene
+from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 _SCENE = (
@@ -79,6 +81,8 @@ def render_layers(
         scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
         return render_scene(scene, method)
     check_scene(image, defocus, nodes, psfs, stray_light, border)
+    if nodes.device.type != "cpu" and not is_unread():
+        check_nodes(nodes)
     return torch.ops.kornia_tidy.render_layers(
         image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method
     )

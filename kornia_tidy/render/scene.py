@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.render.borders import BORDERS, check_border, pad_border
-from kornia_tidy.render.layers import assign_layers
+from kornia_tidy.render.layers import assign_layers, check_nodes
 from kornia_tidy.render.repeatable import of_thread
 
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
@@ -176,6 +176,8 @@ def layered_scene(
         ((4, 4), tensor([0]), tensor([0.5000]))
     """
     check_scene(image, defocus, nodes, psfs, stray_light, border)
+    if nodes.device.type != "cpu":
+        check_nodes(nodes)
     return assigned_scene(
         SceneArguments(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
     )

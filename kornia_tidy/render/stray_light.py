@@ -16,6 +16,7 @@ from torch import Tensor
 
 from kornia_tidy.render.layers import blend_of_layers
 from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.runtime.precision import has_float64
 
 _RINGS = 128  # at most; in larger images neighbours stand together, each group's light spread evenly over its pixels
 
@@ -35,8 +36,9 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
         device: where to put it.
 
     Returns:
-        (height, width) float64 in [0, 1): how much of a pixel's stray light lands in the image, and as much of its own
-        comes from there. Zero where the window is at least ``2 * max(height, width) - 1`` pixels wide.
+        (height, width) float64, or float32 on a device without it, in [0, 1): how much of a pixel's stray light lands
+        in the image, and as much of its own comes from there. Zero where the window is at least
+        ``2 * max(height, width) - 1`` pixels wide.
 
     Source: Born and Wolf, Principles of Optics, 8.5.2: encircled energy of a circular aperture.
 
@@ -46,6 +48,8 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
         >>> float(share_within(4, 4, 7).max())
         0.0
     """
+    if device is not None and not has_float64(device):
+        return share_within(height, width, psf_size).float().to(device)
     radius, last = psf_size // 2, max(height, width) - 1
     if last <= radius:
         return torch.zeros(height, width, dtype=torch.float64, device=device)

@@ -12,7 +12,7 @@ from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_store import settled_profile
-from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE, METHODS, choose, explain, render_scene
+from kornia_tidy.render.dispatch import BACKENDS, BATCHED, LARGEST_PLANE, METHODS, choose, explain, render_scene
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
@@ -59,7 +59,7 @@ class TestChoose(BaseTester):
         expected = explain(scene).backend if method == "auto" else method
         if expected in explain(scene).objections:
             pytest.skip("this scene cannot be rendered directly")
-        coded = render_scene(scene, BACKENDS[expected])
+        coded = render_scene(scene, {**BACKENDS, BATCHED.name: BATCHED}[expected])
         assert torch.equal(render(image, defocus, bank, compositing, method=method), coded)
 
     def test_exception_unknown_method(self):
