@@ -1,4 +1,4 @@
-"""The systems that come with the package, as the experiments score them without training: other conditions, one noise."""
+"""The systems that come with the package, scored under other conditions without further training."""
 
 from __future__ import annotations
 
