@@ -82,9 +82,8 @@ def take(optics: TiDyOptics, way: str, scene: Tensor, depth: Tensor, pixels: flo
         images = torch.stack([moved(scene, float(pixels * time)) for time in times], 1)
         return moving_capture(optics, images, depth[:, None].expand_as(images))[:, None]
     if pixels:  # each shot sees the scene where it then is
-        taken = [
-            burst(optics, moved(scene, float(pixels * times[k])), depth, PAUSE, EXPOSURE)[:, k] for k in range(masks)
-        ]
+        shifts = (pixels * times[: optics.masks.phase.shape[0]]).tolist()
+        taken = [burst(optics, moved(scene, x), depth, PAUSE, EXPOSURE)[:, k] for k, x in enumerate(shifts)]
         shots = torch.stack(taken, 1)
     else:
         shots = burst(optics, scene, depth, PAUSE, EXPOSURE)
