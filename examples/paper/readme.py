@@ -15,13 +15,13 @@ from examples.paper.runner import HERE, RESULTS, SCALES
 from kornia_tidy.files import write_bytes
 
 EXPERIMENTS = {
-    "theorem": "1. Theorem 1",
+    "theorem": "1. Non-convexity, and the reach of averages",
     "point_psf": "2. All in focus without a network",
     "sequence_length": "3. The number of masks",
     "initialisation": "4. The first masks for depth",
     "state_of_the_art": "5. Other systems",
     "transfer": "6. Transfer to real scenes",
-    "switching": "7. The time between masks",
+    "switching_time": "7. Switching time",
     "discretisation": "8. The paper's discretisation",
     "boundaries": "9. Boundaries of depth",
     "burst": "10. Burst against average, and motion",

@@ -1,0 +1,93 @@
+"""The paper's experiments without training: they run, repeat, and compare what they say they compare."""
+
+from __future__ import annotations
+
+import importlib
+import math
+
+import pytest
+import torch
+
+from examples.paper import burst, theorem
+from examples.paper.readme import EXPERIMENTS
+from examples.paper.runner import main
+from examples.paper.shipped import with_parts
+from examples.paper.switching_time import trials as switching_trials
+from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.mask_design.non_convexity import autocorrelation_bound, extreme_points
+from kornia_tidy.optics.aperture import circular_aperture
+from tests.base import BaseTester
+
+NAMES = ("theorem", "switching_time", "boundaries", "burst")
+
+
+@pytest.mark.parametrize("name", NAMES)
+class TestEveryExperiment(BaseTester):
+    def test_smoke_it_runs_and_says_what_it_can_and_cannot_judge(self, name, tmp_path, capsys):
+        experiment = importlib.import_module(f"examples.paper.{name}").EXPERIMENT
+        rows = main(experiment, "", ["--threads", "0", "--output", str(tmp_path)])
+        assert len(rows) == len(experiment.trials("smoke"))
+        text = (tmp_path / f"{name}-smoke.md").read_text(encoding="utf-8")
+        assert text.startswith(f"## {EXPERIMENTS[name]}\n")
+        assert "Judged can be" in text
+        assert f"{len(rows)} of {len(rows)} trials" in text
+
+    def test_cardinality_each_trial_of_each_scale_is_another(self, name):
+        experiment = importlib.import_module(f"examples.paper.{name}").EXPERIMENT
+        for scale in ("smoke", "cpu", "gpu", "paper"):
+            trials = [tuple(trial.items()) for trial in experiment.trials(scale)]
+            assert len(set(trials)) == len(trials) > 0
+
+
+class TestTheorem(BaseTester):
+    def test_feature_a_trial_repeats_to_the_last_digit(self):
+        trial = theorem.trials("smoke")[0]
+        assert theorem.measure(trial, "smoke") == theorem.measure(trial, "smoke")
+
+    def test_feature_the_psf_holds_all_light(self):
+        psf = theorem.average_psf(theorem.target_masks("five random masks", 0), circular_aperture(theorem.SIDE))
+        assert float(psf.sum()) == pytest.approx(1.0, abs=1e-5)
+
+    def test_feature_the_bound_is_below_every_residual_of_a_single_mask_and_zero_for_one(self):
+        aperture = circular_aperture(theorem.SIDE)
+        scores = theorem.measure({"target": "five random masks", "fitted": "1", "seed": "0"}, "smoke")
+        assert 0 < float(scores["bound"]) < float(scores["best"])
+        own = theorem.average_psf(theorem.target_masks("one random mask", 0), aperture)
+        assert theorem.least_residual(1.0, own, aperture) == 0.0
+
+    def test_feature_the_bound_is_the_residual_where_only_the_extreme_lag_differs(self):
+        """Two masks that differ at one extreme point: against either, other lags only add to the difference."""
+        aperture = circular_aperture(theorem.SIDE)
+        y, x = extreme_points(aperture)[0]
+        pair = torch.zeros(2, theorem.SIDE, theorem.SIDE)
+        pair[1, y, x] = math.pi
+        target = theorem.average_psf(pair, aperture)
+        single = theorem.average_psf(pair[:1], aperture)
+        residual = float(((single - target).square().sum() / target.square().sum()).sqrt())
+        bound = float(autocorrelation_bound(pair, aperture))
+        assert bound == pytest.approx(0.0, abs=1e-6)
+        assert 0 < theorem.least_residual(bound, target, aperture) < residual
+
+
+class TestShipped(BaseTester):
+    def test_feature_only_the_named_part_changes(self):
+        optics = TiDyOptics(PixelwiseMask(2), fidelity="draft")
+        changed = with_parts(optics, compositing="occlusion")
+        assert changed.compositing == "occlusion"
+        assert optics.compositing == "gather"
+        assert changed.fidelity == optics.fidelity
+        self.assert_close(changed.masks.phase, optics.masks.phase)
+
+    def test_feature_a_system_of_one_mask_is_scored_once(self):
+        assert sum(trial["system"] == "joint-1" for trial in switching_trials("cpu")) == 1
+
+
+class TestBurst(BaseTester):
+    def test_feature_a_burst_loses_the_light_of_its_pauses(self):
+        light = [float(burst.measure(trial, "smoke")["light"]) for trial in burst.trials("smoke")[:2]]
+        lost = 4 * burst.PAUSE / burst.EXPOSURE
+        assert light[1] / light[0] == pytest.approx(1 - lost, abs=0.01)
+
+    def test_feature_a_shift_by_whole_pixels_rolls_the_scene(self):
+        scene = torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(0))
+        self.assert_close(burst.moved(scene, 3.0), scene.roll(3, -1), atol=1e-5, rtol=0.0)
