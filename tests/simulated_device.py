@@ -59,7 +59,7 @@ class _Backend:
 
     @staticmethod
     def device_count() -> int:
-        return 1
+        return int(bool(_active))
 
     @staticmethod
     def current_device() -> int:
@@ -75,6 +75,14 @@ class _Backend:
 
     @staticmethod
     def manual_seed_all(seed: int) -> None:
+        """Do nothing: its random numbers are the CPU's."""
+
+    @staticmethod
+    def get_rng_state(device: int = 0) -> Tensor:
+        return torch.empty(0, dtype=torch.uint8)
+
+    @staticmethod
+    def set_rng_state(state: Tensor, device: int = 0) -> None:
         """Do nothing: its random numbers are the CPU's."""
 
 

@@ -62,7 +62,7 @@ class AcceleratorTester(BaseTester):
 
 class TestCaptures(AcceleratorTester):
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
-    @pytest.mark.parametrize("name", ["draft", "balanced", "reference"])
+    @pytest.mark.parametrize("name", ["draft", "balanced", pytest.param("reference", marks=pytest.mark.slow)])
     def test_feature_fidelities_agree_with_the_cpu(self, name, compositing):
         optics = TiDyOptics(fidelity=fidelity_of(name), compositing=compositing, sensor=None)
         image, depth = scene(1, 24)
@@ -72,6 +72,7 @@ class TestCaptures(AcceleratorTester):
     def test_feature_paper_agrees_with_the_cpu(self):
         self.assert_agrees(TiDyOptics(fidelity="paper", sensor=None), *scene())
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", list(SYSTEMS))
     def test_feature_published_systems_agree_with_the_cpu(self, name):
         fidelity = replace(fidelity_of("draft"), window=9)

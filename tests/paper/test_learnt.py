@@ -32,6 +32,7 @@ NAMES = (
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")
 @pytest.mark.parametrize("name", NAMES)
 class TestEveryExperiment(BaseTester):
+    @pytest.mark.slow  # .ci/run runs it
     def test_smoke_it_runs_and_says_what_it_can_and_cannot_judge(self, name, tmp_path, capsys):
         experiment = importlib.import_module(f"examples.paper.{name}").EXPERIMENT
         rows = main(experiment, "", ["--threads", "0", "--output", str(tmp_path)])

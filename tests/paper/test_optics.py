@@ -23,6 +23,7 @@ NAMES = ("theorem", "switching_time", "boundaries", "burst")
 
 @pytest.mark.parametrize("name", NAMES)
 class TestEveryExperiment(BaseTester):
+    @pytest.mark.slow  # .ci/run runs it
     def test_smoke_it_runs_and_says_what_it_can_and_cannot_judge(self, name, tmp_path, capsys):
         experiment = importlib.import_module(f"examples.paper.{name}").EXPERIMENT
         rows = main(experiment, "", ["--threads", "0", "--output", str(tmp_path)])
