@@ -118,7 +118,7 @@ def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype)
     """
     alone = threading.active_count() == 1
     for _ in range(READS):
-        now = [] if alone else [*masks.parameters(), *modulator.parameters()]
+        now = [] if alone else _watched(masks, modulator)
         before = list(map(Tensor.clone, map(Tensor.detach, now)))
         phase = cast("Tensor", masks.phase).to(dtype)
         shown = modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
@@ -126,10 +126,15 @@ def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype)
             shown = Timeline(shown.states.clone(), shown.durations.clone())
         else:
             shown = shown.map(Tensor.clone)
-        after = [] if alone else [*masks.parameters(), *modulator.parameters()]
+        after = [] if alone else _watched(masks, modulator)
         if all(map(torch.equal, before, after)):
             break
     return shown
+
+
+def _watched(masks: nn.Module, modulator: nn.Module) -> list[Tensor]:
+    """Return the parameters on the CPU; an accelerator makes one change after the other, so that no read is torn."""
+    return [x for x in (*masks.parameters(), *modulator.parameters()) if x.device.type == "cpu"]
 
 
 class Modulator(nn.Module):
