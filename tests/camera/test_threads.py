@@ -148,9 +148,9 @@ class TestThreads(BaseTester):
     def test_feature_psfs_are_computed_once_for_all_threads(self, monkeypatch):
         built, real = [], module.exact_psf_bank
 
-        def spy(*arguments):
+        def spy(*arguments, **options):
             built.append((arguments[3], arguments[0].dtype, arguments[5]))
-            return real(*arguments)
+            return real(*arguments, **options)
 
         optics = camera()
         monkeypatch.setattr(module, "exact_psf_bank", spy)

@@ -26,9 +26,9 @@ def depths_built(optics: TiDyOptics, depth: torch.Tensor) -> int:
     built = []
     real = module.exact_psf_bank
 
-    def spy(*arguments):
+    def spy(*arguments, **options):
         built.extend(arguments[5])
-        return real(*arguments)
+        return real(*arguments, **options)
 
     with patch.object(module, "exact_psf_bank", spy):
         optics(image, depth)
