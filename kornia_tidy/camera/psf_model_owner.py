@@ -209,7 +209,7 @@ class PSFModelOwner(nn.Module):
             >>> from kornia_tidy import TiDyOptics
             >>> optics = TiDyOptics().with_fixed_layers(torch.tensor([0.5, 2.0]))
             >>> [round(psi, 2) for psi in optics.fixed_defocus]
-            [3.8, -14.06]
+            [-14.06, 3.8]
         """
         if depth is None:
             return self._replace(fixed_defocus=self.psf_model.camera.defocus_range)

@@ -73,7 +73,7 @@ def save_pretrained(
         ...     system = from_pretrained(folder)
         ['README.md', 'config.json', 'model.safetensors']
         >>> system.settings.task, system.step
-        ('edof', 4200)
+        ('edof', 6000)
     """
     folder = Path(save_directory)
     if folder.exists() and not folder.is_dir():

@@ -20,16 +20,15 @@ class Pupil:
     """The aperture on a grid of square cells, a whole number of them for each mask pixel.
 
     Args:
-            amplitude: (n, n) in [0, 1].
-            cell_pitch: side of a cell in pupil radii.
-            fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
+        amplitude: (n, n) in [0, 1].
+        cell_pitch: side of a cell in pupil radii.
+        fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
 
     Example:
-            >>> from kornia_tidy.optics.aperture import circular_aperture
-    from kornia_tidy.runtime.precision import has_float64
-            >>> pupil = Pupil(circular_aperture(23), 0.1)
-            >>> round(pupil.light, 2), round(pupil.extent, 2)
-            (3.17, 1.05)
+        >>> from kornia_tidy.optics.aperture import circular_aperture
+        >>> pupil = Pupil(circular_aperture(23), 0.1)
+        >>> round(pupil.light, 2), round(pupil.extent, 2)
+        (3.17, 1.05)
     """
 
     amplitude: Tensor

@@ -179,7 +179,7 @@ class TestMovingCapture(BaseTester):
         optics, (image, depth) = camera(), scene(torch.float32)
         built = []
         build = PSFModel._build
-        monkeypatch.setattr(PSFModel, "_build", lambda self, *a: built.append(1) or build(self, *a))
+        monkeypatch.setattr(PSFModel, "_build", lambda self, *a, **k: built.append(1) or build(self, *a, **k))
         with torch.no_grad():
             for _ in range(3):
                 moving_capture(optics, *at_rest(optics, image, depth))

@@ -69,7 +69,7 @@ FOUND = (
     ("design", "design.json", changed(entries={"a": {"start": 1}}), "a is no candidate"),  # KeyError
     ("figure", "validation.csv", lambda data: data + bytes(200_000), "cannot read .*validation.csv"),  # csv.Error
     ("figure", "validation.csv", lambda data: data.replace(b"psnr", b"pxnr"), "logs of the run in .* are damaged"),
-    ("folder", "rgb.txt", lambda data: data.replace(b"a.png", LONG.encode() + b".png"), "File name too long"),
+    ("folder", "rgb.txt", lambda data: data.replace(b"a.png", LONG.encode() + b".png"), "the name is too long"),
     ("tiff", "image.tif", lambda data: with_samples(data, 5), "5 samples a pixel, more than 4"),
 )  # fmt: skip
 

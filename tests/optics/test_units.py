@@ -251,7 +251,7 @@ class TestLens(BaseTester):
     def test_exception_too_much_defocus_is_refused_before_any_work(self):
         wide = ThinLensCamera(aperture_diameter=50e-3)
         with pytest.raises(ValueError, match=r"needs 6226 layers of PSFs 573 px wide, .* at most 4096 and 650 px"):
-            camera(camera=wide)
+            camera(camera=wide, fidelity=Fidelity(wide_blur="waves"))
         with pytest.raises(ValueError, match="at most 4096"):
             camera(fidelity=Fidelity(layer_spacing=1e-3))
 

@@ -64,7 +64,7 @@ class TestChoose(BaseTester):
 
     def test_exception_unknown_method(self):
         bank = make_bank()
-        message = "method must be one of 'auto', 'direct', 'tiled', 'dense', got 'sparse'"
+        message = "method must be one of 'auto', 'direct', 'tiled', 'dense', 'batched', got 'sparse'"
         with pytest.raises(ValueError, match=message):
             render(*make_scene(bank), bank, method="sparse")
 
