@@ -116,25 +116,20 @@ def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype)
         >>> shown.states.shape, shown.weights
         (torch.Size([2, 23, 23]), tensor([0.5000, 0.5000], dtype=torch.float64))
     """
-    alone = threading.active_count() == 1
+    # An accelerator makes one change after the other, so that no read of it is torn.
+    watched = () if threading.active_count() == 1 else (masks, modulator)
     for _ in range(READS):
-        now = [] if alone else _watched(masks, modulator)
-        before = list(map(Tensor.clone, map(Tensor.detach, now)))
+        before = [x.detach().clone() for part in watched for x in part.parameters() if x.device.type == "cpu"]
         phase = cast("Tensor", masks.phase).to(dtype)
         shown = modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
         if shown.mixture is None and shown.middles is None:
             shown = Timeline(shown.states.clone(), shown.durations.clone())
         else:
             shown = shown.map(Tensor.clone)
-        after = [] if alone else _watched(masks, modulator)
+        after = [x for part in watched for x in part.parameters() if x.device.type == "cpu"]
         if all(map(torch.equal, before, after)):
             break
     return shown
-
-
-def _watched(masks: nn.Module, modulator: nn.Module) -> list[Tensor]:
-    """Return the parameters on the CPU; an accelerator makes one change after the other, so that no read is torn."""
-    return [x for x in (*masks.parameters(), *modulator.parameters()) if x.device.type == "cpu"]
 
 
 class Modulator(nn.Module):
