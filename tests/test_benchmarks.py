@@ -14,6 +14,8 @@ import pytest
 from tests.base import BaseTester
 from tests.benchmarks.table import markdown, read_benchmarks
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 SUITES = {path.stem.removeprefix("test_") for path in (ROOT / "tests" / "benchmarks").glob("test_*.py")}
 

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
+from kornia_tidy.psf.gradients_only import is_gradients_only
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 LARGEST_WINDOW = (
@@ -74,6 +75,8 @@ def goes_in_c(window: int, dtype: torch.dtype) -> bool:
 
 def _choose_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
     """Compute the energies by the C kernel if no gradient is wanted, and otherwise by matrix products in torch."""
+    if is_gradients_only():
+        return torch.zeros_like(_new_energies(field, weights, kernels, learning))
     if not learning and field.device.type == "cpu" and goes_in_c(kernels.shape[1], field.real.dtype):
         return mutual_intensity_energies(field, weights, kernels)
     return _energies(*_matrices(field, weights, kernels))

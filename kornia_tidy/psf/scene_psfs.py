@@ -26,11 +26,11 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolated_bank,
     nodes_around,
 )
-from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.lens_limits import PARTS, check_defocus_range, check_layer_spacing
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
+from kornia_tidy.psf.psf_ops import computed_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
@@ -251,8 +251,8 @@ class ScenePSFs(WidePSFs):
                     f"{pupil.fill_factor}"
                 )
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
-        lens = dispersion, nodes, self.pixel_step * grid, window, tolerance, shift
-        return exact_psf_bank(states, weights, pupil, spectrum, *lens, each_state=each_state)
+        lens = pupil, spectrum, dispersion, nodes, self.pixel_step * grid, window, tolerance, shift
+        return computed_psf_bank(states, weights, *lens, each_state=each_state)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)

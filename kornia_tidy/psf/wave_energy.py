@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.psf.checkpointed_sum import recomputed
+from kornia_tidy.psf.gradients_only import is_gradients_only
 
 _BLOCK_SAMPLES = 2**18  # numbers of the waves held at once: a megabyte in float32 stays in a core's cache
 
@@ -48,6 +49,8 @@ def _real_matrix(numbers: Tensor) -> Tensor:
 def _energies(first: Tensor, weights: Tensor, left: Tensor, second: Tensor) -> Tensor:
     """Energies (D, P, P) of first (2N, K 2N), weights (K,), left (D, P, q, 2N) and second (D, 2 q P, 2N)."""
     depths, window, order, _ = left.shape
+    if is_gradients_only():
+        return left.new_zeros(depths, window, window)
     rows = weights.repeat(order)
     energies = []
     with torch.autocast(left.device.type, enabled=False):

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,6 +15,8 @@ from torch import Tensor
 from kornia_tidy import TiDyOptics
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from tests.benchmarks.rendering_against_peers import in_turn, load_scene
+
+Call = Callable[..., Tensor]
 
 
 def depth_of(psi: Tensor, optics: TiDyOptics) -> Tensor:
@@ -27,32 +31,48 @@ def main() -> None:
 
     Gradients in float32 are off by rounding; in float64 a corner of the scene shows that nothing else is.
     """
-    optics = TiDyOptics(sensor=None)
     image, psi = load_scene("aloe")
-    depth = depth_of(psi, optics)
-    compiled = torch.compile(optics, fullgraph=True)
-
-    def capture(camera: torch.nn.Module) -> Tensor:
-        with torch.no_grad():
-            return camera(image, depth)
-
-    def learn(camera: torch.nn.Module) -> Tensor:
-        return torch.autograd.grad(camera(image, depth).square().mean(), optics.masks.phase)[0]
-
     print(f"{torch.get_num_threads()} threads")
-    for what, call in (("capture", capture), ("capture and gradients", learn)):
-        off = (call(compiled) - call(optics)).abs().max() / call(optics).abs().max()
-        times = in_turn({"eager": lambda f=call: f(optics), "compiled": lambda f=call: f(compiled)})
-        ratio = times["compiled"] / times["eager"]
-        medians = ", ".join(f"{name} {milliseconds:.1f} ms" for name, milliseconds in times.items())
-        print(f"{what:22} {medians}: {ratio:.2f}, off {off:.0e}")
+    for compositing in ("gather", "scatter", "occlusion"):
+        side = 512 if compositing == "occlusion" else None  # of its corner
+        optics = TiDyOptics(sensor=None, compositing=compositing)
+        scene = [x[..., :side, :side].contiguous() for x in (image, depth_of(psi, optics))]
+        for what, call in CALLS.items():
+            compiled = torch.compile(optics, fullgraph=True)
+            off = difference(call, compiled, optics, scene)
+            ways = {"eager": partial(call, optics, *scene), "compiled": partial(call, compiled, *scene)}
+            times = in_turn(ways)
+            medians = ", ".join(f"{name} {milliseconds:.1f} ms" for name, milliseconds in times.items())
+            print(
+                f"{compositing:9} {what:9} {medians}: {times['compiled'] / times['eager']:.2f}, off {off:.0e}",
+                flush=True,
+            )
 
     optics = TiDyOptics(sensor=None).double()
     compiled = torch.compile(optics, fullgraph=True)
-    image, depth = image[..., :256, :256].double(), depth[..., :256, :256].double()
-    for what, call in (("capture", capture), ("gradients", learn)):
-        off = (call(compiled) - call(optics)).abs().max() / call(optics).abs().max()
-        print(f"{what} in float64, 256x256: off {off:.0e}")
+    scene = [x[..., :256, :256].double() for x in (image, depth_of(psi, optics))]
+    for what, call in CALLS.items():
+        print(f"{what} in float64, 256x256: off {difference(call, compiled, optics, scene):.0e}")
+
+
+def capture(camera: torch.nn.Module, image: Tensor, depth: Tensor) -> Tensor:
+    """Return a capture without gradients."""
+    with torch.no_grad():
+        return camera(image, depth)
+
+
+def learn(camera: torch.nn.Module, image: Tensor, depth: Tensor) -> Tensor:
+    """Return the gradient of the masks."""
+    return torch.autograd.grad(camera(image, depth).square().mean(), list(camera.parameters())[:1])[0]
+
+
+CALLS = {"capture": capture, "gradients": learn}
+
+
+def difference(call: Call, compiled: torch.nn.Module, optics: TiDyOptics, scene: list[Tensor]) -> float:
+    """Return the largest difference of compiled and eager results as a share of the largest value."""
+    one, other = call(compiled, *scene), call(optics, *scene)
+    return float((one - other).abs().max() / other.abs().max())
 
 
 if __name__ == "__main__":

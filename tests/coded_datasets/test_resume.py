@@ -24,6 +24,7 @@ def killed(tmp_path_factory):
     return folder, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 class TestResume(BaseTester):
     @pytest.mark.parametrize("name", FORMS)
     def test_feature_processes_killed_at_random_moments_end_with_the_bytes_of_one_undisturbed(self, name, killed):

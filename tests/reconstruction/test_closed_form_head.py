@@ -112,6 +112,7 @@ class TestClosedFormHead(BaseTester):
             whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 288))
         self.assert_close(tiled, whole, atol=1e-4, rtol=0)
 
+    @pytest.mark.slow
     def test_feature_onnx_takes_capture_and_noise(self):
         head = head_of(PlainHead(closed_form_channels(4), 4, width=2), layers=4, trained=True)
         check_onnx(head, (photo(18, 21, dtype=torch.float32)[:1], torch.full((1, 1, 1, 1), 0.02)))

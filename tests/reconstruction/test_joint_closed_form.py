@@ -151,6 +151,7 @@ class TestJointClosedFormHead(BaseTester):
         for part, expected in zip(tiled, whole, strict=True):
             self.assert_close(part, expected, atol=1e-4, rtol=0)
 
+    @pytest.mark.slow
     def test_feature_onnx(self):
         capture = photo(18, 21, dtype=torch.float32)
         assert len(check_onnx(JointHead(joint(layers=2, trained=True, kind=PlainHead)), capture, capture.flip(-1))) == 3

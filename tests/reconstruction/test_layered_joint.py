@@ -213,6 +213,7 @@ class TestLayeredJointHead(BaseTester):
         for part, expected in zip(tiled, whole, strict=True):
             self.assert_close(part, expected, atol=1e-4, rtol=0)
 
+    @pytest.mark.slow
     def test_feature_onnx(self):
         capture = scene()[2][..., 20:41, :32]
         assert len(check_onnx(JointHead(stirred()), torch.cat([capture] * 2), capture.flip(-1))) == 3

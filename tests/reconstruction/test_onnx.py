@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from tests.base import BaseTester
@@ -10,6 +11,7 @@ from tests.reconstruction.test_head import SeeingHead, every_head, trained
 
 
 class TestONNX(BaseTester):
+    @pytest.mark.slow
     @every_head
     def test_feature_onnx_is_equal(self, name):
         check_onnx(trained(name), torch.rand(1, 3, 37, 50))

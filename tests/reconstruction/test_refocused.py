@@ -106,6 +106,7 @@ class TestRefocused(BaseTester):
             whole, tiled = head(image), reconstruct_tiled(head, image, memory_budget=24 << 20)
         self.assert_close(tiled, whole, atol=1e-5, rtol=0)
 
+    @pytest.mark.slow
     def test_feature_onnx(self):
         check_onnx(refocused(AttentionUNet(7, 4, width=2)), torch.rand(1, 3, 21, 32))
 

@@ -30,6 +30,7 @@ def lines(path):
 
 
 class TestResume(BaseTester):
+    @pytest.mark.slow
     def test_feature_a_run_killed_at_random_moments_ends_bit_for_bit_where_an_undisturbed_one_does(self, tmp_path):
         """Masks, network with dropout and batch normalisation, moving average, Adam, generators, counters, logs.
 

@@ -1,0 +1,197 @@
+"""Exact PSFs as one operator of torch: a compiled camera computes and remembers them as an eager one does.
+
+A compiler would unfold the sums over masks, wavelengths and depths into a graph of complex operations, which it cannot
+fuse, and would compute the PSFs anew for each capture. The gradient is a second operator, which computes them again:
+only the arguments are kept between the two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.psf.gradients_only import gradients_only
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_cache import BankMemory
+from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
+
+_LENS = (
+    "Tensor phase, Tensor weights, Tensor amplitude, float cell_pitch, float fill_factor, float[] wavelengths,"
+    " float[] channel_weights, float[] basis, float[] dispersion, float[] chromatic_defocus, float[] defocus,"
+    " float pixel_step, int window, float tolerance"
+)
+_TENSORS = 3
+_REMEMBERED_BYTES = 64 << 20  # larger banks are computed anew each time
+_memory = BankMemory()
+
+torch.library.define("kornia_tidy::exact_psfs", f"({_LENS}) -> Tensor")
+torch.library.define("kornia_tidy::exact_psfs_gradients", f"({_LENS}, Tensor gradient, bool[] wanted) -> Tensor[]")
+
+
+def computed_psf_bank(
+    phase: Tensor,
+    weights: Tensor,
+    pupil: Pupil,
+    spectrum: Spectrum,
+    dispersion: Sequence[float],
+    defocus: Sequence[float],
+    pixel_step: float | Tensor,
+    window: int,
+    tolerance: float,
+    chromatic_defocus: Sequence[float],
+    *,
+    each_state: bool = False,
+) -> PSFBank:
+    """Return the bank of :func:`kornia_tidy.psf.exact.exact_psf_bank`, by the operator while compiling.
+
+    A sensor pixel with a gradient and the PSFs of each state are compiled as plain operations.
+
+    Args:
+        phase: as there, as all others.
+        weights: as there.
+        pupil: as there.
+        spectrum: as there.
+        dispersion: as there.
+        defocus: as there.
+        pixel_step: as there.
+        window: as there.
+        tolerance: as there.
+        chromatic_defocus: as there.
+        each_state: as there.
+
+    Example:
+        >>> flat, pupil = torch.zeros(1, 23, 23), Pupil(torch.ones(23, 23), 0.1)
+        >>> lens = pupil, Spectrum.monochrome(), [1.0], [0.0], 2e-7, 23, 1e-2, [0.0]
+        >>> computed_psf_bank(flat, torch.ones(1), *lens).psfs.shape
+        torch.Size([1, 1, 23, 23])
+    """
+    lens = pupil, spectrum, dispersion, defocus
+    if torch.compiler.is_compiling() and not (isinstance(pixel_step, Tensor) or each_state or is_transformed()):
+        return operator_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus)
+    return exact_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus, each_state)
+
+
+def operator_psf_bank(
+    phase: Tensor,
+    weights: Tensor,
+    pupil: Pupil,
+    spectrum: Spectrum,
+    dispersion: Sequence[float],
+    defocus: Sequence[float],
+    pixel_step: float,
+    window: int,
+    tolerance: float,
+    chromatic_defocus: Sequence[float],
+) -> PSFBank:
+    """Return the bank of :func:`kornia_tidy.psf.exact.exact_psf_bank` by the operator ``kornia_tidy::exact_psfs``.
+
+    Args:
+        phase: as there. Gradients reach phase and weights; they can be differentiated in turn.
+        weights: as there.
+        pupil: as there.
+        spectrum: as there.
+        dispersion: as there.
+        defocus: as there.
+        pixel_step: as there, a number.
+        window: as there.
+        tolerance: as there.
+        chromatic_defocus: as there.
+
+    Example:
+        >>> flat, pupil = torch.zeros(1, 23, 23), Pupil(torch.ones(23, 23), 0.1)
+        >>> lens = pupil, Spectrum.monochrome(), [1.0], [0.0], 2e-7, 23, 1e-2, [0.0]
+        >>> operator_psf_bank(flat, torch.ones(1), *lens).psfs.shape
+        torch.Size([1, 1, 23, 23])
+    """
+    rows, basis = ([x for row in table for x in row] for table in (spectrum.weights, spectrum.basis or ()))
+    light = list(spectrum.wavelengths), rows, basis
+    shown = phase, weights, pupil.amplitude, pupil.cell_pitch, pupil.fill_factor
+    psfs = torch.ops.kornia_tidy.exact_psfs(
+        *shown, *light, list(dispersion), list(chromatic_defocus), list(defocus), pixel_step, window, tolerance
+    )
+    return PSFBank(psfs, psfs.new_tensor(defocus), psfs.sum((2, 3)))
+
+
+def _rows(numbers: Sequence[float], columns: int) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(numbers[first : first + columns]) for first in range(0, len(numbers), columns))
+
+
+def _computed(*arguments: Any) -> Tensor:
+    phase, weights, amplitude, pitch, fill_factor, waves, rows, basis, dispersion, shifts, nodes, *sensor = arguments
+    spectrum = Spectrum(tuple(waves), _rows(rows, len(waves)), _rows(basis, len(waves)) or None)
+    lens = Pupil(amplitude, pitch, fill_factor), spectrum, dispersion, nodes
+    return exact_psf_bank(phase, weights, *lens, *sensor, chromatic_defocus=shifts).psfs
+
+
+def _psfs(*arguments: Any) -> Tensor:
+    phase, weights, amplitude, *lens = arguments
+    nodes = tuple(lens.pop(-4))
+    setting = [tuple(x) if isinstance(x, list) else x for x in lens]
+    setting += [tuple(amplitude.shape), torch.get_num_threads()]
+
+    def build(missing: tuple[float, ...]) -> PSFBank:
+        psfs = _computed(*arguments[:-4], missing, *arguments[-3:])
+        return PSFBank(psfs, psfs.new_tensor(missing), psfs.sum((2, 3)))
+
+    with torch.no_grad(), torch.autocast(phase.device.type, enabled=False):
+        if math.prod(_shape(*arguments)) * phase.element_size() > _REMEMBERED_BYTES:
+            return build(nodes).psfs
+        compared = torch.cat([weights, amplitude.to(weights).flatten()])
+        return _memory.recall("exact", setting, phase, compared, nodes, build).psfs
+
+
+def _shape(*arguments: Any) -> tuple[int, ...]:
+    waves, rows, basis, nodes, window = arguments[5], arguments[6], arguments[7], arguments[-4], arguments[-2]
+    planes = len(rows) // len(waves) * (len(basis) // len(waves) if basis else 1)
+    return len(nodes), planes, window, window
+
+
+def _psfs_fake(*arguments: Any) -> Tensor:
+    return arguments[0].new_empty(_shape(*arguments))
+
+
+def _gradients(*arguments: Any) -> list[Tensor]:
+    phase, weights, *lens, gradient, wanted = arguments
+    given = (phase, weights)
+    with recording_in_operator(), gradients_only(), torch.autocast(phase.device.type, enabled=False):
+        leaves = [x.detach().requires_grad_(want) for x, want in zip(given, wanted, strict=True)]
+        psfs = _computed(*leaves, *lens)
+        found = torch.autograd.grad(psfs, [x for x in leaves if x.requires_grad], gradient)
+    return [x.contiguous() for x in found]
+
+
+def _gradients_fake(*arguments: Any) -> list[Tensor]:
+    return [x.new_empty(x.shape) for x, want in zip(arguments[:2], arguments[-1], strict=True) if want]
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:_TENSORS])
+    ctx.lens = inputs[_TENSORS:]
+
+
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    (phase, weights, amplitude), wanted = ctx.saved_tensors, list(ctx.needs_input_grad[:2])
+    rest = [None] * (1 + len(ctx.lens))
+    if torch.is_grad_enabled():  # it is differentiated in turn
+        with torch.autocast(gradient.device.type, enabled=False):
+            psfs = _computed(phase, weights, amplitude, *ctx.lens)
+            inputs = [x for x, want in zip((phase, weights), wanted, strict=True) if want]
+            found = iter(torch.autograd.grad(psfs, inputs, gradient, create_graph=True))
+    else:
+        operator = torch.ops.kornia_tidy.exact_psfs_gradients
+        found = iter(operator(phase, weights, amplitude, *ctx.lens, gradient, wanted) if any(wanted) else ())
+    return *(next(found) if want else None for want in wanted), *rest
+
+
+torch.library.impl("kornia_tidy::exact_psfs", "default", _psfs)
+torch.library.register_fake("kornia_tidy::exact_psfs", _psfs_fake)
+torch.library.register_autograd("kornia_tidy::exact_psfs", _backward, setup_context=_keep)
+torch.library.impl("kornia_tidy::exact_psfs_gradients", "default", _gradients)
+torch.library.register_fake("kornia_tidy::exact_psfs_gradients", _gradients_fake)
