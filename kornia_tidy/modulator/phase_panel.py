@@ -124,9 +124,9 @@ class GreyLevels(nn.Module):
         if response is not None:
             curve = torch.as_tensor(response, dtype=torch.float64)
             if curve.ndim != 1 or len(curve) < 2 or not bool(torch.isfinite(curve).all()):
-                raise ValueError(
-                    f"a measured response must have at least two finite phases in radians, got {curve.tolist()}"
-                )
+                odd = curve[~curve.isfinite()].flatten()
+                got = odd[0].item() if len(odd) else f"the shape {tuple(curve.shape)}"
+                raise ValueError(f"a measured response must have at least two finite phases in radians, got {got}")
             position = torch.linspace(0, len(curve) - 1, len(levels), dtype=torch.float64)
             lower = position.long().clamp(max=len(curve) - 2)
             levels = torch.lerp(curve[lower], curve[lower + 1], position - lower)
