@@ -47,8 +47,8 @@ class TF32Device(SimulatedDevice):
         return super()._computed(operator, name, args, kwargs, target)
 
 
+def cameras() -> list[TiDyOptics]:
     """Return a camera for each way of computing PSFs, and one whose panel has crosstalk."""
-    """Return cameras whose PSFs are computed in each of the package's ways, and one whose panel blurs its masks."""
     panel = SpatialLightModulator(PixelCrosstalk(0.5), DwellTimes())
     return [
         camera(masks=2),

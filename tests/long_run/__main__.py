@@ -131,8 +131,8 @@ class _Mallinfo(ctypes.Structure):
     )  # fmt: skip
 
 
+def _allocated(library: ctypes.CDLL) -> float:
     """Return the MiB allocated in arenas and in mappings; NaN with another C library."""
-    """Return what is allocated in arenas and in mappings of their own in MiB; NaN with another C library."""
     if (mallinfo := getattr(library, "mallinfo2", None)) is None:
         return math.nan
     mallinfo.restype = _Mallinfo
