@@ -115,7 +115,7 @@ def rows() -> list[Row]:
     rounding = "rounding of the type at 1, from float32 on the GPU"
     return [
         Row(GROUP, "TF32, simulated", tried, _simulated, BOUND, CAPTURE,
-            "inputs of matrix products and convolutions rounded to 10 bits"),
+            "inputs of matrix products and convolutions rounded to 10 bits", slow=True),
         Row(GROUP, "GPU, TF32 off", tried, lambda: _on_cuda(allowed=False), BOUND, CAPTURE, absent=ABSENT),
         Row(GROUP, "GPU, TF32 on", tried, lambda: _on_cuda(allowed=True), BOUND, CAPTURE, absent=ABSENT),
         *(Row(GROUP, f"GPU, {str(dtype).removeprefix('torch.')}", "images of this type",

@@ -125,7 +125,7 @@ def rows() -> list[Row]:
         Row(GROUP, "defocus, rad", "-200 ... 200", lambda: _defocus(200.0), BOUND, CAPTURE, slow=True),
         Row(GROUP, "defocus, rad", "1e3, 1e4 and -1e4, each alone, in a window of 33 px", lambda: worst(
             [psf_error(camera(fidelity=camera().fidelity.replace(window=33)), psi) for psi in (1e3, 1e4, -1e4)]),
-            BOUND, PSFS),
+            BOUND, PSFS, slow=True),
         Row(GROUP, "defocus, rad", "1e3, 1e4 and -1e4, light in the middle 33 px, flat mask", lambda: worst(
             [_geometric_error(psi) for psi in (1e3, 1e4, -1e4)]), 0.1, "geometric optics, relative",
             "float64; what is left is ripple of diffraction"),

@@ -202,7 +202,7 @@ def rows() -> list[Row]:
         Row(GROUP, "dwell times", "learnt: 1, 2 and 3; 0.05 beside 1", lambda: worst(
             [of_dwell_times(1, 2, 3), of_dwell_times(0.05, 1)]), SLOPE_BOUND, SLOPES),
         *(Row(GROUP, "depth", f"0.3 to 5 m, layers {layers}", lambda layers=layers: of_depth(layers), SLOPE_BOUND,
-              SLOPES) for layers in ("linear", "cubic", "bandlimited")),
+              SLOPES, slow=layers != "linear") for layers in ("linear", "cubic", "bandlimited")),
         Row(GROUP, "depth", "infinity; nearer than the camera's range", _far_depths, 0.0, "0, float32",
             "1/z is flat at infinity; clamped depths have no gradient"),
         Row(GROUP, "image", "dark: 0 linear, 0 and 0.001 to 0.002 sRGB", lambda: worst(
