@@ -272,10 +272,14 @@ def _panel_size(text: str) -> tuple[int, int]:
 
 def _numbers(path: str) -> list[float]:
     """Return the numbers of a text file, separated by white space, commas or semicolons."""
-    try:
-        return [float(word) for word in re.split(r"[\s,;]+", read_bytes(path).decode()) if word]
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: a response is phases in radians as text ({error})") from None
+    words = re.split(r"[\s,;]+", read_bytes(path).decode("utf-8", "replace"))
+    numbers = []
+    for word in filter(None, words):
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            raise ValueError(f"cannot read {path}: a response is phases in radians as text, got {word!r:.80}") from None
+    return numbers
 
 
 def _check_absent(path: str, force: bool, source: str | None = None, folder: bool = False) -> None:

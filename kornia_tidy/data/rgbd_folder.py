@@ -41,7 +41,9 @@ class RGBDFolder(SceneDataset):
             leads out of the folder; or if the options contradict each other.
 
     Convention:
-        - Items are sorted by name; a name is what the ``*`` match, joined by ``/``.
+        - Items are sorted by name; a name is what the ``*`` match, joined by ``/``. Names are compared as text, as in
+          torchvision's ``ImageFolder``: ``frame10`` comes before ``frame2``. Number frames with leading zeros where
+          their order matters.
         - A file that matches both patterns belongs to the longer one, so that ``"*.png"`` and ``"*_depth.png"`` may lie
           in one folder.
 

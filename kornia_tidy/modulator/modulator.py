@@ -165,7 +165,8 @@ class DwellTimes(Modulator):
         - output: states (S, N, N) radians and weights (S,), which sum to one. Here S = K.
 
     Raises:
-        ValueError: if a share is negative or not finite, or all are zero; on use, if there are not as many as masks.
+        ValueError: if a share is negative or not finite, or all are zero; on use, if there are not as many as masks, or
+            no mask.
         TypeError: if ``shares`` is not a sequence of numbers.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), section 4.
@@ -180,13 +181,15 @@ class DwellTimes(Modulator):
     def __init__(self, shares: Sequence[float] | None = None) -> None:
         super().__init__()
         _check_numbers(shares)
-        if shares is not None and not (sum(shares) > 0 and all(0 <= s < math.inf for s in shares)):
+        if shares is not None and not (any(shares) and all(0 <= s < math.inf for s in shares)):
             raise ValueError(f"dwell shares must be finite, not negative and not all zero, got {tuple(shares)}")
-        self.shares = None if shares is None else tuple(s / sum(shares) for s in shares)
+        self.shares = None if shares is None else _normalised(shares)
 
     def timeline(self, phase: Tensor) -> Timeline:
         """Return the masks one after another, each for its dwell time."""
         masks = phase.shape[0]
+        if masks == 0:
+            raise ValueError(f"phase must hold at least one mask, got the shape {tuple(phase.shape)}")
         if self.shares is None:
             return Timeline(phase, phase.new_full((masks,), 1 / masks))
         _check_count(len(self.shares), masks)
@@ -362,6 +365,12 @@ class SpatialLightModulator(Modulator):
 def _check_numbers(shares: object) -> None:
     if shares is not None and not (isinstance(shares, Sequence) and all(isinstance(s, int | float) for s in shares)):
         raise TypeError(f"dwell shares must be a number for each mask, such as (3, 1), got {described(shares)}")
+
+
+def _normalised(shares: Sequence[float]) -> tuple[float, ...]:
+    """Return shares that sum to one; those near the largest float are divided first, so that no sum is infinite."""
+    relative = [s / max(shares) for s in shares]
+    return tuple(s / sum(relative) for s in relative)
 
 
 def _check_count(shares: int, masks: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import pad
 
 from kornia_tidy.checks import check_positive
 
@@ -124,9 +124,9 @@ class GreyLevels(nn.Module):
         if response is not None:
             curve = torch.as_tensor(response, dtype=torch.float64)
             if curve.ndim != 1 or len(curve) < 2 or not bool(torch.isfinite(curve).all()):
-                raise ValueError(
-                    f"a measured response must have at least two finite phases in radians, got {curve.tolist()}"
-                )
+                odd = curve[~curve.isfinite()].flatten()
+                got = odd[0].item() if len(odd) else f"the shape {tuple(curve.shape)}"
+                raise ValueError(f"a measured response must have at least two finite phases in radians, got {got}")
             position = torch.linspace(0, len(curve) - 1, len(levels), dtype=torch.float64)
             lower = position.long().clamp(max=len(curve) - 2)
             levels = torch.lerp(curve[lower], curve[lower + 1], position - lower)
@@ -244,8 +244,8 @@ class PixelCrosstalk(nn.Module):
         kernel = self.kernel.to(phase)
         reach = len(kernel) // 2
         padded = pad(phase[:, None], (reach,) * 4, mode="replicate")
-        rows = conv2d(padded, kernel[None, None, None, :])
-        return conv2d(rows, kernel[None, None, :, None])[:, 0]
+        rows = (padded.unfold(-1, len(kernel), 1) * kernel).sum(-1)  # no convolution: GPUs round those to TF32
+        return (rows.unfold(-2, len(kernel), 1) * kernel).sum(-1)[:, 0]
 
     def extra_repr(self) -> str:
         """Return a one-line description of the blur."""

@@ -107,6 +107,9 @@ class TestMasks(BaseTester):
             ("export heights.npy -o slm --pupil-radius 1", "the mask must fit on the panel"),
             ("export heights.npy -o slm --phase-range 0", "phase_range must be positive"),
             ("export heights.npy -o slm --response heights.npy", "cannot read heights.npy: a response is phases"),
+            ("export heights.npy -o slm --response nan.txt", "have at least two finite phases in radians, got nan"),
+            ("export heights.npy -o slm --response one.txt", "two finite phases in radians, got the shape (1,)"),
+            ("export heights.npy -o slm --response long.txt", "cannot read long.txt: a response is phases in radians"),
             ("export heights.npy -o slm --dwell 1 2 3", "there are 3 dwell shares for 2 masks"),
             ("export heights.npy -o slm --switching-time 0.2", "must fit into the exposure of 100 ms"),
             ("export heights.npy -o slm --wavelength 1e-7 --material pmma", "published for 420 to 1620 nm"),
@@ -121,6 +124,8 @@ class TestMasks(BaseTester):
     def test_exception_is_one_sentence_and_nothing_is_written(self, arguments, sentence, folder, capsys):
         (folder / "taken").mkdir()
         (folder / "taken" / "holiday.jpg").write_bytes(b"sun")
+        for name, text in (("nan", 500 * "1.5 " + "nan"), ("one", "1.5"), ("long", 5000 * "x")):
+            (folder / f"{name}.txt").write_text(text)
         before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
         try:
             status = run(arguments)
@@ -130,4 +135,5 @@ class TestMasks(BaseTester):
         last = capsys.readouterr().err.strip().splitlines()[-1]
         assert "error: " in last
         assert sentence in last
+        assert len(last) < 500
         assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == before

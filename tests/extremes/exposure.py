@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import DefocusRange, DwellTimes, PixelwiseMask, TiDyOptics
+from kornia_tidy.optics.aperture import circular_aperture
 from tests.extremes.lens import BOUND, CAPTURE
 from tests.extremes.row import Row, difference, refusals, rounding, scene, worst
 
@@ -40,6 +41,19 @@ def psf_error(optics: TiDyOptics, *defocus: float) -> float:
         single = optics.psf_bank(dtype=torch.float32, defocus=defocus).psfs.double()
         double = optics.psf_bank(dtype=torch.float64, defocus=defocus).psfs
     return float(((single - double).abs() / double.amax((-2, -1), keepdim=True)).max())
+
+
+def _geometric_error(psi: float, window: int = 33) -> float:
+    """Relative error of the light in the middle of a flat mask's PSF, against a disc of even light."""
+    optics = camera(torch.zeros(1, 23, 23), fidelity=camera().fidelity.replace(window=window))
+    found = optics.psf_bank(dtype=torch.float64, defocus=(psi,)).energy.detach()
+    lens = optics.camera
+    distance = 1 / (1 / lens.focal_length - 1 / lens.focus_distance)
+    radius = lens.aperture_diameter / 2
+    disc = psi / math.pi * 530e-9 / radius * distance / lens.pixel_pitch  # pixels of the disc per radius of the pupil
+    cell = 0.1 * disc
+    expected = window**2 / (float(circular_aperture(23).sum()) * cell**2)
+    return float((found / expected - 1).abs().max())
 
 
 def _defocus(psi: float) -> float:
@@ -109,6 +123,12 @@ def rows() -> list[Row]:
             lambda: psf_error(camera(flat, fidelity="balanced"), 0.0), BOUND, PSFS),
         Row(GROUP, "defocus, rad", "-20 ... 20", lambda: _defocus(20.0), BOUND, CAPTURE),
         Row(GROUP, "defocus, rad", "-200 ... 200", lambda: _defocus(200.0), BOUND, CAPTURE, slow=True),
+        Row(GROUP, "defocus, rad", "1e3, 1e4 and -1e4, each alone, in a window of 33 px", lambda: worst(
+            [psf_error(camera(fidelity=camera().fidelity.replace(window=33)), psi) for psi in (1e3, 1e4, -1e4)]),
+            BOUND, PSFS, slow=True),
+        Row(GROUP, "defocus, rad", "1e3, 1e4 and -1e4, light in the middle 33 px, flat mask", lambda: worst(
+            [_geometric_error(psi) for psi in (1e3, 1e4, -1e4)]), 0.1, "geometric optics, relative",
+            "float64; what is left is ripple of diffraction"),
         Row(GROUP, "defocus, rad", "-1e4 ... 1e4: 10,000 layers, blur of thousands of pixels",
             refusals(lambda: camera(camera=DefocusRange(-1e4, 1e4))), None),
         Row(GROUP, "layer spacing, rad", "1e-6: 40 million layers",
@@ -137,6 +157,9 @@ def rows() -> list[Row]:
         Row(GROUP, "dwell times", "all 0; negative; NaN; inf",
             refusals(*(lambda times=times: DwellTimes(times)
                        for times in ([0.0, 0.0], [1.0, -1.0], [math.nan, 1.0], [math.inf, 1.0]))), None),
+        Row(GROUP, "dwell times", "1.7e308 beside 6e307", lambda: _weights(1.7e308, 6e307), BOUND, CAPTURE),
+        Row(GROUP, "dwell times", "of no mask",
+            refusals(lambda: DwellTimes()(torch.zeros(0, 23, 23)), lambda: DwellTimes([])), None),
         Row(GROUP, "aperture", "one pixel of 23x23", lambda: _aperture(_one_pixel()), BOUND, CAPTURE),
         Row(GROUP, "aperture", "ring of the outer 5 %", lambda: _aperture(_obscured()), BOUND, CAPTURE),
         Row(GROUP, "aperture", "empty; negative; NaN",

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import DwellTimes, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.modulator import LearnableDwellTimes
 from tests.extremes.exposure import camera, random_heights
-from tests.extremes.row import Row, scene, worst
+from tests.extremes.row import Row, difference, scene, worst
 
 GROUP = "Gradients"
 SLOPES = "central differences in float64, relative"
@@ -20,7 +21,7 @@ STEP = 1e-5
 STEPS = 10_000
 
 
-def slope_error(function: Callable[[Tensor], Tensor], at: Tensor, seed: int = 0) -> float:
+def slope_error(function: Callable[[Tensor], Tensor], at: Tensor, seed: int = 0, step: float = STEP) -> float:
     """Return the error of the derivative along a random direction, relative to gradient times direction."""
     generator = torch.Generator().manual_seed(seed)
     direction = torch.randn(at.shape, generator=generator, dtype=at.dtype)
@@ -29,12 +30,12 @@ def slope_error(function: Callable[[Tensor], Tensor], at: Tensor, seed: int = 0)
     if not bool(gradient.isfinite().all()):
         return math.nan
     with torch.no_grad():
-        measured = (function(at + STEP * direction) - function(at - STEP * direction)) / (2 * STEP)
+        measured = (function(at + step * direction) - function(at - step * direction)) / (2 * step)
     scale = float(gradient.norm() * direction.norm()) or 1.0
     return abs(float((gradient * direction).sum() - measured)) / scale
 
 
-def of_masks(optics: TiDyOptics, depth: Tensor | None = None, **noise: object) -> float:
+def of_masks(optics: TiDyOptics, depth: Tensor | None = None, brightness: float = 1.0) -> float:
     """Return the error of the gradient with respect to the masks' phase."""
     optics = optics.double()
     image, depths = scene()
@@ -42,7 +43,7 @@ def of_masks(optics: TiDyOptics, depth: Tensor | None = None, **noise: object) -
 
     def loss(phase: Tensor) -> Tensor:
         captured = torch.func.functional_call(
-            optics, {"masks.phase": phase}, (image, depths if depth is None else depth), noise
+            optics, {"masks.phase": phase}, (brightness * image, depths if depth is None else depth)
         )
         return (captured * weights).sum()
 
@@ -54,6 +55,57 @@ def of_image(optics: TiDyOptics, image: Tensor) -> float:
     optics, (_, depth) = optics.double(), scene()
     weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     return slope_error(lambda leaf: (optics(leaf, depth) * weights).sum(), image)
+
+
+def of_depth(layers: str) -> float:
+    """Return the error of the gradient with respect to depths of 0.3 to 5 m, where layers are blended."""
+    optics = camera(fidelity=camera().fidelity.replace(layers=layers)).double()
+    image, depth = scene()
+    weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    # Gradients jump at the layers; of 1760 depths that move by 1e-7 m none lies as near to one.
+    return slope_error(lambda leaf: (optics(image, leaf) * weights).sum(), depth.clamp(max=5.0), step=1e-7)
+
+
+def _far_depths() -> float:
+    """Largest gradient with respect to depths at infinity and beyond the range, where a capture does not change."""
+    found = []
+    for value in (math.inf, 1e-6):
+        image, depth = (part.float() for part in scene())
+        leaf = torch.full_like(depth, value).requires_grad_()
+        camera(fidelity="balanced")(image, leaf).sum().backward()
+        assert leaf.grad is not None
+        found.append(difference(leaf.grad, torch.zeros_like(leaf.grad)))
+    return worst(found)
+
+
+def of_dwell_times(*shares: float) -> float:
+    """Return the error of the gradient with respect to learnable dwell times."""
+    optics, (image, depth) = camera(masks=len(shares), modulator=LearnableDwellTimes(shares)).double(), scene()
+    weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def loss(logits: Tensor) -> Tensor:
+        captured = torch.func.functional_call(optics, {"modulator.logits": logits}, (image, depth))
+        return (captured * weights).sum()
+
+    return slope_error(loss, optics.modulator.logits.detach().double(), step=1e-4)
+
+
+def _no_photons() -> float:
+    """Gradients of black images: with shot noise they are those of its mean, the light itself."""
+    gradients = []
+    for sensor in (None, SensorNoise(0.0, full_well=10.0)):
+        image, depth = scene()
+        leaf = (0 * image).requires_grad_()
+        (camera(sensor=sensor)(leaf, depth) * image).sum().backward()
+        assert leaf.grad is not None
+        gradients.append(leaf.grad)
+    return difference(*gradients)
+
+
+def _clipped() -> Tensor:
+    """An image in sRGB that has usual values and values above 1, none near 1."""
+    image, _ = scene()
+    return torch.where(image > 0.5, 1.5 + image, 0.2 + image / 2)
 
 
 def _finite(optics: TiDyOptics, image: Tensor, depth: Tensor) -> float:
@@ -145,6 +197,23 @@ def rows() -> list[Row]:
             lambda: of_masks(camera(masks=2, modulator=DwellTimes([0.0, 1.0]))), SLOPE_BOUND, SLOPES),
         *(Row(GROUP, "masks", f"compositing {kind}", lambda kind=kind: of_masks(camera(compositing=kind)),
               SLOPE_BOUND, SLOPES, slow=kind == "occlusion") for kind in ("scatter", "occlusion")),
+        Row(GROUP, "masks", "half of the sensor's pixels saturated, linear",
+            lambda: of_masks(camera(sensor=SensorNoise(0.0)), brightness=2.0), SLOPE_BOUND, SLOPES),
+        Row(GROUP, "dwell times", "learnt: 1, 2 and 3; 0.05 beside 1", lambda: worst(
+            [of_dwell_times(1, 2, 3), of_dwell_times(0.05, 1)]), SLOPE_BOUND, SLOPES),
+        *(Row(GROUP, "depth", f"0.3 to 5 m, layers {layers}", lambda layers=layers: of_depth(layers), SLOPE_BOUND,
+              SLOPES, slow=layers != "linear") for layers in ("linear", "cubic", "bandlimited")),
+        Row(GROUP, "depth", "infinity; nearer than the camera's range", _far_depths, 0.0, "0, float32",
+            "1/z is flat at infinity; clamped depths have no gradient"),
+        Row(GROUP, "image", "dark: 0 linear, 0 and 0.001 to 0.002 sRGB", lambda: worst(
+            [of_image(camera(), 0 * image), *(of_image(camera(color_space="srgb"), dark)
+                                              for dark in (0 * image, 1e-3 + 1e-3 * image))]), SLOPE_BOUND, SLOPES),
+        Row(GROUP, "image", "clipped: a part at 2 and above in sRGB",
+            lambda: of_image(camera(color_space="srgb"), _clipped()), SLOPE_BOUND, SLOPES),
+        Row(GROUP, "image", "saturated: all of the sensor",
+            lambda: of_image(camera(sensor=SensorNoise(0.0)), 2 + image), 0.0, SLOPES,
+            "clipped pixels have no gradient"),
+        Row(GROUP, "image", "black with shot noise: no photons", _no_photons, 1e-12, "without noise, float64"),
         Row(GROUP, "image", "random, sRGB", lambda: of_image(camera(color_space="srgb"), 0.2 + 0.6 * image),
             SLOPE_BOUND, SLOPES),
         Row(GROUP, "image and masks", "black, usual and 16 in sRGB; no noise, read noise and shot noise", _dark, 0.0,

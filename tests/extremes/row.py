@@ -26,6 +26,7 @@ class Row:
         against: what the error is measured against, and in which unit.
         note: what happens there, in words.
         slow: over about half a second; left out of the test suite.
+        absent: why the row cannot be measured on this machine; empty if it can.
     """
 
     group: str
@@ -36,6 +37,7 @@ class Row:
     against: str = ""
     note: str = ""
     slow: bool = False
+    absent: str = ""
 
     @property
     def name(self) -> str:

@@ -58,6 +58,8 @@ def rows() -> list[Row]:
         *(Row(GROUP, "light, electrons", text,
               lambda well=well: _statistics(SensorNoise(0.0, full_well=well, **wide), 0.5), SIGMAS, standard)
           for text, well in (("0.5 (full well 1)", 1.0), ("5", 10.0), ("5e4", 1e5), ("5e6", 1e7), ("5e11", 1e12))),
+        Row(GROUP, "light, electrons", "1e12", lambda: _statistics(SensorNoise(0.0, full_well=1e12, **wide), 1.0),
+            SIGMAS, standard),
         Row(GROUP, "light, full scale", "1e-30, 1e6, 1e30 (HDR)",
             lambda: _finite(SensorNoise(0.01, full_well=1e4, **wide), 1e-30, 1e6, 1e30), 0.0, "finite"),
         Row(GROUP, "read noise, full scale", "0", lambda: _statistics(SensorNoise(0.0), 0.25), 0.0, "the light itself"),

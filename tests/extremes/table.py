@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 
-from tests.extremes import exposure, gradients, lens, pictures, presets, sensor
+from tests.extremes import devices, exposure, gradients, lens, pictures, presets, sensor
 from tests.extremes.row import Row
 
 INTRODUCTION = """\
@@ -19,6 +19,7 @@ How exact captures are far from usual settings, and what happens beyond what is 
   with otherwise the same settings; images are random, depths jump between 0.3 m and infinity.
 * **Allowed**: what the test admits. Captures in float32 must be within 1e-4 of full scale.
 * **Refused**: `ValueError` or `TypeError` with one sentence, before any work. The table shows the first one.
+* **Not measured**: the machine has no device for the row, which is told; where there is one, the row is measured.
 """
 
 EXPLANATION = """\
@@ -48,7 +49,7 @@ and only `fidelity="reference"` computes in float64.
 
 def all_rows() -> list[Row]:
     """Return the rows of the page in their order."""
-    return [row for part in (lens, exposure, pictures, sensor, gradients, presets) for row in part.rows()]
+    return [row for part in (lens, exposure, pictures, sensor, gradients, devices, presets) for row in part.rows()]
 
 
 def measure(row: Row) -> float | str:
@@ -76,7 +77,7 @@ def page(results: Mapping[str, float | str], growth: Mapping[str, Sequence[tuple
         parts.append(
             f"## {group}\n\n| quantity | tried | error | allowed | against, or what happens |\n|---|---|---|---|---|"
         )
-        parts.extend(_line(row, results[row.name]) for row in rows if row.group == group)
+        parts.extend(_line(row, results.get(row.name)) for row in rows if row.group == group)
         parts.append("")
     lines = ["| quantity | value: error |", "|---|---|"]
     lines += [
@@ -86,7 +87,9 @@ def page(results: Mapping[str, float | str], growth: Mapping[str, Sequence[tuple
     return "\n".join(parts) + "\n" + EXPLANATION.format(table="\n".join(lines))
 
 
-def _line(row: Row, found: float | str) -> str:
+def _line(row: Row, found: float | str | None) -> str:
+    if row.absent:
+        return f"| {row.quantity} | {row.tried} | not measured | {row.bound:.2g} | {_escaped(row.absent)} |"
     if row.bound is None:
         return f"| {row.quantity} | {row.tried} | refused | - | {_escaped(str(found))} |"
     words = ". ".join(text for text in (row.against, row.note) if text)

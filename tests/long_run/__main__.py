@@ -13,6 +13,7 @@ import argparse
 import csv
 import ctypes
 import gc
+import math
 import os
 import resource
 import sys
@@ -37,6 +38,12 @@ class Sample(NamedTuple):
     seconds: float
     memory: float
     """Resident, in MiB, after freed memory was given back."""
+    mapped: float
+    """Part of it that is pages of files: code of libraries, read when it is first run."""
+    allocated: float
+    """MiB that the C library has handed out and not got back."""
+    blocks: int
+    """Blocks of memory that Python holds."""
     files: int
     threads: int
 
@@ -102,11 +109,35 @@ def memory_gradient(samples: list[Sample]) -> tuple[float, float, float]:
 
 def _sample(seconds: float) -> Sample:
     gc.collect()
-    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+    library = ctypes.CDLL(None)
+    if trim := getattr(library, "malloc_trim", None):
         trim(0)
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    resident, mapped = (
+        int(pages) * resource.getpagesize() / 2**20 for pages in Path("/proc/self/statm").read_text().split()[1:3]
+    )
     files = len(os.listdir("/proc/self/fd"))
-    return Sample(seconds, pages * resource.getpagesize() / 2**20, files, threading.active_count())
+    return Sample(
+        seconds, resident, mapped, _allocated(library), sys.getallocatedblocks(), files, threading.active_count()
+    )
+
+
+class _Mallinfo(ctypes.Structure):
+    """What ``mallinfo2`` of the C library of GNU (2.33 or newer) returns."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks",
+                     "keepcost")
+    )  # fmt: skip
+
+
+def _allocated(library: ctypes.CDLL) -> float:
+    """Return the MiB allocated in arenas and in mappings; NaN with another C library."""
+    if (mallinfo := getattr(library, "mallinfo2", None)) is None:
+        return math.nan
+    mallinfo.restype = _Mallinfo
+    found = mallinfo()
+    return (found.uordblks + found.hblkhd) / 2**20
 
 
 if __name__ == "__main__":

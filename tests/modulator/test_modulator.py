@@ -15,6 +15,22 @@ from tests.base import BaseTester
 SMALL = Fidelity(window=9, layer_spacing=20.0, stray_light="discard")
 
 
+class TestDwellTimes(BaseTester):
+    @pytest.mark.parametrize(
+        "modulator",
+        [DwellTimes(), DwellTimes((1,)), DiffractionEfficiency(0.7), SpatialLightModulator(), Switching(1e-3)],
+        ids=lambda modulator: type(modulator).__name__,
+    )
+    def test_exception_no_masks(self, modulator):
+        with pytest.raises(ValueError, match=r"phase must hold at least one mask, got the shape \(0, 5, 5\)"):
+            modulator(torch.zeros(0, 5, 5))
+
+    @pytest.mark.parametrize("unit", [5e-324, 1e-300, 1.0, 5.9e307])
+    def test_feature_shares_are_relative_in_any_unit(self, unit):
+        _, weights = DwellTimes((3 * unit, unit, 0.0))(torch.zeros(3, 5, 5))
+        assert weights.tolist() == [0.75, 0.25, 0.0]
+
+
 class TestLearnableDwellTimes(BaseTester):
     def test_exception(self):
         for shares in ((), (1, 0), (1, -1), (1, float("inf"))):

@@ -25,7 +25,7 @@ from tests.mutations.pristine import Case, make_cases
 
 SHARES = {
     "npy": 16, "png": 16, "tiff": 12, "pfm": 8, "jpeg": 12, "safetensors": 10, "checkpoint": 10, "rgbd.json": 5,
-    "sidecar": 5, "raw": 6,
+    "sidecar": 5, "response": 4, "raw": 6,
 }  # fmt: skip
 NAMES = ("accepted", "refused", "guard", "failed")
 

@@ -95,6 +95,7 @@ def _masks(folder: Path) -> list[Case]:
     write_heights(folder / "heights.npy", masks.heights().detach().double())
     write_heights(folder / "heights.safetensors", masks.heights().detach().double())
     TiDyOptics(masks, fidelity="draft").psf_bank().save(folder / "bank.safetensors")
+    (folder / "lut.txt").write_text(" ".join(f"{level / 40.6:.6f}" for level in range(256)))
     write_slm_frames(folder / "frames", SLMFrames.of(20 * masks.heights().detach(), GreyLevels(8)))
     read_frames = ("masks", "import", "FOLDER", "-o", "out.npy")
     sidecar, turns, frame = (folder / "frames" / name for name in ("frames.json", "turns.npy", "frame_000.png"))
@@ -103,6 +104,13 @@ def _masks(folder: Path) -> list[Case]:
         *(Case(kind, kind, path, ("masks", "show", "IN")) for kind, path in files),
         *(Case(kind, kind, path, ("masks", "export", "IN", "-o", "out.npy"), ("out.npy",)) for kind, path in files),
         Case("safetensors", "safetensors", folder / "bank.safetensors", PSFBank.load),
+        Case(
+            "response",
+            "raw",
+            folder / "lut.txt",
+            ("masks", "export", str(folder / "heights.npy"), "-o", "slm", "--response", "IN"),
+            ("slm",),
+        ),
         *(Case("sidecar", "json", sidecar, read_frames, ("out.npy",), folder / "frames") for _ in range(4)),
         Case("sidecar", "npy", turns, read_frames, ("out.npy",), folder / "frames"),
         Case("sidecar", "png", frame, read_frames, ("out.npy",), folder / "frames"),
