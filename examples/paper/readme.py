@@ -22,8 +22,10 @@ EXPERIMENTS = {
     "state_of_the_art": "5. Other systems",
     "transfer": "6. Transfer to real scenes",
     "switching_time": "7. Switching time",
+    "switching_training": "7b. Training with switching",
     "discretisation": "8. The paper's discretisation",
     "boundaries": "9. Boundaries of depth",
+    "boundaries_training": "9b. Training with occlusion",
     "burst": "10. Burst against average, and motion",
 }
 """Titles by module, in the order of the paper's text."""
