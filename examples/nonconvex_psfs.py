@@ -74,7 +74,9 @@ def draw(path: Path, aperture: Tensor, bounds: dict[int, Tensor]) -> None:
     smooth = np.linspace(1, max(counts), 200)
     chart.plot(smooth, smooth**-0.5, "k:", label=r"$1/\sqrt{K}$: mean of random phasors")
     chart.axhline(1, color="C3", linewidth=1, label="every PSF of a single mask")
-    chart.set(ylim=(0, 1.05), xticks=counts, xlabel="masks K in the average", ylabel=r"autocorrelation $|(X \star X)_{v-u}|$")
+    chart.set(
+        ylim=(0, 1.05), xticks=counts, xlabel="masks K in the average", ylabel=r"autocorrelation $|(X \star X)_{v-u}|$"
+    )
     chart.set_title(f"below 1 no single mask makes the average ({values.shape[1]} random sets each)")
     chart.spines[["top", "right"]].set_visible(False)
     chart.legend(frameon=False, loc="upper right", bbox_to_anchor=(1, 0.96))

@@ -26,6 +26,7 @@ pytest.importorskip("lightning.pytorch")
 SMOKE = BUDGETS["smoke"]
 NAMES = (
     "point_psf", "sequence_length", "initialisation", "state_of_the_art", "transfer", "discretisation",
+    "switching_training", "boundaries_training",
 )  # fmt: skip
 
 
