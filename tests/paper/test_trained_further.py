@@ -51,6 +51,7 @@ class TestTrials(BaseTester):
 
 
 class TestCrossedScores(BaseTester):
+    @pytest.mark.slow
     def test_feature_a_shipped_system_keeps_its_scores_and_a_trained_one_does_not(self, monkeypatch):
         monkeypatch.setitem(trained_further.BUDGETS, "smoke", TINY)
         trial = {"system": "joint-1", "trained": trained_further.AS_SHIPPED, "seed": "0"}
