@@ -36,7 +36,7 @@ BUDGETS["paper"] = BUDGETS["gpu"]
 
 
 def further_trials(systems: Mapping[str, Sequence[str]], scale: str) -> list[Trial]:
-    """Return the trials: each system as shipped, then by what it is trained further with, and by seed.
+    """Return the trials: systems as shipped, then systems trained further, by condition and seed.
 
     Args:
         systems: names of conditions to train under, by system.
@@ -103,7 +103,7 @@ def scores_under(system: TrainedSystem, name: str, parts: Mapping[str, Any], bud
 
 
 def crossed_table(rows: Sequence[Row], scored: Sequence[str], what: str) -> str:
-    """Return the table of what systems were trained with by what they are scored under.
+    """Return the table of scores: a row for each training, a column for each condition of the scored captures.
 
     Args:
         rows: of the experiment.

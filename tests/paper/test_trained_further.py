@@ -51,8 +51,8 @@ class TestTrials(BaseTester):
 
 
 class TestCrossedScores(BaseTester):
-    @pytest.mark.slow
-    def test_feature_a_shipped_system_keeps_its_scores_and_a_trained_one_does_not(self, monkeypatch):
+    @pytest.mark.slow  # .ci/run runs it
+    def test_smoke_a_shipped_system_keeps_its_scores_and_a_trained_one_does_not(self, monkeypatch):
         monkeypatch.setitem(trained_further.BUDGETS, "smoke", TINY)
         trial = {"system": "joint-1", "trained": trained_further.AS_SHIPPED, "seed": "0"}
         shipped = trained_further.crossed_scores(trial, "smoke", GATHER, ["gather"])
