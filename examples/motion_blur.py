@@ -9,6 +9,8 @@ picture is from what one gets by blurring the picture at rest along the way, whi
 
 With the defaults the two directions are 0.014 apart with five masks learnt to focus a point at all depths, 0.0028 with
 five random ones, which blur so far that little else is seen, and 3e-8 with one mask, which is rounding.
+
+What motion costs a restoration that assumes a scene at rest is experiment 10 of `examples/paper/`.
 """
 
 from __future__ import annotations

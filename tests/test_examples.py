@@ -141,9 +141,9 @@ class TestLearnPointPSF(BaseTester):
 @pytest.mark.parametrize("example", ["nonconvex_psfs"], indirect=True)
 class TestNonconvexPSFs(BaseTester):
     def test_feature_only_single_masks_reach_one(self, example, tmp_path):
-        witnesses = example.main(["--masks", "3", "--sets", "20", "--output", str(tmp_path)])
-        assert (witnesses[1] - 1).abs().max() < 1e-9
-        assert max(witnesses[2].max(), witnesses[3].max()) < 1
+        bounds = example.main(["--masks", "3", "--sets", "20", "--output", str(tmp_path)])
+        assert (bounds[1] - 1).abs().max() < 1e-9
+        assert max(bounds[2].max(), bounds[3].max()) < 1
         assert picture(tmp_path / "nonconvex_psfs.png").float().std() > 20
 
 

@@ -46,7 +46,7 @@ Painted scenes / real scenes: PSNR in dB of images, RMSE of normalised inverse d
 All networks were trained on gather. The closed form assumes one depth in each neighbourhood."""
 JUDGED = """\
 Judged can be what a system trained on gather loses on captures with occlusion. Not judged can be the reverse, training
-with occlusion and scoring on gather: that was not run. Behind a near surface the scenes have no pixels, so that
+with occlusion and scoring on gather: that is experiment 9b. Behind a near surface the scenes have no pixels, so that
 occlusion-aware compositing extends what is visible."""
 
 

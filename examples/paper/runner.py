@@ -104,7 +104,7 @@ def parse(experiment: Experiment, about: str, arguments: Sequence[str] | None) -
 
 
 def run(experiment: Experiment, scale: str, folder: Path, most: int | None = None) -> list[Row]:
-    """Measure the trials that the table does not hold yet, and return all rows.
+    """Measure the trials that the table does not hold yet, and return all rows in the order of the trials.
 
     Raises:
         ValueError: if the table holds trials of other settings.
@@ -115,7 +115,7 @@ def run(experiment: Experiment, scale: str, folder: Path, most: int | None = Non
     if any(row["settings"] != settings for row in rows):
         raise ValueError(f"{path} holds trials of other settings: remove it, or choose another --output")
     trials = [dict(trial) for trial in experiment.trials(scale)]
-    known = [{name: row.get(name) for name in trials[0]} for row in rows]
+    known = [trial_of(row, trials) for row in rows]
     todo = [trial for trial in trials if trial not in known][:most]
     size = 1 if experiment.together is None else experiment.together[scale]
     bar = tqdm(total=len(todo), desc=experiment.name, leave=False, disable=None)
@@ -127,7 +127,16 @@ def run(experiment: Experiment, scale: str, folder: Path, most: int | None = Non
             rows.append({**trial, **{name: as_text(value) for name, value in scores.items()}, **about})
         write_rows(path, rows)
         bar.update(len(group))
+    places = {tuple(trial.items()): place for place, trial in enumerate(trials)}
+    rows.sort(key=lambda row: places.get(tuple(trial_of(row, trials).items()), len(places)))
+    if rows:
+        write_rows(path, rows)
     return rows
+
+
+def trial_of(row: Row, trials: Sequence[Trial]) -> dict[str, str | None]:
+    """Return what distinguishes the trial of a row, by the names that the trials have."""
+    return {name: row.get(name) for name in trials[0]}
 
 
 def as_text(value: float | str) -> str:

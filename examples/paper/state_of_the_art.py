@@ -122,7 +122,8 @@ Judged can be which system learns most in the same few steps with equal exposure
 one and the same closed form. Not judged can be the published numbers: other data, weights pretrained there, days of
 training. Systems whose lens spans a smaller range of defocus have the easier task. Presets start from the masks of
 their papers or, where these start flat, from a mask of their kind; values that no source states are guesses, see
-docs/systems.md."""
+docs/systems.md. MiDaS Small has random weights here, and its last layer cuts negative values: after these steps its map
+is zero everywhere in both trainings, so that its row is the error of a map of zeros."""
 
 
 def settings(scale: str) -> str:

@@ -83,7 +83,7 @@ Painted scenes / real scenes: PSNR in dB of images, RMSE of normalised inverse d
 A system of five masks has four swaps in its exposure of 100 ms; one of one mask has none."""
 JUDGED = """\
 Judged can be what swaps cost these systems as they are, and from when on one mask is ahead of five. Not judged can be
-what training with swaps would win back for networks: that was not run. For masks alone, without a network,
+what training with swaps wins back: that is experiment 7b. For masks alone, without a network,
 `examples/learn_with_switching.py` measures it."""
 
 

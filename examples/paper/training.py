@@ -42,19 +42,46 @@ def train(optics: TiDyOptics, task: str, budget: Budget, seed: int, **head: Any)
     Returns:
         The system in eval mode.
     """
+    settings = head_settings(task, budget, **head)
+    torch.manual_seed(keyed_seed("paper", "weights", seed))
+    return fit(optics, build_head(settings), settings, budget, seed)
+
+
+def fit(
+    optics: TiDyOptics,
+    network: nn.Module,
+    settings: SystemSettings,
+    budget: Budget,
+    seed: int,
+    before_step: Callable[[int], None] | None = None,
+) -> TrainedSystem:
+    """Train a camera's masks and a given network together.
+
+    Args:
+        optics: the camera, trained in place. Masks that require no gradient stay as they are.
+        network: trained in place, from the weights that it has, in the mode that it is in.
+        settings: task of the system.
+        budget: steps, scenes and learning rates.
+        seed: of the order of the scenes.
+        before_step: function that is called with the number of each step before it.
+
+    Returns:
+        The system in eval mode.
+    """
     import lightning.pytorch as pl  # noqa: PLC0415 (so that --help needs no extra)
+    from lightning.pytorch.callbacks import LambdaCallback  # noqa: PLC0415
 
     from kornia_tidy.training.data_module import SceneData  # noqa: PLC0415
     from kornia_tidy.training.module import TidyTraining  # noqa: PLC0415
 
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    settings = head_settings(task, budget, **head)
-    torch.manual_seed(keyed_seed("paper", "weights", seed))
-    network = build_head(settings)
     module = TidyTraining(
-        optics, network, task, lr=budget.lr, lr_metres=budget.lr_metres, schedule=budget.schedule, ema=0
+        optics, network, settings.task, lr=budget.lr, lr_metres=budget.lr_metres, schedule=budget.schedule, ema=0
     )
     scenes = ForCamera(painted(budget, "train", budget.scenes), cast("ThinLensCamera", optics.camera))
+    callbacks = []
+    if before_step is not None:
+        callbacks.append(LambdaCallback(on_train_batch_start=lambda run, *_: before_step(run.global_step)))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=UserWarning, module="lightning")
         warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)
@@ -66,6 +93,7 @@ def train(optics: TiDyOptics, task: str, budget: Budget, seed: int, **head: Any)
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
             logger=False,
+            callbacks=callbacks,
             enable_checkpointing=False,
             enable_model_summary=False,
             enable_progress_bar=budget.accelerator != "cpu",

@@ -26,6 +26,7 @@ pytest.importorskip("lightning.pytorch")
 SMOKE = BUDGETS["smoke"]
 NAMES = (
     "point_psf", "sequence_length", "initialisation", "state_of_the_art", "transfer", "discretisation",
+    "switching_training", "boundaries_training",
 )  # fmt: skip
 
 
@@ -79,6 +80,15 @@ class TestRunner(BaseTester):
         assert run(counted, "smoke", parts) == wanted
         assert read_rows(parts / "sequence_length-smoke.csv") == wanted
         assert len(measured) == 2 * count
+
+    def test_feature_a_table_does_not_depend_on_which_trials_came_first(self, tmp_path):
+        counted = replace(EXPERIMENT, measure=lambda trial, scale: {"psnr": len(trial["task"])})
+        wanted = run(counted, "smoke", tmp_path)
+        path = tmp_path / "sequence_length-smoke.csv"
+        header, *lines = path.read_text().splitlines(keepends=True)
+        path.write_text("".join([header, *lines[:0:-1]]))  # without the first trial, from the last one
+        assert run(counted, "smoke", tmp_path) == wanted
+        assert path.read_text() == "".join([header, *lines])
 
     def test_exception_results_of_other_settings_are_not_mixed(self, tmp_path):
         (tmp_path / "sequence_length-smoke.csv").write_text("task,settings\nedof,other\n")

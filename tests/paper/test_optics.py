@@ -10,7 +10,7 @@ import torch
 
 from examples.paper import burst, theorem
 from examples.paper.readme import EXPERIMENTS
-from examples.paper.runner import main
+from examples.paper.runner import ABOUT, main, run
 from examples.paper.shipped import with_parts
 from examples.paper.switching_time import trials as switching_trials
 from kornia_tidy import PixelwiseMask, TiDyOptics
@@ -38,6 +38,19 @@ class TestEveryExperiment(BaseTester):
         for scale in ("smoke", "cpu", "gpu", "paper"):
             trials = [tuple(trial.items()) for trial in experiment.trials(scale)]
             assert len(set(trials)) == len(trials) > 0
+
+
+@pytest.mark.parametrize("experiment", [theorem.EXPERIMENT, burst.EXPERIMENT], ids=["theorem", "burst"])
+@pytest.mark.slow  # .ci/run runs it
+def test_smoke_two_runs_print_the_same_digits(experiment, tmp_path):
+    tables = []
+    for name in ("once", "again"):
+        folder = tmp_path / name
+        folder.mkdir()
+        rows = run(experiment, "smoke", folder, most=2)
+        tables.append([{key: value for key, value in row.items() if key not in ABOUT} for row in rows])
+    assert len(tables[0]) == 2
+    assert tables[0] == tables[1]
 
 
 class TestTheorem(BaseTester):
