@@ -1,7 +1,8 @@
 """Addresses outside the repository, in pages, docstrings and settings: https, of reviewed hosts, nothing asked of them.
 
-A new address wants a look at what is there and, if its host or repository is new, a line in the lists below. What the
-addresses hold today is asked by `make docs ARGS=--linkcheck`, with a network.
+A new address wants a look at what is there and, if its host is new, a line in the list below. What the addresses hold
+today is asked by `make docs ARGS=--linkcheck`, with a network. Last looked at on 23 November 2026, in stored copies of
+public pages: 2303.17583 is TiDy-PSFs, by Shah, Kulshrestha and Metzler.
 """
 
 from __future__ import annotations
@@ -16,18 +17,13 @@ import pytest
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[1]
-OURS = "kornia-tidy/kornia-tidy"
 HOSTS = {
     "arxiv.org": r"/abs/\d{4}\.\d{5}",
-    "github.com": r"/[\w.-]+/[\w.-]+(/.*)?",
     "horatio.cs.nyu.edu": r"/mit/silberman/.+\.mat",
     "keepachangelog.com": r"/en/\d\.\d\.\d/",
     "lmb.informatik.uni-freiburg.de": r"/resources/datasets/\w+\.en\.html",
     "semver.org": r"/",
 }  # each reviewed host, and the form that its addresses have
-REPOSITORIES = {OURS}  # of GitHub
-KINDS = {"blob", "tree"}  # of addresses in our repository that name a file or folder of it
-PLACES = {"commits/main", "issues", ""}  # its other pages that are named
 ADDRESS = re.compile(r"\b\w+://[^\s\"'<>`|]+")
 BARE = re.compile(
     r"(?<![\w./@-])(?:www\.[\w.-]+|(?:github|gitlab|huggingface|arxiv|doi|pypi)\.(?:com|org|co))/[^\s\"'<>`|]+"
@@ -65,21 +61,13 @@ def addresses(name: str, text: str) -> list[Address]:
 
 
 def check(address: Address) -> None:
-    """Raise an error for an address that is not https, or of a host, form or repository that nobody has reviewed."""
+    """Raise an error for an address that is not https, or of a host or form that nobody has reviewed."""
     parts = urlsplit(address.text)
     assert parts.scheme == "https", f"{address.place}: {address.text} must begin with https://"
     assert parts.hostname in HOSTS, f"{address.place}: nobody has reviewed the host of {address.text}"
     assert re.fullmatch(HOSTS[parts.hostname], parts.path), (
         f"{address.place}: {address.text} is no address of that host"
     )
-    if parts.hostname == "github.com":
-        owner, repository, *rest = parts.path.strip("/").split("/")
-        repository = f"{owner}/{repository.removesuffix('.git')}"
-        assert repository in REPOSITORIES, f"{address.place}: nobody has reviewed the repository {repository}"
-        if rest and rest[0] in KINDS:
-            assert (ROOT / "/".join(rest[2:])).exists(), f"{address.place}: there is no {'/'.join(rest[2:])}"
-        else:
-            assert "/".join(rest) in PLACES, f"{address.place}: {address.text} is no page of the repository"
 
 
 class TestAddresses(BaseTester):
@@ -98,9 +86,7 @@ class TestAddresses(BaseTester):
             ("<https://example.com/x>.", "nobody has reviewed the host of https://example.com/x\n"),
             ("(github.com/kornia/kornia)", "must begin with https"),
             ("www.example.com/page", "must begin with https"),
-            ("https://github.com/kornia/gone.", "nobody has reviewed the repository kornia/gone"),
-            (f"https://github.com/{OURS}/blob/main/docs/gone.md", r"there is no docs/gone\.md"),
-            (f"https://github.com/{OURS}/wiki", "is no page of the repository"),
+            ("https://github.com/kornia/gone.", "nobody has reviewed the host of https://github.com/kornia/gone\n"),
         ],
     )
     def test_exception_names_the_line_and_the_address(self, text, match):
@@ -114,7 +100,7 @@ class TestAddresses(BaseTester):
             "open http://127.0.0.1:7860/ or http://localhost:7860",
             "[file](docs/start.md#one), kornia_tidy.data, a/b",
             "see [the paper](https://arxiv.org/abs/2303.17583).",
-            f"git clone https://github.com/{OURS}.git; https://github.com/{OURS}/blob/main/docs/start.md",
+            "the format of [a log](https://keepachangelog.com/en/1.1.0/)",
         ],
     )
     def test_feature_good_ones_pass(self, text):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import pkgutil
 import re
 import sys
 from pathlib import Path
@@ -36,7 +37,10 @@ def load(name):
     return module
 
 
-gallery, api_pages = load("gallery"), load("api_pages")
+gallery, api_pages, flowchart = load("gallery"), load("api_pages"), load("flowchart")
+CHARTS = re.findall(
+    r"```mermaid\n(.*?)```", (SITE.parent / "architecture.md").read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+)
 
 
 @pytest.fixture
@@ -70,8 +74,9 @@ class TestGallery(BaseTester):
         assert all(read_image(tmp_path / "pages" / file).shape[0] == 3 for _, file in pictures)
         card = [":::{grid-item-card} My example", ":link: my_example", ":link-type: doc"]
         card += [f":img-top: images/my_example-{name}.png" for name, _ in pictures]
+        instead = [] if pictures else ["```text", "arguments []", "```"]
         index = (tmp_path / "pages" / "index.md").read_text(encoding="utf-8")
-        assert "\n".join([*card, "", "A question. Two sentences.", ":::"]) in index
+        assert "\n".join([*card, "", "A question. Two sentences.", *instead, ":::"]) in index
 
     def test_feature_an_example_runs_again_only_after_a_change(self, tmp_path, example, capsys):
         path = example("None")
@@ -122,13 +127,79 @@ class TestApiPages(BaseTester):
         assert api_pages.imports([tmp_path / "page.md"]) == expected
 
 
+class TestFlowChart(BaseTester):
+    @pytest.mark.parametrize("text", CHARTS)
+    def test_feature_boxes_do_not_overlap_and_arrows_go_down(self, text):
+        svg = flowchart.draw_chart(text)
+        boxes = [[float(value) for value in re.findall(r'"([\d.-]+)"', box)] for box in re.findall(r"<rect[^>]*>", svg)]
+        chart = flowchart.read_chart(text)
+        assert len(boxes) == len(chart.lines)
+        for place, (x, y, width, height, _) in enumerate(boxes):
+            for other_x, other_y, other_width, other_height, _ in boxes[:place]:
+                apart = (
+                    x - other_x - other_width,
+                    other_x - x - width,
+                    y - other_y - other_height,
+                    other_y - y - height,
+                )
+                assert max(apart) > 10
+        ends = [re.findall(r"[\d.-]+", path) for path in re.findall(r'<path d="([^"]*)"', svg)]
+        assert len(ends) == len(chart.arrows)
+        assert all(float(end[-1]) > float(end[1]) for end in ends)
+
+    def test_feature_long_arrows_pass_beside_the_boxes(self):
+        chart = flowchart.read_chart("flowchart TD\n  a --> b\n  b --> c\n  a --> c")
+        layers, stations = flowchart.layout(chart)
+        assert [set(layer) for layer in layers] == [{"a"}, {"b", ("a", "c", 1)}, {"c"}]
+        assert stations["a", "c"] == ["a", ("a", "c", 1), "c"]
+
+    def test_feature_words_lines_and_dots(self):
+        svg = flowchart.draw_chart('flowchart LR\n  a["one<br/>1 < 2"] -. against .-> b[two]')
+        assert re.findall(r">([^<>]+)</text>", svg) == ["one", "1 &lt; 2", "two"]
+        assert svg.count("stroke-dasharray") == 1
+
+    def test_feature_places_in_order_and_near_what_is_wanted(self):
+        assert flowchart.separated([0.0, 0.0], [10.0, 10.0]) == [-16.0, 16.0]
+        assert flowchart.separated([0.0, 100.0], [10.0, 10.0]) == [0.0, 100.0]
+
+    @pytest.mark.parametrize(
+        ("text", "match"),
+        [
+            ("graph TD\n  a --> b", "must begin with flowchart TD or flowchart LR, got 'graph TD'"),
+            ("flowchart TD\n  a ==> b", "must be an arrow between boxes, got 'a ==> b'"),
+            ("flowchart TD\n  a --> b\n  b --> a", "must not go in a circle"),
+        ],
+    )
+    def test_exception_what_is_not_understood(self, text, match):
+        with pytest.raises(ValueError, match=match):
+            flowchart.draw_chart(text)
+
+
+class TestFormulas(BaseTester):
+    def test_feature_commands_become_signs_and_unknown_ones_are_told(self, monkeypatch):
+        pytest.importorskip("latex2mathml", reason="latex2mathml is not installed (extra 'docs')")
+        pytest.importorskip("docutils", reason="docutils is not installed (extra 'docs')")
+        monkeypatch.setattr(sys, "path", [str(SITE), *sys.path])
+        formula = load("drawn_in_page").formula
+        assert "&#x003C8;" in formula(r"\psi", "inline")
+        assert "<mtable" in formula(r"a &= b \\ c &= d", "block")
+        with pytest.raises(ValueError, match=r"\\nonsense cannot be written as MathML"):
+            formula(r"\nonsense x", "inline")
+
+
 class TestDocstrings(BaseTester):
     """How conf.py rewrites what Sphinx reads; none of it needs Sphinx."""
 
     @pytest.fixture
     def conf(self, monkeypatch):
+        """Its references are looked up in one package: to import all of them takes seconds."""
         monkeypatch.setattr(sys, "path", list(sys.path))
-        return load("conf")
+        conf = load("conf")
+        found = [pkgutil.ModuleInfo(None, "kornia_tidy.optics", ispkg=True)]
+        found += pkgutil.iter_modules(kornia_tidy.optics.__path__, "kornia_tidy.optics.")
+        monkeypatch.setattr(conf.references.pkgutil, "walk_packages", lambda *_: found)
+        conf.references.defined.cache_clear()
+        return conf
 
     def test_feature_a_property_keeps_its_sentence(self, conf):
         lines = ["Height in metres: the mask's."]

@@ -22,12 +22,10 @@ release = version = kornia_tidy.__version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
-    "sphinxcontrib.mermaid",
 ]
 nitpicky = True
 nitpick_ignore = [("py:class", "Distance")]  # another name of float, by which settings allow inf
@@ -48,6 +46,7 @@ napoleon_use_rtype = False
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 88
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "kornia_tidy"
 html_static_path = ["_static"]
@@ -87,7 +86,11 @@ def shorten_factories(
 
 def setup(app: Any) -> None:
     """Register what is resolved here."""
+    import drawn_in_page  # noqa: PLC0415
+
     app.connect("source-read", link_examples_to_the_gallery)
     app.connect("autodoc-process-docstring", keep_sentences_of_properties, priority=400)
     app.connect("autodoc-process-signature", shorten_factories)
     app.connect("missing-reference", references.resolve)
+    app.add_directive("mermaid", drawn_in_page.FlowChart)
+    app.add_html_math_renderer("mathml", (drawn_in_page.visit_inline, None), (drawn_in_page.visit_block, None))

@@ -40,6 +40,7 @@ ARGUMENTS = {
     "train_on_rendered": "--scenes 16 --size 96 --epochs 4 --output captures",
 }
 NEEDS = {"ray_rendering": "ray"}  # packages without which only the script is shown
+CARD_LINES = 14  # of what an example prints, in its card
 DRAW = Path(__file__).with_name("run_example.py")
 COMMAND = re.compile(r"^ *python examples/.*\n", re.MULTILINE)
 
@@ -80,7 +81,7 @@ def write_gallery(pages: Path, results: Path, examples: list[Path], *, run: bool
         if run and (example.stem not in NEEDS or find_spec(NEEDS[example.stem])):
             run_example(example, results / example.stem)
         write_page(example, results / example.stem, pages)
-    cards = "\n".join(card(example, pages) for example in examples)
+    cards = "\n".join(card(example, pages, results) for example in examples)
     write(pages / "index.md", INDEX.format(cards=cards, stems="\n".join(example.stem for example in examples)))
 
 
@@ -138,15 +139,18 @@ def write_page(example: Path, folder: Path, pages: Path) -> None:
     write(pages / f"{example.stem}.md", page)
 
 
-def card(example: Path, pages: Path) -> str:
-    """Return the card of an example in the index."""
+def card(example: Path, pages: Path, results: Path) -> str:
+    """Return the card of an example in the index: its first picture, or what it prints."""
     described = ast.get_docstring(ast.parse(text(example))) or ""
     lead = " ".join(described.partition("\n\n")[0].split())
     pictures = sorted((pages / "images").glob(f"{example.stem}-*.png"))
     shown = [f":img-top: images/{pictures[0].name}"] if pictures else []
     title = TITLES.get(example.stem, example.stem.replace("_", " ").capitalize())
     head = [f":::{{grid-item-card}} {title}", f":link: {example.stem}", ":link-type: doc", *shown]
-    return "\n".join([*head, "", lead, ":::", ""])
+    printed = results / example.stem / "printed.txt"
+    lines = [] if shown or not printed.exists() else text(printed).splitlines()[:CARD_LINES]
+    shown_instead = ["```text", *lines, "```"] if lines else []
+    return "\n".join([*head, "", lead, *shown_instead, ":::", ""])
 
 
 def text(path: Path) -> str:

@@ -20,18 +20,20 @@ def draw(returned: Any) -> None:
     """Draw the losses of a training as a curve, or the pictures of a batch beside each other."""
     if not isinstance(returned, list):
         return
-    from matplotlib.figure import Figure  # noqa: PLC0415
-    from torch import Tensor, cat  # noqa: PLC0415
-
-    from kornia_tidy.data import write_image  # noqa: PLC0415
-
     if all(isinstance(value, float) for value in returned):
+        from matplotlib.figure import Figure  # noqa: PLC0415
+
         figure = Figure(figsize=(6, 3.4), layout="constrained")
         axes = figure.subplots()
         axes.plot(returned, linewidth=1)
         axes.set(xlabel="step", ylabel="loss", yscale="log")
         figure.savefig("loss.png", dpi=120)
-    elif isinstance(returned[0], Tensor):
+        return
+    from torch import Tensor, cat  # noqa: PLC0415
+
+    from kornia_tidy.data import write_image  # noqa: PLC0415
+
+    if isinstance(returned[0], Tensor):
         write_image("captures.png", cat(list(returned[0]), dim=-1))
 
 

@@ -21,8 +21,8 @@ def legends(result: Result) -> dict[str, str]:
     settings, scores = result.settings, result.scores()
     height, width = result.capture.shape[-2:]
     count = len(result.optics.masks.phase)
-    plain = (settings.camera == OWN and settings.start == FLAT) or settings.camera.endswith("-0")
-    through = "a lens without programmed masks" if plain else f"{count} mask{'s' if count > 1 else ''}, in turn"
+    plain = (settings.camera == OWN and settings.start == FLAT) or settings.camera.endswith(("-0", "-flat"))
+    through = "a lens without programmed masks" if plain else f"{count} masks, in turn" if count > 1 else "1 mask"
     by = (
         f"by the network of {settings.camera}"
         if settings.camera in PRETRAINED

@@ -51,7 +51,7 @@ def defocus_response(lens: PSFModel, defocus: Sequence[float] | None = None) -> 
     The wave on the sensor is :math:`W = K U K^T` with the pupil field U (see :mod:`~kornia_tidy.psf.propagation`). With
     K' and K'' the kernels that have an additional factor x and x² under the integral,
 
-    .. math:: \partial_\psi W = i (K'' U K^T + K U K''^T), \qquad \partial_x W = 2\pi i\, s\, K U K'^T
+    .. math:: \partial_\psi W = i (K'' U K^T + K U {K''}^T), \qquad \partial_x W = 2\pi i\, s\, K U K'^T
 
     Propagation is always exact, even if the fidelity of the lens asks for another.
 

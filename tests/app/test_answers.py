@@ -106,6 +106,13 @@ class TestLegends(BaseTester):
         assert "closed form" in words["image"]
         assert "adds up" not in words["psfs"]
 
+    @pytest.mark.parametrize(
+        ("camera", "words"),
+        [("joint-1", "exposure through 1 mask; gather"), ("edof-flat", "through a lens without programmed masks; gather")],
+    )
+    def test_feature_one_mask_is_not_shown_in_turn(self, camera, words):
+        assert words in legends(take_picture(Settings(camera=camera, **SMALL)))["capture"]
+
     def test_feature_many_pixels_beyond_the_range_are_told(self, trained):
         assert "beyond" not in status(trained, 1.0)
         far = take_picture(Settings(camera="ikoma2021", stretch=False, near=0.5, far=0.9, **SMALL))

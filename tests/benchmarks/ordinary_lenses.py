@@ -7,6 +7,7 @@ error is that of 256 x 256 pixels in green at 40 depths against the exact PSF of
 
 from __future__ import annotations
 
+import argparse
 import os
 import resource
 import subprocess
@@ -98,7 +99,13 @@ def measure(name: str) -> None:
 
 
 def main() -> None:
-    """Print a table with a row for each lens."""
+    """Print a table with a row for each lens, or the row of one."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("lens", nargs="?", choices=tuple(LENSES), help="print the row of this one alone")
+    lens = parser.parse_args().lens
+    if lens:
+        measure(lens)
+        return
     print(f"{torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f}")
     print("| 50 mm | first capture, s | of the processor | again, s | target, s | memory, MiB | window, px | light | "
           "RMSE | promised |")  # fmt: skip
@@ -108,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    measure(sys.argv[1]) if len(sys.argv) > 1 else main()
+    main()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -68,4 +68,6 @@ def _check(what: str, entry: Any, schema: dict[str, type]) -> None:
 
 
 if __name__ == "__main__":
-    print(markdown(read_benchmarks(sys.argv[1])))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", help="what pytest-benchmark has written")
+    print(markdown(read_benchmarks(parser.parse_args().file)))

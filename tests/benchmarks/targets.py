@@ -7,6 +7,7 @@ layers, PSFs of 23 x 23 pixels, float32, unless a row says otherwise. Medians of
 
 from __future__ import annotations
 
+import argparse
 import platform
 import subprocess
 import sys
@@ -240,7 +241,11 @@ ROWS = {
 }
 
 
-def main(wanted: list[str]) -> None:
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rows", nargs="*", metavar="row", choices=[*ROWS, []], help="numbers of rows (default: all)")
+    wanted = parser.parse_args().rows
     image, psi = load_scene("aloe")
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     print(
@@ -255,4 +260,4 @@ def main(wanted: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -7,8 +7,8 @@ runs there; medians of 5 steps.
 
 from __future__ import annotations
 
+import argparse
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -56,7 +56,11 @@ def clocked_step(optics: TiDyOptics, head: nn.Module, adam: torch.optim.Optimize
     return clock[1] - clock[0], clock[3] - clock[2], clock[4] - clock[0]
 
 
-def main(names: list[str]) -> None:
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("heads", nargs="*", metavar="head", choices=[*HEADS, []], help="(default: all)")
+    names = parser.parse_args().heads
     torch.set_num_threads(1)
     print("| head | size | optics forward, ms | backward, ms | step, ms | share |\n|---|---|---|---|---|---|")
     for size in SIZES:
@@ -73,4 +77,4 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
