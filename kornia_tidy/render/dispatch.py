@@ -17,6 +17,7 @@ from kornia_tidy.render.backends.batched import MOST_SAMPLES, BatchedBackend
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
+from kornia_tidy.render.backends.triton_direct import TritonBackend
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.first_use import profile_for
@@ -27,7 +28,9 @@ from kornia_tidy.runtime.tracing import is_transformed
 
 BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
 BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an estimate
-METHODS = ("auto", *BACKENDS, BATCHED.name)
+TRITON = TritonBackend()
+NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED, TRITON.name: TRITON}
+METHODS = ("auto", *NAMED)
 LARGEST_PLANE = 32 << 20  # bytes of all channels of an image, up to which "auto" may take dense
 REMEMBERED = 256  # choices, each of some 500 bytes and a grid
 
@@ -144,7 +147,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """
     if method != "auto":
         check_choice("method", method, METHODS)
-        backend = BATCHED if method == BATCHED.name else BACKENDS[method]
+        backend = NAMED[method]
         why = refusal(backend, scene)
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
