@@ -226,9 +226,9 @@ def correlate_kernel(
         for left in range(0, tl.where((from_row >= 0) & (from_row < light_height), width, 0), PIXELS):
             x = left + pixel
             inside = x < width
-            own = tl.load(of_index + x, mask=inside, other=-2)[None, :]
+            own = tl.load(of_index + x, mask=inside, other=-1)[None, :]
             value = tl.load(of_values + x, mask=inside, other=0)[None, :]
-            here, next_one = own == layer[:, None], own + 1 == layer[:, None]
+            here, next_one = own == layer[:, None], (own >= 0) & (own + 1 == layer[:, None])
             if WEIGHT_GRADIENT:
                 factor = tl.where(here, -value, tl.where(next_one, value, 0.0))
             elif LINEAR:

@@ -24,7 +24,6 @@ ROWS, COLUMNS = 8, 32  # of a tile of the output
 LAYERS, PIXELS, MOST_TAPS = 16, 32, 64  # of a product of matrices in a correlation
 SLAB_BYTES = 64 << 20  # limit of the memory of all partial sums of a correlation
 ROWS_EACH = 32  # rows of images that one partial sum holds: more blocks for a processor, and a smaller rounding error
-NO_LAYER = -2  # neither a layer, nor one below a layer
 
 
 def objection(device: torch.device) -> str | None:
@@ -171,7 +170,7 @@ def occlude(
     Args:
         light: (B, C, H + P - 1, W + P - 1) image with all that lies beyond its border.
         psfs: (D, C, P, P), flipped by 180 degrees for a convolution; not negative anywhere.
-        layer_index: (B or 1, H + P - 1, W + P - 1).
+        layer_index: (B or 1, H + P - 1, W + P - 1) layer of each pixel, whole numbers of any dtype.
         layer_weight: share of the next layer, of the same shape, or None.
         mean: (B, C) mean light of each image, and
         stray_light: (D, C) share of it that each layer takes on; both or none.
@@ -218,7 +217,7 @@ def _tiled_arguments(
 def _labels(layer_index: Tensor, layer_weight: Tensor | None, layers: int, light: Tensor) -> tuple[Tensor, Tensor]:
     """Return indices in int32, and weights; the light stands for weights that are not there."""
     index = layer_index[:1] if layer_index.stride(0) == 0 else layer_index
-    index = _rows_in_memory(index.clamp(NO_LAYER, layers).to(torch.int32))
+    index = _rows_in_memory(index.clamp(-1, layers).to(torch.int32))
     if layer_weight is None:
         return index, light[:, 0]
     weight = layer_weight.detach()
