@@ -334,7 +334,7 @@ def occlusion_kernel(
     COLUMNS: tl.constexpr,
     SPAN: tl.constexpr,
 ):
-    """The layers in a tile's window, from near to far: each is blurred, normalised and covers what is behind it."""
+    """Composite the layers in a tile's window from near to far, each blurred and normalised."""
     across, down = tl.cdiv(width, COLUMNS), tl.cdiv(height, ROWS)
     number = tl.program_id(0)
     tile, plane = number % (across * down), (number // (across * down)).to(tl.int64)

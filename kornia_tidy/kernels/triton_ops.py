@@ -68,7 +68,7 @@ def gather(
     out = light.new_empty(*light.shape[:2], *layer_index.shape[-2:])
     arguments = _tiled_arguments(light, psfs, layer_index, layer_weight, out, offset)
     linear = layer_weight is not None
-    _launch("gather_kernel", _tiles(out), *arguments, offset > 0, linear, weight_gradient, ROWS, COLUMNS)
+    launch("gather_kernel", _tiles(out), *arguments, offset > 0, linear, weight_gradient, ROWS, COLUMNS)
     return out
 
 
@@ -98,7 +98,7 @@ def scatter(
     """
     out = light.new_empty(*light.shape[:2], *size)
     arguments = _tiled_arguments(light, psfs, layer_index, layer_weight, out, offset)
-    _launch("scatter_kernel", _tiles(out), *arguments, offset > 0, layer_weight is not None, ROWS, COLUMNS)
+    launch("scatter_kernel", _tiles(out), *arguments, offset > 0, layer_weight is not None, ROWS, COLUMNS)
     return out
 
 
@@ -144,7 +144,7 @@ def correlate(
     taps = min(MOST_TAPS, max(16, _power_of_two(side)))
     if rows:
         programs = parts * channels * -(-layers // LAYERS) * side * -(-side // taps)
-        _launch(
+        launch(
             "correlate_kernel",
             programs,
             *(light, values, index, weight, out, images, height, width, *light.shape[-2:], channels, len(index)),
@@ -187,7 +187,7 @@ def occlude(
     index, weight = _labels(layer_index, layer_weight, layers, light)
     out = light.new_empty(*light.shape[:2], light.shape[-2] - side + 1, light.shape[-1] - side + 1)
     stray = stray_light is not None and mean is not None  # both or none
-    _launch(
+    launch(
         "occlusion_kernel",
         _tiles(out),
         *(
@@ -215,7 +215,7 @@ def _tiled_arguments(
 
 
 def _labels(layer_index: Tensor, layer_weight: Tensor | None, layers: int, light: Tensor) -> tuple[Tensor, Tensor]:
-    """Return indices in int32, and weights; the light stands for weights that are not there."""
+    """Return indices in int32, and weights. Without weights a view of the light is passed, which no kernel reads."""
     index = layer_index[:1] if layer_index.stride(0) == 0 else layer_index
     index = _rows_in_memory(index.clamp(-1, layers).to(torch.int32))
     if layer_weight is None:
@@ -242,8 +242,14 @@ def _power_of_two(size: int) -> int:
     return 1 << (size - 1).bit_length()
 
 
-def _launch(name: str, programs: int, *arguments: Any) -> None:
-    """Launch a kernel of :mod:`kornia_tidy.kernels.triton_kernels`, unless there is nothing to do."""
+def launch(name: str, programs: int, *arguments: Any) -> None:
+    """Launch a kernel of :mod:`kornia_tidy.kernels.triton_kernels`, unless there is nothing to do.
+
+    Args:
+        name: of the kernel.
+        programs: number of its programs.
+        arguments: of the kernel; the first one is a tensor on its device.
+    """
     if programs == 0:
         return
     kernel = getattr(_kernels(), name)
