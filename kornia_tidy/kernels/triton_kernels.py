@@ -8,14 +8,15 @@ The sums of a row of a PSF, or of a row of the image, are added up separately: b
 error than one long sum. No value is added atomically, so the same input gives the same bits.
 
 This module needs Triton; :mod:`kornia_tidy.kernels.triton_ops` calls it. Widths, heights and strides count elements,
-rows of pixels are contiguous. Pixels whose index is no layer become NaN.
+rows of pixels are contiguous, and images
+that share a map have a stride of 0. Pixels whose index is no layer become NaN.
 """
 
 import triton  # ty: ignore[import-not-found]
 import triton.language as tl  # ty: ignore[import-not-found]
 
 # Sizes and strides of any value are served by one compiled kernel.
-SIZES = ["height", "width", "light_height", "light_width", "channels", "maps", "layers", "offset", "side", "parts"]
+SIZES = ["height", "width", "light_height", "light_width", "channels", "layers", "offset", "side", "parts"]
 SIZES += ["rows_each", "images", "light_image", "light_channel", "light_row", "values_image", "values_channel"]
 SIZES += ["values_row", "map_image", "map_row", "weight_image", "weight_row"]
 
@@ -24,7 +25,7 @@ SIZES += ["values_row", "map_image", "map_row", "weight_image", "weight_row"]
 def gather_kernel(
     light,  # (B, C, light_height, light_width)
     taps,  # (C, P, P, D)
-    index,  # (maps, height, width) int32
+    index,  # (B, height, width) int32
     weight,  # like index, of the light's dtype
     out,  # (B, C, height, width)
     height,
@@ -32,7 +33,6 @@ def gather_kernel(
     light_height,
     light_width,
     channels,
-    maps,
     layers,
     offset,
     side,
@@ -58,8 +58,7 @@ def gather_kernel(
     x = (tile % across) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     inside = (y < height) & (x < width)
 
-    own = image % maps
-    layer = tl.load(index + own * map_image + y * map_row + x, mask=inside, other=0)
+    layer = tl.load(index + image * map_image + y * map_row + x, mask=inside, other=0)
     valid = (layer >= 0) & (layer < layers)
     has_next = valid & (layer + 1 < layers)
     light += image * light_image + channel * light_channel + (y - offset) * light_row + x - offset
@@ -88,7 +87,7 @@ def gather_kernel(
     if WEIGHT_GRADIENT:
         below = above - below
     elif LINEAR:
-        share = tl.load(weight + own * weight_image + y * weight_row + x, mask=inside, other=0)
+        share = tl.load(weight + image * weight_image + y * weight_row + x, mask=inside, other=0)
         below = (1 - share) * below + share * above
     tl.store(out + (plane * height + y) * width + x, below, mask=inside)
 
@@ -97,7 +96,7 @@ def gather_kernel(
 def scatter_kernel(
     light,  # (B, C, light_height, light_width)
     taps,  # (C, P, P, D)
-    index,  # (maps, light_height, light_width) int32
+    index,  # (B, light_height, light_width) int32
     weight,  # like index, of the light's dtype
     out,  # (B, C, height, width)
     height,
@@ -105,7 +104,6 @@ def scatter_kernel(
     light_height,
     light_width,
     channels,
-    maps,
     layers,
     offset,
     side,
@@ -130,10 +128,9 @@ def scatter_kernel(
     x = (tile % across) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     inside = (y < height) & (x < width)
 
-    own = image % maps
     light += image * light_image + channel * light_channel + (y - offset) * light_row + x - offset
-    index += own * map_image + (y - offset) * map_row + x - offset
-    weight += own * weight_image + (y - offset) * weight_row + x - offset
+    index += image * map_image + (y - offset) * map_row + x - offset
+    weight += image * weight_image + (y - offset) * weight_row + x - offset
     taps += channel * side * side * layers
 
     dtype = light.dtype.element_ty
@@ -166,7 +163,7 @@ def scatter_kernel(
 def correlate_kernel(
     light,  # (B, C, light_height, light_width)
     values,  # (B, C, height, width)
-    index,  # (maps, height, width) int32
+    index,  # (B, height, width) int32
     weight,  # like index, of the light's dtype
     out,  # (parts, D, C, P, P)
     images,
@@ -175,7 +172,6 @@ def correlate_kernel(
     light_height,
     light_width,
     channels,
-    maps,
     layers,
     offset,
     side,
@@ -218,8 +214,8 @@ def correlate_kernel(
     for row in range(first, tl.minimum(first + rows_each, images * height)):
         image, y = (row // height).to(tl.int64), row % height
         from_row = y + j - offset
-        of_index = index + (image % maps) * map_image + y * map_row
-        of_weight = weight + (image % maps) * weight_image + y * weight_row
+        of_index = index + image * map_image + y * map_row
+        of_weight = weight + image * weight_image + y * weight_row
         of_values = values + image * values_image + channel * values_channel + y * values_row
         of_light = light + image * light_image + channel * light_channel + from_row * light_row
         of_row = tl.zeros([LAYERS, TAPS], dtype)
@@ -309,7 +305,7 @@ def _blur_layer(
 def occlusion_kernel(
     light,  # (B, C, height + P - 1, width + P - 1)
     taps,  # (C, P, P, D)
-    index,  # (maps, height + P - 1, width + P - 1) int32: D is no layer
+    index,  # (B, height + P - 1, width + P - 1) int32: D is no layer
     weight,  # like index, of the light's dtype
     mean,  # (B, C)
     stray_light,  # (D, C)
@@ -317,7 +313,6 @@ def occlusion_kernel(
     height,
     width,
     channels,
-    maps,
     layers,
     side,
     light_image,
@@ -343,8 +338,7 @@ def occlusion_kernel(
     y, x = top + tl.arange(0, ROWS)[:, None], left + tl.arange(0, COLUMNS)[None, :]
     inside = (y < height) & (x < width)
 
-    own = image % maps
-    index += own * map_image
+    index += image * map_image
     rows, columns = tl.minimum(top + ROWS, height) - top, tl.minimum(left + COLUMNS, width) - left
     window = index + top * map_row + left
     lowest, highest = _layers_within(window, rows + side - 1, columns + side - 1, map_row, layers, SPAN)
@@ -353,7 +347,7 @@ def occlusion_kernel(
 
     light += image * light_image + channel * light_channel + y * light_row + x
     index += y * map_row + x
-    weight += own * weight_image + y * weight_row + x
+    weight += image * weight_image + y * weight_row + x
     taps += channel * side * side * layers
     dtype = light.dtype.element_ty
     total = tl.zeros([ROWS, COLUMNS], dtype)

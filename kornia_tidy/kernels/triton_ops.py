@@ -147,9 +147,9 @@ def correlate(
         launch(
             "correlate_kernel",
             programs,
-            *(light, values, index, weight, out, images, height, width, *light.shape[-2:], channels, len(index)),
+            *(light, values, index, weight, out, images, height, width, *light.shape[-2:], channels),
             *(layers, offset, side, parts, -(-rows // parts), *light.stride()[:3], *values.stride()[:3]),
-            *(*index.stride()[:2], *weight.stride()[:2], layer_weight is not None, weight_gradient),
+            *(*_map_strides(index), *_map_strides(weight), layer_weight is not None, weight_gradient),
             *(LAYERS, taps, PIXELS),
         )
     return out.sum(0)
@@ -197,8 +197,8 @@ def occlude(
             weight,
             *((mean.contiguous(), stray_light.contiguous()) if stray else (light,) * 2),
         ),
-        *(out, *out.shape[-2:], light.shape[1], len(index), layers, side, *light.stride()[:3], *index.stride()[:2]),
-        *(*weight.stride()[:2], epsilon, layer_weight is not None, stray, ROWS, COLUMNS, COLUMNS),
+        *(out, *out.shape[-2:], light.shape[1], layers, side, *light.stride()[:3], *_map_strides(index)),
+        *(*_map_strides(weight), epsilon, layer_weight is not None, stray, ROWS, COLUMNS, COLUMNS),
     )
     return out
 
@@ -209,19 +209,25 @@ def _tiled_arguments(
     light = _rows_in_memory(light)
     layers, side = len(psfs), psfs.shape[-1]
     index, weight = _labels(layer_index, layer_weight, layers, light)
-    sizes = *out.shape[-2:], *light.shape[-2:], light.shape[1], len(index), layers, offset, side
-    strides = *light.stride()[:3], *index.stride()[:2], *weight.stride()[:2]
+    sizes = *out.shape[-2:], *light.shape[-2:], light.shape[1], layers, offset, side
+    strides = *light.stride()[:3], *_map_strides(index), *_map_strides(weight)
     return light, _taps(psfs), index, weight, out, *sizes, *strides
 
 
 def _labels(layer_index: Tensor, layer_weight: Tensor | None, layers: int, light: Tensor) -> tuple[Tensor, Tensor]:
     """Return indices in int32, and weights. Without weights a view of the light is passed, which no kernel reads."""
-    index = layer_index[:1] if layer_index.stride(0) == 0 else layer_index
-    index = _rows_in_memory(index.clamp(-1, layers).to(torch.int32))
-    if layer_weight is None:
-        return index, light[:, 0]
-    weight = layer_weight.detach()
-    return index, _rows_in_memory(weight.expand(len(index), -1, -1) if len(weight) < len(index) else weight)
+    index = _once(layer_index).clamp(-1, layers).to(torch.int32)
+    weight = light[:, 0] if layer_weight is None else _once(layer_weight)
+    return _rows_in_memory(index), _rows_in_memory(weight)
+
+
+def _once(maps: Tensor) -> Tensor:
+    """Return maps (B, H, W), or the one (1, H, W) that all images share."""
+    return maps[:1] if maps.stride(0) == 0 else maps
+
+
+def _map_strides(maps: Tensor) -> tuple[int, int]:
+    return (maps.stride(0) if len(maps) > 1 else 0), maps.stride(1)
 
 
 def _taps(psfs: Tensor) -> Tensor:

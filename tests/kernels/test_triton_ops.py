@@ -109,6 +109,18 @@ class TestCorrelate(BaseTester):
 
 
 @needs_triton
+class TestSharedMaps(BaseTester):
+    def test_feature_images_share_layers_and_have_weights_of_their_own(self):
+        """And the other way round: as with maps of each image in memory."""
+        light, psfs = torch.rand(2, 1, 4, 5), torch.rand(3, 1, 3, 3)
+        index, weight = torch.randint(2, (2, 2, 3)), torch.rand(2, 2, 3)
+        shared = index[:1].expand(2, -1, -1), weight[:1].expand(2, -1, -1)
+        for labels in ((shared[0], weight), (index, shared[1]), shared):
+            expected = triton_ops.gather(*on_device((light, psfs, *(x.clone().contiguous() for x in labels))))
+            assert torch.equal(triton_ops.gather(*on_device((light, psfs)), *on_device(labels)), expected)
+
+
+@needs_triton
 class TestPixelsInNoLayer(BaseTester):
     """The depth of such a pixel is not a number. Its index may be any, and nothing beyond the PSFs is read."""
 
