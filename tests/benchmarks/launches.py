@@ -4,19 +4,26 @@
 PSFs of 61 px, forward and backward to the masks, on the simulated device of the tests, after one step that fills the
 memories. Counted are operators of torch, each for one launch, copies on the device included and views left out; waits
 for a value, and copies from the host, which a CUDA graph cannot hold. The counts are those of any accelerator. They
-depend on the number of layers in the scene for occlusion alone.
+depend on the number of layers in the scene for occlusion alone. Rows with Triton are those of a CUDA GPU with
+``KORNIA_TIDY_TRITON=on``, wherever that would be taken: each kernel counts as one launch, and gives zeros here.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Generator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from unittest import mock
 
 import torch
 from tqdm import tqdm
 
 from kornia_tidy import Fidelity, SensorNoise, TiDyOptics
+from kornia_tidy.kernels import triton_ops
+from kornia_tidy.render import accelerator_cost
 from tests.simulated_device import SimulatedDevice
 
 BATCH, SIDE, WINDOW = 8, 278, 61
@@ -31,14 +38,47 @@ class Step(NamedTuple):
     uploads: int
 
 
+@contextmanager
+def kernels_counted(device: SimulatedDevice) -> Generator[None]:
+    """Render by the Triton backend, whose kernels do nothing but count and give zeros.
+
+    Args:
+        device: that counts.
+    """
+
+    def launch(name: str, programs: int, *arguments: Any) -> None:
+        device.launches += 1
+        device.callers["launches", name] += 1
+        for tensor in arguments:
+            if torch.is_tensor(tensor) and tensor.is_floating_point():
+                out = tensor  # the last one
+        out.on_cpu.zero_()
+
+    allowed = mock.patch.dict(os.environ, {"KORNIA_TIDY_TRITON": "on"})
+    able, taken = (
+        mock.patch.object(triton_ops, "objection", return_value=None),
+        mock.patch.object(accelerator_cost, "GAIN", 0),
+    )
+    with allowed, able, taken, mock.patch.object(triton_ops, "launch", launch):
+        yield
+
+
 def step_counts(
-    compositing: str, *, fixed: bool, batch: int = BATCH, side: int = SIDE, window: int = WINDOW, steps: int = 2
+    compositing: str,
+    *,
+    fixed: bool,
+    triton: bool = False,
+    batch: int = BATCH,
+    side: int = SIDE,
+    window: int = WINDOW,
+    steps: int = 2,
 ) -> list[Step]:
     """Return the counts of training steps that follow each other, each of another scene.
 
     Args:
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         fixed: take the camera with fixed layers.
+        triton: take the Triton backend.
         batch: images.
         side: of the images in pixels.
         window: of the PSFs in pixels.
@@ -47,7 +87,7 @@ def step_counts(
     fidelity = replace(Fidelity.of("balanced"), window=window)
     optics = TiDyOptics(fidelity=fidelity, compositing=compositing, sensor=SensorNoise(0.01))
     counts = []
-    with SimulatedDevice() as device:
+    with SimulatedDevice() as device, kernels_counted(device) if triton else nullcontext():
         camera = device.put(optics.with_fixed_layers() if fixed else optics)
         for _ in range(steps):
             image = device.put(torch.rand(batch, 3, side, side))
@@ -61,15 +101,18 @@ def step_counts(
 
 
 def main(compositings: list[str]) -> None:
-    """Print a row for each compositing, with and without fixed layers."""
+    """Print a row for each compositing: layers of the scene, with and without Triton, and fixed layers."""
     torch.manual_seed(0)
     print(f"{BATCH} x 3 x {SIDE} x {SIDE}, five masks, PSFs of {WINDOW} px, forward and backward, second step")
-    print(f"{'compositing':12} {'layers':10} {'launches':>8} {'waits':>6} {'uploads':>8}")
+    print(f"{'compositing':12} {'layers':20} {'launches':>8} {'waits':>6} {'uploads':>8}")
     for compositing in tqdm(compositings or COMPOSITINGS, leave=False):
-        for fixed in (False, True):
-            last = step_counts(compositing, fixed=fixed)[-1]
-            layers = "fixed" if fixed else "of scene"
-            tqdm.write(f"{compositing:12} {layers:10} {last.launches:8d} {last.waits:6d} {last.uploads:8d}")
+        for layers, fixed, triton in (
+            ("of scene", False, False),
+            ("fixed", True, False),
+            ("of scene, Triton", False, True),
+        ):
+            last = step_counts(compositing, fixed=fixed, triton=triton)[-1]
+            tqdm.write(f"{compositing:12} {layers:20} {last.launches:8d} {last.waits:6d} {last.uploads:8d}")
 
 
 if __name__ == "__main__":
