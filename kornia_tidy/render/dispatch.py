@@ -153,9 +153,10 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         if why is not None:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return backend
-    if _goes_by_triton(scene):
+    accelerated = scene.image.device.type != "cpu"
+    if accelerated and _goes_by_triton(scene):
         return TRITON
-    if scene.image.device.type != "cpu" and not is_transformed() and BATCHED.samples(scene) <= MOST_SAMPLES:
+    if accelerated and not is_transformed() and BATCHED.samples(scene) <= MOST_SAMPLES:
         return BATCHED
     # With occlusion the values of PSFs matter too.
     layout = {} if scene.layout is None or scene.compositing == "occlusion" else scene.layout
@@ -180,9 +181,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
 
 def _goes_by_triton(scene: LayeredScene) -> bool:
     """Return whether ``"auto"`` takes kernels in Triton: where they are allowed to, and estimated to be much faster."""
-    if scene.image.device.type == "cpu" or not triton_is_allowed() or not is_triton_faster(scene):
-        return False
-    return refusal(TRITON, scene) is None
+    return triton_is_allowed() and is_triton_faster(scene) and refusal(TRITON, scene) is None
 
 
 def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
