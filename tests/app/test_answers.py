@@ -108,7 +108,10 @@ class TestLegends(BaseTester):
 
     @pytest.mark.parametrize(
         ("camera", "words"),
-        [("joint-1", "exposure through 1 mask; gather"), ("edof-flat", "through a lens without programmed masks; gather")],
+        [
+            ("joint-1", "exposure through 1 mask; gather"),
+            ("edof-flat", "through a lens without programmed masks; gather"),
+        ],
     )
     def test_feature_one_mask_is_not_shown_in_turn(self, camera, words):
         assert words in legends(take_picture(Settings(camera=camera, **SMALL)))["capture"]
