@@ -145,7 +145,7 @@ def run_until_read(words: list[str]) -> None:
 
 
 def make_checkout(folder: Path) -> None:
-    """Make a folder look like a checkout whose environment is there: links to the files, and `.venv`."""
+    """Make a folder into a checkout by links to the files, with an environment in `.venv`."""
     for path in ROOT.iterdir():
         if path.name not in (".git", ".venv", "outputs"):
             (folder / path.name).symlink_to(path)

@@ -67,6 +67,7 @@ class TestGallery(BaseTester):
         page = self.make(tmp_path, example(returned))
         assert page.startswith("# My example\n\nA question. Two sentences.\n\nWhat follows the first paragraph.\n")
         assert "```bash\npython examples/my_example.py --size 8\n```" in page
+        assert page.count("--size 8") == 1  # not among the words, too
         assert "## What it prints\n\n```bash\npython examples/my_example.py\n```\n```text\narguments []\n```" in page
         assert "```{literalinclude} my_example.py" in page
         pictures = re.findall(r"!\[(\w+)\]\((\S+)\)", page)

@@ -12,12 +12,7 @@ from latex2mathml.converter import convert
 
 
 def formula(latex: str, display: str) -> str:
-    r"""Return a formula as MathML; rows (``\\``) and columns (``&``) are aligned.
-
-    Example:
-        >>> formula("x", "inline")
-        '<math xmlns="http://www.w3.org/1998/Math/MathML" display="inline"><mrow><mi>x</mi></mrow></math>'
-    """
+    r"""Return a formula as MathML; rows (``\\``) and columns (``&``) are aligned."""
     latex = latex.replace(r"\arg", r"\mathrm{arg}")  # a command that the converter does not know
     if r"\begin" not in latex and (r"\\" in latex or "&" in latex):
         latex = rf"\begin{{aligned}}{latex}\end{{aligned}}"
