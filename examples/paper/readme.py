@@ -39,7 +39,8 @@ has and at the scale that their machine allows: `smoke` takes seconds, `cpu` min
 
 The same machine, seed and number of threads give the same digits. Run again from a fresh clone on the machine named
 below, with one thread, these tables came out alike to the last printed digit: `smoke` of all twelve, twice; `cpu` of
-experiments 1 and 4; and 150 starts of experiment 2, fifty each of one, two and five masks.
+experiments 1 and 4, and five trainings of experiment 3; and 150 starts of experiment 2, fifty each of one, two and five
+masks.
 """
 
 
