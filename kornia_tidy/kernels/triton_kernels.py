@@ -8,7 +8,8 @@ The sums of a row of a PSF, or of a row of the image, are added up separately: b
 error than one long sum. No value is added atomically, so the same input gives the same bits.
 
 This module needs Triton; :mod:`kornia_tidy.kernels.triton_ops` calls it. Widths, heights and strides count elements,
-rows of pixels are contiguous, and images that share a map have a stride of 0. Pixels whose index is no layer become NaN.
+rows of pixels are contiguous, and images that share a map have a stride of 0. Pixels whose index is no layer become
+NaN, except with occlusion.
 """
 
 import triton  # ty: ignore[import-not-found]
