@@ -10,6 +10,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.camera.advice import explain_capture, plan_capture
+from kornia_tidy.camera.bank_pieces import BankPieces, render_pieces
 from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.capture_psfs import Banks, capture_psfs, wide_irradiance
@@ -67,7 +68,8 @@ class TiDyOptics(CameraState):
         check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
             unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
-            through in bands of 64 rows or more, which changes nothing but the last digits.
+            through in bands of 64 rows or more, and PSFs that exceed half of it are computed in pieces, some layers at
+            a time, with gradients too. That changes nothing but the last digits.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -273,6 +275,8 @@ class TiDyOptics(CameraState):
             banks: PSFs, each with its share of the exposure.
             border: what lies beyond the image.
         """
+        if isinstance(banks, BankPieces):
+            return render_pieces(light, defocus, banks, self, border)
         if not isinstance(banks, list):
             return wide_irradiance(light, defocus, banks, border)
         method = "batched" if self.fixed_defocus is not None and light.device.type != "cpu" else "auto"
