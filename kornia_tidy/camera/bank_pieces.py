@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from kornia_tidy.camera.exposure import Banks, render_banks
-from kornia_tidy.camera.samples import cropped
+from kornia_tidy.camera.samples import Sample, cropped
 from kornia_tidy.psf.defocus_interpolation import nodes_around
 from kornia_tidy.psf.exact import without_kernel_cache
 from kornia_tidy.psf.psf_model import PSFModel
@@ -91,6 +91,20 @@ def pieces_for(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor) ->
     if layers * (psfs + work) <= allowed:
         return None
     return BankPieces(model, channels, dtype, max(2, allowed // (psfs + work)), layers * psfs <= allowed)
+
+
+def image_budget(camera: Any, sample: Sample) -> int:
+    """Return the bytes for rendering an image: half of the camera's budget where PSFs may come in pieces, else all.
+
+    Args:
+        camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
+        sample: image and depth.
+    """
+    budget: int = camera.memory_budget
+    if sample.bytes_at_once <= budget // 2:
+        return budget
+    reach = torch.tensor(camera.psf_model.camera.defocus_range, dtype=torch.float64)
+    return budget if pieces_for(camera, sample.image.shape[1], sample.dtype, reach) is None else budget // 2
 
 
 def layer_bytes(model: PSFModel, channels: int, dtype: torch.dtype) -> tuple[int, int]:

@@ -10,8 +10,8 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.camera.advice import explain_capture, plan_capture
-from kornia_tidy.camera.bank_pieces import BankPieces, render_pieces
 from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
+from kornia_tidy.camera.bank_pieces import BankPieces, render_pieces
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.capture_psfs import Banks, capture_psfs, wide_irradiance
 from kornia_tidy.camera.color import any_channels
@@ -203,7 +203,7 @@ class TiDyOptics(CameraState):
         device = sample.image.device
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             now = self.snapshot(sample.dtype)
-            if sample.bytes_at_once > now.memory_budget and (rows := rows_at_once(now, sample)):
+            if sample.bytes_at_once > now.memory_budget // 2 and (rows := rows_at_once(now, sample)):
                 return sample.coded(capture_in_bands(now, sample, rows, params, generator))
             light = now.decode(sample.image.to(sample.dtype))
             defocus = now.defocus(sample.depth.to(sample.dtype))

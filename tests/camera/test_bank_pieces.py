@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.camera.bank_pieces import BankPieces, layer_bytes, pieces_for, render_pieces, runs_of
+from kornia_tidy.camera.bank_pieces import BankPieces, image_budget, layer_bytes, pieces_for, render_pieces, runs_of
+from kornia_tidy.camera.samples import read_sample
 from kornia_tidy.psf import exact
 from kornia_tidy.tradeoff.costs import peak_bytes
 from tests.base import BaseTester
@@ -125,6 +126,12 @@ class TestPiecesFor(BaseTester):
         assert taken < budget < peak_bytes(lambda: found.append(whole(image, depth)), image.device)
         # In float32 defocus of 300 rad over 2 rad between layers: 150 units of the last place, and those of transforms.
         self.assert_close(found[0], found[1], rtol=0, atol=1e3 * torch.finfo(torch.float32).eps)
+
+    def test_feature_image_and_psfs_share_the_budget(self):
+        """631 layers of at most 2 MiB want more than half of 64 MiB, the 11 layers of 7 px do not."""
+        image, depth = torch.rand(1, 1, 1024, 1024), torch.full((1, 1, 1024, 1024), 0.5)
+        for optics, share in ((fast_optics(64 << 20), 2), (make_optics(memory_budget=64 << 20), 1)):
+            assert image_budget(optics, read_sample(image, depth, optics)) == (64 << 20) // share
 
     @pytest.mark.parametrize("remembered", [False, True])
     @torch.no_grad()
