@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.bank_pieces import image_budget
 from kornia_tidy.camera.capture_psfs import capture_psfs
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample, check_light, cropped, survey_defocus
 from kornia_tidy.render.bands import padded_band
@@ -27,8 +28,10 @@ def rows_at_once(camera: Any, sample: Sample) -> int | None:
     unseen = camera.compositing == "occlusion" and camera.border == "zero"
     if learning or is_followed() or spread or unseen or not len(image):
         return None
+    if sample.bytes_at_once <= (allowed := image_budget(camera, sample)):
+        return None
     row = 3 * BYTES_A_VALUE * sample.dtype.itemsize // 4 * image.shape[0] * image.shape[-1]
-    rows = max(STRIP, (camera.memory_budget - BYTES_OF_TILES) // row // STRIP * STRIP)
+    rows = max(STRIP, (allowed - BYTES_OF_TILES) // row // STRIP * STRIP)
     return None if rows >= image.shape[-2] else rows
 
 

@@ -1,4 +1,4 @@
-"""The PSFs of a capture: in groups of layers where blur is wide, else one bank, or one for each state."""
+"""The PSFs of a capture: in groups of layers where blur is wide, else one bank, one for each state, or pieces."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.camera.bank_pieces import BankPieces, pieces_for
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.wide_psfs import WideBank
 from kornia_tidy.render.coarse_gather import gather_groups
 
-Banks = list[tuple[Tensor | float, PSFBank]] | WideBank
+Banks = list[tuple[Tensor | float, PSFBank]] | WideBank | BankPieces
+_MOST_COPIES = 64  # of PSFs: while they are computed, and in their spectra, for each state
 _BANKS = 3  # held at a time by scatter and occlusion: of layers, and their spectra
 
 
@@ -43,6 +45,13 @@ def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, 
                 f"{camera.memory_budget / 2**30:.1f} GiB: take compositing='gather', a smaller aperture, a narrower "
                 f"depth_range, or a larger memory_budget"
             )
+    else:
+        (lo, hi), fidelity = model.camera.defocus_range, model.fidelity
+        samples = ((hi - lo) / fidelity.layer_spacing + 1) * (fidelity.window or fidelity.max_window) ** 2
+        if _MOST_COPIES * samples * channels * dtype.itemsize > camera.memory_budget // 2:  # else it surely fits
+            pieces = pieces_for(camera, channels, dtype, reach)
+            if pieces is not None:
+                return pieces
     return model.scene_banks(channels, dtype, reach, camera.compositing == "occlusion", defocus.device)
 
 

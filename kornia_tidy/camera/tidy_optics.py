@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.advice import explain_capture, plan_capture
 from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
+from kornia_tidy.camera.bank_pieces import BankPieces, render_pieces
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.capture_psfs import Banks, capture_psfs, wide_irradiance
 from kornia_tidy.camera.color import any_channels
@@ -67,7 +68,8 @@ class TiDyOptics(CameraState):
         check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
             unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
-            through in bands of 64 rows or more, which changes nothing but the last digits.
+            through in bands of 64 rows or more, and PSFs that exceed half of it are computed in pieces, some layers at
+            a time, with gradients too. That changes nothing but the last digits.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -201,7 +203,7 @@ class TiDyOptics(CameraState):
         device = sample.image.device
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             now = self.snapshot(sample.dtype)
-            if sample.bytes_at_once > now.memory_budget and (rows := rows_at_once(now, sample)):
+            if sample.bytes_at_once > now.memory_budget // 2 and (rows := rows_at_once(now, sample)):
                 return sample.coded(capture_in_bands(now, sample, rows, params, generator))
             light = now.decode(sample.image.to(sample.dtype))
             defocus = now.defocus(sample.depth.to(sample.dtype))
@@ -273,6 +275,8 @@ class TiDyOptics(CameraState):
             banks: PSFs, each with its share of the exposure.
             border: what lies beyond the image.
         """
+        if isinstance(banks, BankPieces):
+            return render_pieces(light, defocus, banks, self, border)
         if not isinstance(banks, list):
             return wide_irradiance(light, defocus, banks, border)
         method = "batched" if self.fixed_defocus is not None and light.device.type != "cpu" else "auto"

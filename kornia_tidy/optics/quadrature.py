@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ def gauss_legendre_order(half_range: float, tolerance: float) -> int:
     exact = np.sinc(b / np.pi)
     order = 1
     while True:
-        nodes, weights = np.polynomial.legendre.leggauss(order)
+        nodes, weights = _leggauss(order)
         if np.abs(np.cos(b[:, None] * nodes) @ weights / 2 - exact).max() <= tolerance:
             return order
         order += 1 if order < 32 else order // 8
@@ -61,8 +62,13 @@ def gauss_legendre(order: int, device: torch.device | None = None) -> tuple[Tens
 
 
 def _gauss_legendre(order: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    nodes, weights = np.polynomial.legendre.leggauss(order)
+    nodes, weights = _leggauss(order)
     return tuple((nodes / 2).tolist()), tuple((weights / 2).tolist())
+
+
+@lru_cache(maxsize=64)  # a search asks for all orders up to its own, some of which take milliseconds
+def _leggauss(order: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.polynomial.legendre.leggauss(order)
 
 
 # torch.compile cannot trace NumPy, so the results are marked as constants. torch.compiler.assume_constant_result sets

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Generator, Hashable, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import cast
 
@@ -24,6 +26,28 @@ Key = tuple[float, float, Geometry, Gaps, torch.device, torch.dtype, int]  # the
 _CACHE: OrderedDict[Key, Tensor] = OrderedDict()
 _MATRICES: OrderedDict[tuple[Hashable, ...], tuple[Tensor, Tensor]] = OrderedDict()  # of accelerators
 _CACHE_BYTES = 256 * 2**20
+
+
+class _Thread(threading.local):
+    forgets = False
+
+
+_thread = _Thread()
+
+
+@contextmanager
+def without_kernel_cache() -> Generator[None]:
+    """Keep no sensor kernels in this thread that are computed meanwhile: some hundred KiB for each depth and colour.
+
+    Example:
+        >>> with without_kernel_cache():
+        ...     pass
+    """
+    before, _thread.forgets = _thread.forgets, True
+    try:
+        yield
+    finally:
+        _thread.forgets = before
 
 
 def exact_psf_bank(
@@ -181,7 +205,7 @@ def _kernels(
         )
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
-    if is_followed():
+    if is_followed() or _thread.forgets:
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
     keys = [(psi, step, geometry, gaps, device, dtype, torch.get_num_threads()) for psi in defocus]
     missing = [key for key in keys if key not in _CACHE]

@@ -63,9 +63,11 @@ def cell_integrals(
         centres, widths = (begin + end) / 2, end - begin
     x = (centres[:, None] + widths[:, None] * points) * pitch
     psi = torch.tensor(defocus, dtype=torch.float64, device=x.device)
-    wave = torch.exp(-2j * math.pi * frequency[:, None, None] * x)
     lens = torch.exp(1j * psi[:, None, None] * x**2) * (widths[:, None] * weights * pitch * x**moment)
-    return torch.einsum("ung,dng->dun", wave, lens)
+    rotation = -2j * math.pi * pitch * frequency[:, None]
+    if cells is None:  # all cells have the same points around their centres, so that no (U, N, points) is needed
+        return torch.exp(rotation * centres) * torch.einsum("ug,dng->dun", torch.exp(rotation * points), lens)
+    return torch.einsum("ung,dng->dun", torch.exp(-2j * math.pi * frequency[:, None, None] * x), lens)
 
 
 def pixel_frequencies(step: float | Tensor, window: int, order: int, device: torch.device | None = None) -> Tensor:

@@ -115,6 +115,15 @@ class PSFModel(ScenePSFs):
         """
         return self.replace(fidelity=Fidelity.of(fidelity))
 
+    def without_memory(self) -> Self:
+        """Return this model without remembered PSFs: those that it computes go when it does. The parts are shared.
+
+        Example:
+            >>> PSFModel().without_memory().psf_bank(defocus=[0.0]).psfs.shape[:2]
+            torch.Size([1, 3])
+        """
+        return self._replace(_memories={})
+
     def through_state(self, state: int) -> Self:
         """Return this model with one state of its modulator shown all the time. The parts and the window are shared.
 

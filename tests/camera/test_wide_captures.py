@@ -70,6 +70,21 @@ class TestWideCaptures(BaseTester):
         coded.square().mean().backward()
         assert float(optics.masks.phase.grad.abs().max()) > 0
 
+    def test_exception_gradients_of_masks_name_the_width_and_each_remedy_works(self):
+        optics, image = fast_camera(1.4, 0.5), light(32).requires_grad_()
+        far = torch.full((1, 1, 32, 32), float("inf"))
+        said = "gradients of masks are computed through PSFs of at most 257 px, got [67][0-9]{2} px: freeze the masks"
+        with pytest.raises(RuntimeError, match=said):
+            optics(image, far).sum().backward()
+        optics.masks.requires_grad_(False)
+        optics(image, far).sum().backward()
+        assert torch.isfinite(image.grad).all()
+        narrow = ThinLensCamera(50e-3, 50e-3 / 1.4, 0.5, 6e-6, depth_range=(0.46, 0.54))
+        for lens, depth in ((narrow, 0.46), (fast_camera(2.8, 2.0).camera, 1.6)):
+            learnt = TiDyOptics(PixelwiseMask(1, initial="flat"), lens, sensor=None, color_space="linear")
+            learnt(image, torch.full_like(far, depth)).square().mean().backward()
+            assert float(learnt.masks.phase.grad.abs().max()) > 0
+
     @torch.no_grad()
     def test_feature_bands_are_the_whole(self):
         optics, image, depth = fast_camera(), light(192), stairs(192)

@@ -1,0 +1,95 @@
+"""Time of rendering through large PSFs in FFT round trips: one transform of the padded image and back.
+
+``python -m tests.benchmarks.large_windows [window ...]``; minutes. The scene is Aloe (1110 x 1282), its disparity laid
+linearly on [-20, 20] rad, in 8 nearest layers, float32. Backends take turns. Of each the least processor time of
+``ROUNDS`` counts, because other programs can only lengthen it.
+
+``tiles`` is the number of transformed samples of the chosen tiles, their layers and PSFs, with the logarithms of the
+sides, over that of a round trip: what tiles cost if nothing but transforms took time.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from math import log2, prod
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.render.backends.tile_plan import BLOCKS, cheapest_grid
+from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.compositing import render
+from kornia_tidy.render.dispatch import explain
+from kornia_tidy.render.scene import layered_scene
+from tests.benchmarks.rendering_against_peers import load_scene, make_bank, round_trip
+from tests.render.scenes import Bank
+
+LAYERS, ROUNDS = 8, 3
+WINDOWS = (65, 129, 257, 513)
+LARGEST_DIRECT = 65  # px; direct convolution of larger windows takes many seconds
+
+
+def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Return the least processor time of each call, the calls in turn."""
+    least = dict.fromkeys(calls, float("inf"))
+    for _ in range(ROUNDS):
+        for name, call in calls.items():
+            begun = time.process_time()
+            call()
+            least[name] = min(least[name], time.process_time() - begun)
+    return least
+
+
+def tile_transforms(image: Tensor, psi: Tensor, bank: Bank) -> tuple[str, float]:
+    """Return the chosen tiles in words, and their transforms in round trips."""
+    scene = layered_scene(image, psi, bank.defocus, bank.psfs, layers="nearest")
+    work, grid = cheapest_grid(scene.labels, LAYERS, bank.psfs.shape[-1], BLOCKS)
+    side = bank.psfs.shape[-1] - 1
+    plane = prod(next_fast_size(n + side) for n in image.shape[-2:])
+    samples = (work.blocks + work.pairs + work.layers) * grid.size**2 * 2 * log2(grid.size)
+    words = f"{grid.tile} px in {grid.size}, {work.pairs / work.blocks:.1f} layers"
+    return words, samples / (plane * log2(plane))
+
+
+def gradient_calls(image: Tensor, psi: Tensor, bank: Bank, compositing: str, methods: list[str]) -> dict:
+    """Return calls that make the gradient of an image."""
+
+    def step(method: str) -> None:
+        leaf = image.clone().requires_grad_()
+        render(leaf, psi, bank, compositing, layers="nearest", method=method).sum().backward()
+
+    return {f"image gradient, {method}": lambda m=method: step(m) for method in methods}
+
+
+def measure(window: int) -> None:
+    """Print the rows of one window."""
+    image, psi = load_scene("aloe")
+    bank = make_bank(LAYERS, window)
+    scene = layered_scene(image, psi, bank.defocus, bank.psfs, layers="nearest")
+    print(explain(scene), file=sys.stderr)
+    methods = ["auto", "tiled", "dense", *(["direct"] if window <= LARGEST_DIRECT else [])]
+    calls: dict[str, Callable[[], object]] = {"round trip": lambda: round_trip(image, psi, bank)}
+    for method in methods:
+        calls[f"gather, {method}"] = lambda m=method: render(image, psi, bank, layers="nearest", method=m)
+    for method in ("auto", "tiled", "dense"):
+        calls[f"scatter, {method}"] = lambda m=method: render(image, psi, bank, "scatter", layers="nearest", method=m)
+    calls |= gradient_calls(image, psi, bank, "gather", ["auto"])
+    times = least_seconds(calls)
+    words, transforms = tile_transforms(image, psi, bank)
+    unit = times.pop("round trip")
+    for name, seconds in times.items():
+        bound = f"{transforms:.1f} ({words})" if name == "gather, tiled" else ""
+        print(f"| {window} | {name} | {1e3 * seconds:.0f} | {seconds / unit:.2f} | {bound} |", flush=True)
+
+
+def main(windows: list[int]) -> None:
+    torch.set_num_threads(1)
+    print("| window | call | ms | round trips | tiles |\n|---|---|---|---|---|")
+    for window in windows:
+        measure(window)
+
+
+if __name__ == "__main__":
+    main([int(word) for word in sys.argv[1:]] or list(WINDOWS))
