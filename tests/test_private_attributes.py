@@ -67,7 +67,8 @@ def foreign_writes(source: str) -> list[str]:
     """Line, object and attribute of each write to a private attribute of another object."""
     tree, found = ast.parse(source), set()
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    own = {id(part): own_objects(function) for function in functions for part in ast.walk(function)}
+    names = [(function, own_objects(function)) for function in functions]
+    own = {id(part): own_names for function, own_names in names for part in ast.walk(function)}
     for node in ast.walk(tree):
         for owner, name in written_to(node):
             text = ast.unparse(owner)

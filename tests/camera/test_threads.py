@@ -146,14 +146,14 @@ class TestThreads(BaseTester):
         assert [wrong_captures(5000, show) for show in WAYS.values()] == [0, 0, 0, 0]
 
     def test_feature_psfs_are_computed_once_for_all_threads(self, monkeypatch):
-        built, real = [], module.exact_psf_bank
+        built, real = [], module.computed_psf_bank
 
         def spy(*arguments, **options):
             built.append((arguments[3], arguments[0].dtype, arguments[5]))
             return real(*arguments, **options)
 
         optics = camera()
-        monkeypatch.setattr(module, "exact_psf_bank", spy)
+        monkeypatch.setattr(module, "computed_psf_bank", spy)
         in_threads(lambda i: [optics(*SAMPLES[(i + j) % 4]) for j in range(8)])
         nodes = [(kind, dtype, psi) for kind, dtype, several in built for psi in several]
         assert len(nodes) == len(set(nodes))
@@ -163,7 +163,7 @@ class TestThreads(BaseTester):
         optics = camera()
         for sample in SAMPLES:
             optics(*sample)
-        monkeypatch.setattr(module, "exact_psf_bank", lambda *_: pytest.fail("a PSF was computed again"))
+        monkeypatch.setattr(module, "computed_psf_bank", lambda *_: pytest.fail("a PSF was computed again"))
         for sample in SAMPLES:
             optics(*sample)
 
