@@ -15,6 +15,8 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
+from types import CellType, FunctionType, MethodType
 from typing import Any, Self
 
 import torch
@@ -23,6 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter, tree_map_only
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.runtime.precision import WITHOUT_FLOAT64
 
 # Operators that give another view of the same memory and launch nothing, besides those that the schema tells of.
@@ -157,7 +160,8 @@ class SimulatedDevice(TorchDispatchMode):
 
     def __exit__(self, *error: object) -> None:
         _active.pop()
-        WITHOUT_FLOAT64.discard(DEVICE.type)
+        if all(device.float64 for device in _active):  # it is entered again within itself
+            WITHOUT_FLOAT64.discard(DEVICE.type)
         super().__exit__(*error)
 
     def put(self, value: Any) -> Any:
@@ -262,3 +266,26 @@ def _copy(target: SimulatedTensor, source: Tensor, non_blocking: bool = False) -
 
 for _name, _kernel in (("empty_strided", _empty_strided), ("empty.memory_format", _empty), ("copy_", _copy)):
     _kernels.impl(_name, _kernel, "PrivateUse1")
+
+
+def moved(value: Any, device: SimulatedDevice) -> Any:
+    """Return a value with all tensors and modules in it on the device, also those that a function encloses."""
+    if isinstance(value, (Tensor, nn.Module)):
+        return device.put(value)
+    if isinstance(value, PSFBank):
+        return PSFBank(*(moved(part, device) for part in (value.psfs, value.defocus, value.energy, value.veil)))
+    if isinstance(value, dict):
+        return {name: moved(part, device) for name, part in value.items()}
+    if isinstance(value, (tuple, list)):
+        parts = [moved(part, device) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if isinstance(value, partial):
+        return partial(moved(value.func, device), *moved(value.args, device), **moved(value.keywords, device))
+    if isinstance(value, MethodType):
+        return MethodType(value.__func__, moved(value.__self__, device))
+    if isinstance(value, FunctionType) and value.__closure__:
+        cells = tuple(CellType(moved(cell.cell_contents, device)) for cell in value.__closure__)
+        function = FunctionType(value.__code__, value.__globals__, value.__name__, value.__defaults__, cells)
+        function.__kwdefaults__ = value.__kwdefaults__
+        return function
+    return value

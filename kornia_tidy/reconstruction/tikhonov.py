@@ -16,6 +16,7 @@ from kornia_tidy.checks import check_choice, check_float_tensor, check_positive
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.runtime.precision import widest
 
 BORDERS = ("smooth", "circular")
 
@@ -264,8 +265,8 @@ def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None =
 def _fourier_matrix(psfs: Tensor, side: int, count: int) -> Tensor:
     """Return the DFT matrix (count, P) of a line of ``side`` pixels, for P pixels centred on its first one."""
     points = torch.arange(psfs.shape[-1], device=psfs.device) - psfs.shape[-1] // 2
-    turns = torch.arange(count, device=psfs.device)[:, None] * points
-    phase = turns.double() * (-2 * math.pi / side)  # in float32 it would be inaccurate on wide planes
+    turns = (torch.arange(count, device=psfs.device)[:, None] * points).remainder(side)  # exact on wide planes
+    phase = turns.to(widest(psfs.device)) * (-2 * math.pi / side)
     return torch.polar(torch.ones_like(phase), phase).to(torch.promote_types(psfs.dtype, torch.complex64))
 
 

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from kornia_tidy.runtime.precision import widest
+
 # Expected electrons from which a Gaussian replaces the Poisson distribution. Its mean and variance are exact; its skew
 # is not. Rounded to whole electrons, it differs by 0.025 in total variation at this count (0.040 at 10, 0.018 at 50).
 # It is below zero, where it is clamped, with probability 3e-7 (8e-4 at 10), which biases the mean by 3e-7 electrons.
@@ -96,8 +98,7 @@ def poisson_quantile(rate: Tensor, uniform: Tensor) -> Tensor:
 
 def _dim_counts(rate: Tensor, uniform: Tensor) -> Tensor:
     """Return Poisson counts where ``rate`` is below ``GAUSSIAN_FROM``, zero elsewhere."""
-    # float32 sums change the count of one pixel in 3e5, so devices would disagree. Apple's GPUs have no float64.
-    wide = torch.float32 if rate.device.type == "mps" else torch.float64
+    wide = widest(rate.device)  # float32 sums change the count of one pixel in 3e5, so devices would disagree
     dim = rate < GAUSSIAN_FROM
     if _recording(rate):
         every = poisson_quantile(torch.where(dim, rate, 0).to(wide), uniform.to(wide))

@@ -1,0 +1,104 @@
+"""Every public operation, head and loss on a simulated accelerator: the values and gradients of the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from kornia_tidy.reconstruction import (
+    JointHead,
+    Refocused,
+    Residual,
+    losses,
+    metrics,
+)
+from kornia_tidy.reconstruction.nafnet import NAFNet
+from tests.base import BaseTester
+from tests.operations import OPERATIONS, bank_for
+from tests.reconstruction import test_closed_form_head, test_head, test_joint_closed_form, test_layered_joint
+from tests.simulated_device import DEVICE, SimulatedDevice, moved
+from tests.test_kinds import argument, bound
+
+# Sums of 1e4 products in float32 at most, and gradients of theirs; see tests/test_accelerators.py.
+ROUNDING, OF_GRADIENTS = 1e-5, 1e-4
+EPSILON = {"occlusion": 1e-2}  # in float32 its divisors have a larger one: see tests/test_accelerators.py
+precisions = pytest.mark.parametrize("float64", [True, False], ids=["float64", "no_float64"])
+
+
+def learnt(call: Callable[[Tensor], Any], given: Tensor) -> list[Tensor]:
+    """Return all tensors that a call returns, and the gradient of its argument."""
+    found = call(given)
+    outputs = [found] if isinstance(found, Tensor) else list(found)
+    light = sum(x.square().sum() for x in outputs)
+    gradients = torch.autograd.grad(light, given) if light.requires_grad else ()
+    return [*outputs, *gradients]
+
+
+def refocused() -> Refocused:
+    head = Refocused(NAFNet(3 + 3, 3, width=2), layers=3)
+    head.set_psfs(bank_for(torch.rand(1, 3, 4, 4)))
+    return head.eval()
+
+
+def scored(loss: Callable[..., Tensor]) -> Callable[[Tensor], Tensor]:
+    target = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(5))
+    return lambda x: loss(x, target)
+
+
+def joint_scored() -> Callable[[Tensor], Tensor]:
+    loss, target = losses.JointLoss(), torch.rand(2, 4, 16, 16, generator=torch.Generator().manual_seed(5))
+    return lambda x: loss(x[:, :1], x, target[:, :1], target[:, 1:])
+
+
+HEADS: dict[str, Callable[[], Callable[[Tensor], Any]]] = {
+    **{name: partial(test_head.trained, name) for name in test_head.HEADS},
+    "closed form": lambda: test_closed_form_head.head_of(None),
+    "closed form and network": lambda: test_closed_form_head.head_of(
+        test_closed_form_head.small(layers=4), 4, trained=True
+    ),
+    "joint": lambda: JointHead(test_joint_closed_form.joint(trained=True)),
+    "layers and joint": lambda: JointHead(test_layered_joint.stirred()),
+    "residual": lambda: Residual(NAFNet(width=2)).eval(),
+    "refocused": refocused,
+    **{name: partial(scored, getattr(losses, name)) for name in ("mse_loss", "l1_loss", "rmse_loss", "gradient_loss")},
+    "JointLoss": joint_scored,
+    "psnr": lambda: scored(metrics.psnr),
+    "ssim": lambda: scored(metrics.ssim),
+}
+
+
+class OnDevice(BaseTester):
+    def assert_agrees(self, call: Callable[[Tensor], Any], given: Tensor, float64: bool, least: float = 0) -> None:
+        expected = learnt(call, given.clone().requires_grad_())
+        with SimulatedDevice(float64=float64) as device:
+            found = learnt(moved(call, device), device.put(given.clone().requires_grad_()))
+        assert len(found) == len(expected)
+        for number, (one, other) in enumerate(zip(found, expected, strict=True)):
+            assert one.device.type == DEVICE.type
+            rounding = OF_GRADIENTS if number == len(expected) - 1 else ROUNDING
+            atol = max(rounding, least) * max(1e-30, float(other.detach().abs().max()))
+            self.assert_close(one.on_cpu.detach(), other.detach(), rtol=0, atol=atol)
+
+
+@precisions
+class TestOperations(OnDevice):
+    @pytest.mark.parametrize("name", OPERATIONS)
+    def test_feature_agrees_with_the_cpu(self, name, float64):
+        given = argument(OPERATIONS[name])
+        least = 0 if float64 else EPSILON.get(name, 0)
+        self.assert_agrees(bound(OPERATIONS[name], given), given, float64, least)
+
+
+@precisions
+class TestHeadsAndLosses(OnDevice):
+    @pytest.mark.parametrize("name", HEADS)
+    def test_feature_agrees_with_the_cpu(self, name, float64):
+        generator = torch.Generator().manual_seed(0)
+        call = HEADS[name]()
+        given = torch.rand(2, 3, 16, 16, generator=generator)
+        self.assert_agrees(call, given, float64)
