@@ -74,13 +74,18 @@ def read_arguments(program: str, arguments: list[str]) -> None:
         raise ValueError(f"{program} is not known here")
 
 
+def outside() -> dict[str, str]:
+    """Return the environment without what make and pytest tell those that they call."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS", "PYTEST_"))}
+
+
 def recipe(arguments: list[str]) -> list[list[str]]:
     """Return the commands that make would run for targets, without those that set up the environment."""
     if shutil.which("make") is None:
         pytest.skip("make is not installed")
     old = [f"--old-file=.venv/{stamp}" for stamp in (".ready", ".docs-ready")]
     done = subprocess.run(
-        ["make", "--dry-run", *old, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+        ["make", "--dry-run", *old, *arguments], cwd=ROOT, env=outside(), capture_output=True, text=True, check=False
     )
     if done.returncode:
         raise ValueError(done.stderr.strip().splitlines()[-1])
@@ -172,7 +177,7 @@ def run_in_checkout(words: list[str], folder: Path, place: str) -> str:
         words = [*words, *FEW_TESTS.split()]
     if "pip" in words:
         words = [*words, "--dry-run", "--no-deps", "--quiet"]
-    environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+    environment = {**outside(), "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         words, cwd=folder, env=environment, capture_output=True, text=True, timeout=LONGEST, check=False
     )
