@@ -60,6 +60,24 @@ def check_arguments(words: list[str], place: str) -> None:
         raise AssertionError(f"{place}: {' '.join(str(error).split())}") from error
 
 
+def check_command(words: list[str], place: str) -> None:
+    """Check that a target of make or a module is there, and let the module read its arguments if it has any."""
+    if words[0] == "make":
+        recipe(words[1:])
+    elif len(words) > 3:
+        check_arguments(words, place)
+    else:
+        assert find_module(words[2]), f"{place}: there is no {words[2]}"
+
+
+def find_module(name: str) -> bool:
+    """Return whether a module is there."""
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
 def read_arguments(program: str, arguments: list[str]) -> None:
     """Let a program read its arguments, and stop it there."""
     if program == "kornia-tidy":

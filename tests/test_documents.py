@@ -4,8 +4,8 @@ The blocks of a page are run in their order, in a folder of their own that holds
 share one namespace. Shell lines are commands of `kornia-tidy`, given to its entry point, or of a checkout. A ```text
 block tells what the block before it prints; ... in it stands for anything. Options of <!-- run with: OPTIONS --> are
 appended to the commands of the block, to make them shorter. A block after <!-- slow: reason --> is run with --runslow;
-without, its names are imported and its commands read their arguments. A block after <!-- arguments only: reason -->
-does no more than that; there is one, of benchmarks.
+without, its names are imported and its commands read their arguments. So do commands of make and of Python's modules
+that stand in a sentence or a table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
 from tests.data.published import write_each
 from tests.inference.test_baselines import tiny
-from tests.page_commands import check_arguments, make_checkout, run_in_checkout
+from tests.page_commands import check_arguments, check_command, make_checkout, run_in_checkout
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -48,12 +48,12 @@ PUBLISHED_NETWORKS = {
     "zoedepth": "Intel/zoedepth-nyu",
 }  # made small in the folder, so that nothing is downloaded
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
-ARGUMENTS_ONLY = ["docs/benchmarks.md"]  # pages with a block that is never run: it takes hours
 SLOW: set[str] = {"docs/guides/raw_files.md"}  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-MARKS = re.compile(r"(?:<!-- (?:arguments only|needs|slow|run with): (?:(?!-->).)+ -->\n)+\Z", re.DOTALL)
+MARKS = re.compile(r"(?:<!-- (?:needs|slow|run with): (?:(?!-->).)+ -->\n)+\Z", re.DOTALL)
 MARK = re.compile(r"<!-- ([\w ]+): ((?:(?!-->).)+) -->", re.DOTALL)
+COMMAND = re.compile(r"`((?:python -m tests\.|make )[^`]+)`")
 LINK = re.compile(r"\]\(([^)\s]*?)(?:#([^)\s]*))?\)")
 
 
@@ -64,7 +64,6 @@ class Block(NamedTuple):
     line: int
     language: str
     text: str
-    reason: str  # why only its arguments are read, or nothing
     needs: str = ""  # package without which it is only compiled
     slow: bool = False  # run with --runslow alone
     options: str = ""  # appended to its commands where it is run
@@ -87,7 +86,6 @@ def blocks(name: str, text: str) -> list[Block]:
                 line=before.count("\n") + 1,
                 language=fence[1],
                 text=fence[2],
-                reason=said.get("arguments only", ""),
                 needs=said.get("needs", ""),
                 slow="slow" in said,
                 options=said.get("run with", ""),
@@ -111,12 +109,12 @@ def run_page(name: str, text: str, *, slow: bool = False) -> None:
             compile(block.text, str(ROOT / name), "exec")
             printed = None
         elif block.language == "text":
-            if not block.reason and printed is not None:
+            if printed is not None:
                 same = doctest.OutputChecker().check_output(
                     block.text, printed, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
                 )
                 assert same, f"{block.place} shows\n{block.text}but printed is\n{printed}"
-        elif block.language in RUN and not block.reason and (slow or not block.slow):
+        elif block.language in RUN and (slow or not block.slow):
             if block.needs in ("torchvision", "deepinv"):
                 need_torchvision()
             out = io.StringIO()
@@ -190,7 +188,7 @@ class TestEveryPage(BaseTester):
     def test_feature_what_is_seldom_run_names_what_is_there(self, name):
         for block in blocks(name, (ROOT / name).read_text(encoding="utf-8")):
             missing = block.needs and importlib.util.find_spec(block.needs) is None
-            seldom = block.reason or block.slow or missing
+            seldom = block.slow or missing
             if seldom and block.language == "python":
                 try:
                     check_names(block)
@@ -217,9 +215,11 @@ class TestEveryPage(BaseTester):
                 gone.append(f"{file}#{anchor}")
         assert gone == []
 
-    def test_feature_nearly_all_blocks_are_run(self):
-        found = [b for name in NAMES for b in blocks(name, (ROOT / name).read_text(encoding="utf-8")) if b.reason]
-        assert [block.page for block in found] == ARGUMENTS_ONLY
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_commands_in_sentences_are_there(self, name):
+        """They read their arguments if they have any; how they are told to start is enough of the others."""
+        for line in COMMAND.findall(FENCE.sub("", (ROOT / name).read_text(encoding="utf-8"))):
+            check_command(shlex.split(line), name)
 
     def test_feature_the_picture_of_the_readme_is_drawn(self, tmp_path):
         script = ROOT / "docs" / "make_picture.py"
@@ -274,14 +274,6 @@ class TestRunPage(BaseTester):
         with pytest.raises(SyntaxError):
             run_page("p.md", block.format("gone", ")"))
 
-    def test_feature_a_marked_block_is_not_run_and_the_next_one_is(self, folder):
-        mark = "<!-- arguments only: {} -->"
-        text = page(mark.format("why"), "```python", "1 / 0", "```", "", mark.format("that"), "```text", "```")
-        run_page("p.md", text)
-        assert [block.reason for block in blocks("p.md", text)] == ["why", "that"]
-        with pytest.raises(ZeroDivisionError):
-            run_page("p.md", page(text, "```python", "1 / 0", "```"))
-
     def test_feature_a_slow_block_is_run_on_request(self, folder):
         text = page("<!-- slow: it takes long -->", "```python", "1 / 0", "```")
         run_page("p.md", text)
@@ -315,7 +307,19 @@ class TestRunPage(BaseTester):
         ],
     )
     def test_exception_what_is_seldom_run_and_not_there(self, language, line, match, capsys):
-        (block,) = blocks("p.md", page("<!-- arguments only: why -->", f"```{language}", line, "```"))
-        assert block.reason == "why"
+        (block,) = blocks("p.md", page("<!-- slow: why -->", f"```{language}", line, "```"))
         with pytest.raises(AssertionError, match=match):
             check_names(block) if language == "python" else check_arguments(shell_lines(block)[0], block.place)
+
+    @pytest.mark.parametrize(
+        ("line", "match"),
+        [
+            ("make gone", "No rule to make target .gone."),
+            ("python -m tests.benchmarks.gone", r"p\.md: there is no tests\.benchmarks\.gone"),
+            ("python -m tests.portable --gone 1", r"p\.md: python refuses"),
+        ],
+    )
+    def test_exception_a_command_in_a_sentence_that_is_not_there(self, line, match, capsys):
+        (found,) = COMMAND.findall(f"It is measured by `{line}`.")
+        with pytest.raises((AssertionError, ValueError), match=match):
+            check_command(shlex.split(found), "p.md")
