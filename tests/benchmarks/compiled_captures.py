@@ -38,6 +38,7 @@ def main() -> None:
         optics = TiDyOptics(sensor=None, compositing=compositing)
         scene = [x[..., :side, :side].contiguous() for x in (image, depth_of(psi, optics))]
         for what, call in CALLS.items():
+            torch.compiler.reset()  # there is a limit to graphs of the same code
             compiled = torch.compile(optics, fullgraph=True)
             off = difference(call, compiled, optics, scene)
             ways = {"eager": partial(call, optics, *scene), "compiled": partial(call, compiled, *scene)}
