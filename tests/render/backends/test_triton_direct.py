@@ -82,7 +82,7 @@ class TestTritonBackend(RenderTester):
         bank = make_bank(3, 1, 3, device=device)
         bank.psfs[0, 0, 0, 0] = -0.1
         image, defocus = make_scene(bank, 1, 5, 7)
-        with pytest.raises(ValueError, match=r"PSFs without negative values, got one with -1\.0e-01"):
+        with pytest.raises(ValueError, match=r"PSFs without negative values here, got one with -1\.0e-01"):
             render_by("triton", image, defocus, bank, "occlusion")
 
     def test_dynamo_is_one_operator_of_a_whole_graph(self, device):
