@@ -93,8 +93,9 @@ def read_arguments(program: str, arguments: list[str]) -> None:
 
 
 def outside() -> dict[str, str]:
-    """Return the environment without what make and pytest tell those that they call."""
-    return {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS", "PYTEST_"))}
+    """Return the environment without what make (its variables ``ARGS``, too) and pytest tell those that they call."""
+    told = ("MAKE", "MFLAGS", "ARGS", "PYTEST_")
+    return {name: value for name, value in os.environ.items() if not name.startswith(told)}
 
 
 def recipe(arguments: list[str]) -> list[list[str]]:

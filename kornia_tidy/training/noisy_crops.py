@@ -193,7 +193,10 @@ def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, floa
         electrons: least and largest full well of sensors with shot noise.
 
     Example:
-        >>> 0.001 <= random_sensor((0.001, 0.03)).sigma <= 0.03
+        >>> sensors = [random_sensor((0.001, 0.03), electrons=(1e3, 1e4)) for _ in range(100)]
+        >>> {sensor.full_well is None for sensor in sensors} == {True, False}
+        True
+        >>> all(0.001 <= sensor.sigma <= 0.03 for sensor in sensors if sensor.full_well is None)
         True
     """
     with_shot, place = torch.rand(2).tolist()
