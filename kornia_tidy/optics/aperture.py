@@ -210,7 +210,7 @@ def _disc_area_up_to(lines: Tensor, radius: float) -> Tensor:
     (x sqrt(r² - x²) + y sqrt(r² - y²) + r² (asin(x/r) + asin(y/r) - π/2)) / 2.
     """
     distance = lines.abs().clamp(max=radius)
-    half_sector = distance * (radius**2 - distance**2).sqrt() + radius**2 * (distance / radius).asin()
+    half_sector = distance * ((radius - distance) * (radius + distance)).sqrt() + radius**2 * (distance / radius).asin()
     curved = (half_sector[:, None] + half_sector - radius**2 * math.pi / 2) / 2
     straight = distance[:, None] * distance
     inside = torch.hypot(distance[:, None], distance) <= radius
