@@ -28,7 +28,11 @@ NOISE, EXPONENT, EXPONENT_BEFORE_BILATERAL = 2e-3, 1.3, 0.87
 WINDOW, SPACE = 7, 2.0  # of the bilateral filter, pixels
 COLOR, COLOR_EXPONENT = 0.2, 0.5  # difference of encoded colours
 LEAST_NOISE = 1e-5  # of full scale; its logarithm is finite
-LAYER_WEIGHT = 1e-2  # of the deconvolution for one depth
+LAYER_WEIGHT = 1e-2  # of the deconvolution for one depth, as an input of a network
+# Blended by the likelihood of depth, the best weight rises from 0.003 to 0.03 with a noise of 0.002 to 0.03; what one
+# weight costs is small, as the bilateral filter follows.
+BLEND_WEIGHT = 5e-3
+BLEND_SHARPNESS = 0.5  # best temperature of the likelihood at a noise of 0.002; it rises in proportion to the noise
 NODES = 11  # depths over which PSFs are averaged
 LIKELIHOOD_WINDOW = 65  # pixels of a PSF that the likelihood of its depth takes; the filters are three times as wide
 SHARPNESS = 4.0  # temperature of the likelihood in closed form, which takes patches for uniform in depth; RMSE is least
@@ -67,14 +71,20 @@ class ClosedForm(nn.Module):
     without the filter the weight rises with an exponent of 1.3. Estimates of four fixed weights from 0.003 to 0.095 are
     interpolated linearly in :math:`\log \gamma`, in linear light. The bilateral filter works on the encoded image.
 
+    With ``likelihood`` the image is blended from deconvolutions for D depths instead, by the likelihood l of each:
+
+    .. math:: \hat x = \sum_k p_k \, (k_k * y), \quad p \propto e^{l / T}, \quad T = 0.5 \max(\sigma / 0.002, 1)
+
     Args:
         layers: number D of depths for each of which the brightness is deconvolved too, with a weight of 0.01 and the
             mean PSF of the colours, as further inputs of a network: where PSFs differ between depths, the map of its
             own depth restores a region best.
         bilateral: False leaves out the bilateral filter.
         encoded: captures are encoded as sRGB. False: they are linear light.
-        likelihood: give the logarithm of the likelihood of each of the ``layers`` as further inputs too, see
-            :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`, as 1 + its quarter / 12, at least 0.
+        likelihood: blend the image by the likelihood of each of the ``layers``, see
+            :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`, and give its logarithm as further
+            inputs of a network, as 1 + its quarter / 12, at least 0. The brightness for a depth is then that of the
+            image for this depth, of weight 0.005.
 
     Shape:
         - capture: (B, 3, H, W) in [0, 1].
@@ -154,7 +164,9 @@ class ClosedForm(nn.Module):
         """Compute the kernels from PSFs, (layers or 1, 3, P, P)."""
         wide = psfs.to(torch.promote_types(psfs.dtype, torch.float32))
         self.kernels = tikhonov_kernels(wide.mean(0), WEIGHTS)
-        if self.layers:
+        if self.likelihood:
+            self.filters = tikhonov_kernels(wide.flatten(0, 1), (BLEND_WEIGHT,)).unflatten(1, (-1, 3))[0]
+        elif self.layers:
             self.filters = tikhonov_kernels(wide.mean(1), (LAYER_WEIGHT,)).transpose(0, 1)
         if self.likelihood:
             beyond = max(0, wide.shape[-1] - LIKELIHOOD_WINDOW) // 2
@@ -199,20 +211,27 @@ class ClosedForm(nn.Module):
         light = self._without_stray_light(self._light(capture))
         estimates = convolve_kernels(light, self.kernels.to(light.dtype))
         level = noise.clamp(min=LEAST_NOISE).log10()
-        exponent = EXPONENT_BEFORE_BILATERAL if self.bilateral else EXPONENT
-        image = self._encode(_at_noise(estimates, level, exponent))
-        if self.bilateral:
-            above = (level.mean(1, keepdim=True) - math.log10(NOISE)).clamp(min=0)  # ringing is left without noise
-            image = bilateral_filter(image, COLOR * 10 ** (COLOR_EXPONENT * above), WINDOW, SPACE)
-        maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True)]
-        if self.layers:
-            brightness = light.mean(1, keepdim=True)
-            by_depth = convolve_kernels(brightness, self.filters.to(light.dtype))
-            maps.append(self._encode(by_depth.expand(-1, -1, 3, -1, -1))[:, :, 0])
+        above = (level.mean(1, keepdim=True) - math.log10(NOISE)).clamp(min=0)  # ringing is left without noise
+        brightness = light.mean(1, keepdim=True)
+        by_depth = []
         if self.likelihood:
             fits = depth_likelihood(brightness, self.whitening.to(light.dtype), self.log_determinants.to(light.dtype))
-            maps.append(1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST)
+            deconvolved = convolve_kernels(light, self.filters.to(light.dtype))
+            shares = (fits / (BLEND_SHARPNESS * 10**above)).softmax(1)
+            image = self._encode((shares.unsqueeze(2) * deconvolved).sum(1))
+            by_depth = [self._brightness(deconvolved.mean(2)), 1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST]
+        else:
+            image = self._encode(_at_noise(estimates, level, EXPONENT_BEFORE_BILATERAL if self.bilateral else EXPONENT))
+            if self.layers:
+                by_depth = [self._brightness(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
+        if self.bilateral:
+            image = bilateral_filter(image, COLOR * 10 ** (COLOR_EXPONENT * above), WINDOW, SPACE)
+        maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
         return Restoration(image, torch.cat(maps, 1))
+
+    def _brightness(self, light: Tensor) -> Tensor:
+        """Encode one map for each depth, (B, D, H, W)."""
+        return self._encode(light.unsqueeze(2).expand(-1, -1, 3, -1, -1))[:, :, 0]
 
     def _light(self, colors: Tensor) -> Tensor:
         return rgb_to_linear_rgb(colors) if self.encoded else colors

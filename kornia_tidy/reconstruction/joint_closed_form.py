@@ -17,8 +17,9 @@ class JointClosedFormHead(ClosedFormHead):
     r"""Estimates image and distribution of depth by one network that refines the closed forms of both.
 
     The network takes what :class:`ClosedFormHead` gives it, and the likelihood of each of L depths. Its last three maps
-    are added to the restored image, all others to the logarithm of the likelihood, interpolated to D classes of depth.
-    The last convolution is initialised with zeros: before training both are the closed forms.
+    are added to the restored image, which is deconvolved for each depth and blended by this likelihood; all others to
+    the logarithm of the likelihood, interpolated to D classes of depth. The last convolution is initialised with zeros:
+    before training both are the closed forms.
 
     Args:
         network: takes :func:`~kornia_tidy.reconstruction.closed_form.closed_form_channels` maps with the likelihood,
@@ -87,23 +88,23 @@ class JointClosedFormHead(ClosedFormHead):
 
 
 def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) -> dict[str, Tensor]:
-    """Return the weights of a network for the image as those of a network for image and depth, which begins as it does.
+    """Return the weights of a network for the image as those of a network for image and depth that begins from them.
 
-    The image stays what it was, up to the number of depths, over which the weights of the first convolution are
-    interpolated. The likelihood has zero weights in the first convolution and the classes have them in the last.
+    Over the depths, whose number may differ, the weights of the first convolution are interpolated, and those of the
+    likelihood are zero. The last convolution is that of ``head``, as the image was added to another closed form.
 
     Args:
         weights: state of a :class:`ClosedFormHead` whose network has the kind and width of that in ``head``.
-        head: whose PSFs, noise and temperature are taken; it is not changed.
+        head: whose PSFs, noise, temperature and last convolution are taken; it is not changed.
 
     Returns:
         A state for ``head``; weights of another kind of network stay as they are.
     """
     assert head.network is not None
     convolutions = [name for name, part in head.named_modules() if isinstance(part, nn.Conv2d)]
-    first, last = f"{convolutions[0]}.weight", f"{convolutions[-1]}.weight"
+    first, last = f"{convolutions[0]}.weight", convolutions[-1]
     found, own = dict(weights), head.state_dict()
-    found |= {name: own[name] for name in own if name.startswith("closed_form.") or name == "temperature"}
+    found |= {name: own[name] for name in own if name.startswith(("closed_form.", f"{last}.")) or name == "temperature"}
     common, layers = closed_form_channels(), head.closed_form.layers
     if first in weights and weights[first].shape[1] >= common:
         shared, by_depth = weights[first][:, :common], weights[first][:, common:]
@@ -111,8 +112,4 @@ def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) 
         given = by_depth.shape[1]
         stretched = interpolated_classes(by_depth, layers) * given / layers if given else zeros
         found[first] = torch.cat([shared, stretched, zeros], 1)
-    for name in (last, last.removesuffix("weight") + "bias"):
-        if name in weights and len(weights[name]) == 3:
-            classes = weights[name].new_zeros(head.out_channels - 3, *weights[name].shape[1:])
-            found[name] = torch.cat([classes, weights[name]])
     return found

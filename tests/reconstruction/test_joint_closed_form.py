@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from kornia.color import rgb_to_linear_rgb
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch.nn import functional
 
 from kornia_tidy.inference.heads import PlainHead
@@ -22,10 +22,12 @@ from kornia_tidy.reconstruction import (
     receptive_field,
     reconstruct_tiled,
 )
-from kornia_tidy.reconstruction.closed_form import LEAST, LIKELIHOOD_WINDOW, SHARPNESS, ClosedForm
+from kornia_tidy.reconstruction.closed_form import BLEND_WEIGHT, LEAST, LIKELIHOOD_WINDOW, SHARPNESS, ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.joint_closed_form import widened_for_depth
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo
@@ -66,6 +68,19 @@ class TestJointClosedFormHead(BaseTester):
         expected = (fits / SHARPNESS).clamp(min=LEAST)
         self.assert_close(head.closed_form(capture).maps[:, -LAYERS:], 1 - expected / LEAST)
         self.assert_close(head(capture)[:, :CLASSES:2], expected)
+
+    def test_feature_blends_the_depths_by_their_likelihood(self):
+        """Each is a deconvolution with its own PSF; the noisier the capture, the wider the likelihood."""
+        restore, capture = ClosedForm(LAYERS, bilateral=False, likelihood=True), photo(32, 48)
+        restore.set_psfs(bank(LAYERS))
+        light = rgb_to_linear_rgb(capture)
+        fits = depth_likelihood(light.mean(1, keepdim=True), *likelihood_filters(bank(LAYERS).psfs.mean(1)))
+        kernels = torch.cat([tikhonov_kernels(psf, (BLEND_WEIGHT,)) for psf in bank(LAYERS).psfs])
+        single = convolve_kernels(light, kernels)
+        for noise, temperature in ((1e-4, 0.5), (2e-3, 0.5), (2e-2, 5.0)):
+            blended = ((fits / temperature).softmax(1).unsqueeze(2) * single).sum(1)
+            expected = linear_rgb_to_rgb(blended.clamp(0, 1))
+            self.assert_close(restore(capture, noise).image, expected, atol=1e-9, rtol=0)
 
     def test_feature_finds_on_which_side_of_an_edge_a_texture_is_near(self):
         _, depth, capture = scene()
@@ -142,14 +157,14 @@ class TestJointClosedFormHead(BaseTester):
         assert head.out_channels == 5 + 3
 
     def test_feature_tiles_are_the_whole(self):
-        head = JointHead(joint(trained=True)).eval()
+        head = JointHead(joint(trained=True, dtype=torch.float64)).eval()
         margin = receptive_field(head)
-        image = photo(40, 2 * margin + 80, dtype=torch.float32)[:1]
+        image = photo(40, 2 * margin + 80)[:1]
         with torch.no_grad():
             whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 2 * margin + 32))
         assert isinstance(tiled, UncertainJointEstimate)
         for part, expected in zip(tiled, whole, strict=True):
-            self.assert_close(part, expected, atol=1e-4, rtol=0)
+            self.assert_close(part, expected, atol=1e-9, rtol=0)
 
     @pytest.mark.slow
     def test_feature_onnx(self):
@@ -169,15 +184,20 @@ class TestJointClosedFormHead(BaseTester):
     @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
     @pytest.mark.parametrize("layers", [0, LAYERS])
     def test_feature_begins_as_a_network_for_the_image(self, kind, layers):
-        """With as many depths it makes the same image; its depth is the closed form's."""
+        """With as many depths it sees the same in its first convolution; image and depth are the closed forms'."""
         image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
-        image.closed_form.set_psfs(bank(LAYERS, dtype=torch.float32))
         for parameter in image.parameters():
             torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
         head, capture = joint(kind=kind), photo(16, 16, dtype=torch.float32)
         head.load_state_dict(widened_for_depth(image.state_dict(), head))
+        (_, begun), (_, trained) = (
+            next(iter(head.network.named_parameters())),
+            next(iter(image.network.named_parameters())),
+        )
+        self.assert_close(begun[:, : trained.shape[1]], trained)
+        assert not begun[:, trained.shape[1] :].any()
         with torch.no_grad():
-            self.assert_close(head(capture, 0.01)[:, -3:], image(capture, 0.01), atol=1e-5, rtol=1e-5)
+            self.assert_close(head(capture, 0.01)[:, -3:], head.closed_form(capture, 0.01).image)
             self.assert_close(head(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
 
     def test_exception(self):
