@@ -1,4 +1,4 @@
-"""Every public operation, head and loss on a simulated accelerator: the values and gradients of the CPU."""
+"""Every public operation, head, loss and data set on a simulated accelerator: values and gradients of the CPU."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.utils.data import DataLoader
 
+from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.coded_datasets import CodedCaptures, render_scenes
+from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.reconstruction import (
     JointHead,
     Refocused,
@@ -102,3 +106,55 @@ class TestHeadsAndLosses(OnDevice):
         call = HEADS[name]()
         given = torch.rand(2, 3, 16, 16, generator=generator)
         self.assert_agrees(call, given, float64)
+
+
+@precisions
+class TestDataSets(BaseTester):
+    """Data sets hold their items on the CPU; a camera on an accelerator takes their pictures there."""
+
+    def test_feature_a_transform_moves_items_there_and_back(self, float64):
+        transform = partial(self.camera(SensorNoise(0.01)).as_transform, seed=3)
+        items = [{**self.scenes()[0], "index": 0}, (torch.full((3, 32, 32), 0.5), torch.ones(1, 32, 32))]
+        whole = {**items[0], "image": (items[0]["image"] * 255).to(torch.uint8)}
+        for item in (items[0], whole):
+            expected = transform()(item)
+            with SimulatedDevice(float64=float64) as device:
+                found = device.put(self.camera(SensorNoise(0.01))).as_transform(seed=3)(item)
+                assert device.uploads
+            assert found.keys() == expected.keys()
+            for name, value in expected.items():
+                if isinstance(value, Tensor):
+                    assert found[name].device.type == "cpu"
+                    atol = 1 if value.dtype == torch.uint8 else ROUNDING
+                    self.assert_close(found[name].double(), value.double(), rtol=0, atol=atol if name == "image" else 0)
+        with SimulatedDevice(float64=float64) as device:
+            coded, depth = device.put(self.camera()).as_transform()(items[1])
+        self.assert_close(coded, self.camera()(*items[1]), rtol=0, atol=ROUNDING)
+        assert depth is items[1][1]
+
+    def test_feature_a_data_set_is_rendered(self, float64, tmp_path):
+        render_scenes(self.camera(SensorNoise(0.01)), self.scenes(), tmp_path / "cpu", seed=5)
+        with SimulatedDevice(float64=float64) as device:
+            render_scenes(device.put(self.camera(SensorNoise(0.01))), self.scenes(), tmp_path / "there", seed=5)
+            assert device.launches
+        for found, expected in zip(CodedCaptures(tmp_path / "there"), CodedCaptures(tmp_path / "cpu"), strict=True):
+            for name in ("image", "depth", "mask"):
+                assert torch.equal(found[name], expected[name])
+            self.assert_close(found["coded"], expected["coded"], rtol=0, atol=1 / 255 + ROUNDING)  # rounded to 8 bits
+
+    def test_feature_batches_of_a_loader(self, float64):
+        batch = next(iter(DataLoader(self.scenes(), batch_size=2)))
+        expected = self.camera()(batch)["image"]
+        with SimulatedDevice(float64=float64) as device:
+            there = {name: device.put(batch[name]) for name in ("image", "depth")}
+            found = device.put(self.camera())(there)["image"]
+            assert found.device.type == DEVICE.type
+        self.assert_close(found.on_cpu, expected, rtol=0, atol=ROUNDING)
+
+    @staticmethod
+    def camera(sensor: SensorNoise | None = None) -> TiDyOptics:
+        return TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(0)), sensor=sensor)
+
+    @staticmethod
+    def scenes() -> DeadLeaves:
+        return DeadLeaves(2, 32, 32, num_leaves=50)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from itertools import chain
 from typing import Any, cast
 
 import torch
@@ -35,6 +36,9 @@ class DatasetTransform:
         - The image is a tensor (C, H, W), an array (H, W, C) or (H, W), or a PIL image, of floating-point, 8-bit or
           16-bit numbers, see :func:`~kornia_tidy.camera.image_types.image_tensor`; the capture is of the same kind.
         - The depth is a tensor (1, H, W), an array (H, W) or a PIL image, and comes back as it was.
+
+    Convention:
+        A sample is moved to the camera's device, and its capture back to where the image was.
 
     Raises:
         KeyError: if a mapping has no such image or depth, or a seed is set and the sample has no such entry.
@@ -89,10 +93,13 @@ class DatasetTransform:
         else:
             return self.optics(sample, **options)  # raises
         metres = self.depth_scale == 1 and isinstance(depth, Tensor) and depth.is_floating_point()
-        if plain and metres and isinstance(image, Tensor) and image.is_floating_point():
+        device = next(chain(self.optics.parameters(), self.optics.buffers()), torch.empty(0)).device
+        ready = plain and metres and isinstance(image, Tensor) and image.is_floating_point()
+        if ready and image.device == depth.device == device:
             return self.optics(sample, **options)
         whole = image_tensor(image)
-        coded = self.optics(whole, depth_tensor(depth, self.depth_scale), **options)
+        coded = self.optics(whole.to(device), depth_tensor(depth, self.depth_scale).to(device), **options)
+        coded = coded.to(whole.device)
         margin = (whole.shape[-2] - coded.shape[-2]) // 2
         taken, warped = like_image(coded, image), cropped_image(depth, margin)
         if not named:
