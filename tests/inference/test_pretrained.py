@@ -68,6 +68,17 @@ class TestPretrained(BaseTester):
         assert again["state_dict"].keys() == weights.keys()
         assert all(torch.equal(again["state_dict"][key], value) for key, value in weights.items())
 
+    def test_feature_psfs_are_left_out_and_computed_from_the_masks(self, tmp_path):
+        system, state = load_pretrained("edof-5"), read_state(FOLDER / "edof-5.safetensors")
+        name = "average.network.closed_form.psfs"
+        state["state_dict"] = {**state["state_dict"], name: system.head.closed_form.psfs + 1.0}
+        write_state(tmp_path / "run.safetensors", state)
+        ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors")
+        assert read_state(tmp_path / "small.safetensors")["state_dict"][name].numel() == 0
+        again = load_trained(tmp_path / "small.safetensors").head.closed_form
+        assert torch.equal(again.psfs, system.head.closed_form.psfs)
+        assert torch.equal(again.kernels, system.head.closed_form.kernels)
+
     def test_feature_networks_are_shipped_in_half_precision_and_loaded_in_single(self, tmp_path):
         whole = load_trained(FOLDER / "edof-5.safetensors")
         ship(FOLDER / "edof-5.safetensors", tmp_path / "half.safetensors")

@@ -82,6 +82,8 @@ def pretrained_record(name: str) -> dict[str, Any]:
 def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, half: bool = True) -> None:
     """Write a checkpoint for shipping: without the state of the run, the network's weights in half precision.
 
+    PSFs of a closed form are left out: :func:`~kornia_tidy.inference.trained.load_trained` computes them from the masks.
+
     Args:
         checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
         path: of the new file.
@@ -99,4 +101,5 @@ def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, ha
     if half:
         parameters = load_trained(checkpoint).head.named_parameters()
         weights = halved(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
+    weights |= {name: value[..., :0, :0] for name, value in weights.items() if name.endswith("closed_form.psfs")}
     write_state(path, {**{key: state[key] for key in ("settings", "global_step")}, "state_dict": weights})
