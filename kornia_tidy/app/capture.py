@@ -217,6 +217,8 @@ def known_system(name: str, compositing: str, noise: float, mask_seed: int) -> t
     system = load_pretrained(name)
     system.optics.sensor = sensor
     system.optics.compositing = changed.get("compositing", system.optics.compositing)
+    with torch.no_grad():
+        update_psfs(system.head, system.optics)  # tells the network of the noise
     return system.optics, system
 
 

@@ -114,6 +114,7 @@ def capture(settings: Settings, has_depth: bool) -> str:
     lines = ["with torch.no_grad():"]
     lines.append(f"    capture = optics(image, depth, generator={_generator(settings.noise_seed)})")
     if settings.camera in PRETRAINED:
+        lines.append("    update_psfs(system.head, optics)  # tells the network of the noise")
         lines.append("    maps = split_maps(system.settings.task, system.head(capture[None]))")
         lines.append('    reconstruction = maps["image"][0].clamp(0, 1)')
     else:

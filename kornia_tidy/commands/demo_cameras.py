@@ -60,7 +60,8 @@ def shipped_cameras(electrons: float) -> dict[str, Camera]:
     """Return the shipped systems that are shown, for the light of a white pixel at the reference f-number.
 
     ``"coded"`` has the most masks of those for an image in focus everywhere, ``"joint"`` of those for depth too; of
-    several with as many masks the one with the largest f-number. ``"flat"`` has none. Each as far as one is shipped.
+    several with as many masks the one that tells how sure its depth is, else that with the largest f-number. ``"flat"``
+    has none. Each as far as one is shipped.
 
     Example:
         >>> round(shipped_cameras(57_000)["coded"].optics.sensor.full_well) > 10_000
@@ -81,8 +82,8 @@ def shipped_cameras(electrons: float) -> dict[str, Camera]:
     return found
 
 
-def _rank(settings: SystemSettings) -> tuple[int, float]:
-    return settings.masks, settings.camera().f_number
+def _rank(settings: SystemSettings) -> tuple[int, int, float]:
+    return settings.masks, settings.depth_classes, settings.camera().f_number
 
 
 def stopped_down(lens: ThinLensCamera, electrons: float) -> Camera:

@@ -20,7 +20,7 @@ from kornia_tidy.render.cost_model import Work
 from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
-PART_BYTES = 640 << 20  # that the planes of all layers of the images worked on together may take
+PART_BYTES = 672 << 20  # that the planes of all layers of the images worked on together may take
 MOST_SAMPLES = 1 << 28  # of all planes: beyond, transforms take longer than launches, and tiles skip absent layers
 
 

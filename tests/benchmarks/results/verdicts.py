@@ -17,7 +17,7 @@ from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK
 from tests.benchmarks.results.table import Difference, Key, Results
 
 REAL = "real"
-FIVE, ONE, JOINT = "edof-5", "edof-1", "joint-5"
+FIVE, ONE, JOINT = "edof-5", "edof-1", "joint-uncertain"
 GAINS = {"0.002": 1.5, "0.01": 2.7, "0.03": 3.5}  # dB of five masks' network over their best closed form
 SHARE_AHEAD = 0.95  # of scenes and noises
 SSIM_GAIN, CHROMA_GAIN, MASKS_GAIN = 0.04, 1.5, 1.2
