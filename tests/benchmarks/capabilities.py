@@ -109,6 +109,7 @@ def occlusion(image: Tensor, psi: Tensor) -> Iterator[Row]:
 
 def large_windows(image: Tensor, psi: Tensor) -> Iterator[Row]:
     """8 layers of 65 and 129 px."""
+    psi = psi + 1e-3  # no pixel lies half way between two layers, where peers may choose the other one
     for window in (65, 129):
         bank = make_bank(8, window)
         peers = {
@@ -132,7 +133,7 @@ def ordinary_lens(*_: Tensor) -> Iterator[Row]:
     f_number, focus = ordinary_lenses.LENSES[LENS]
 
     def ours() -> Tensor:
-        return ordinary_lenses.camera(f_number, focus)(image, depth)
+        return ordinary_lenses.camera(f_number, focus).requires_grad_(False)(image, depth)
 
     optics = ordinary_lenses.camera(f_number, focus)
     peers = {"discs of geometric optics by cv2.filter2D": lambda: by_discs(image, depth, optics)}
@@ -158,10 +159,9 @@ def batches(image: Tensor, psi: Tensor) -> Iterator[Row]:
     )
 
 
-@torch.no_grad()
 def videos(image: Tensor, psi: Tensor) -> Iterator[Row]:
     """64 frames with one bank of PSFs."""
-    optics = TiDyOptics(sensor=None)
+    optics = TiDyOptics(sensor=None).requires_grad_(False)
     depth = depth_of(psi, optics)
     frames = [(image[..., t : t + SIDE, t : t + SIDE], depth[..., t : t + SIDE, t : t + SIDE]) for t in range(FRAMES)]
 
@@ -175,10 +175,9 @@ def videos(image: Tensor, psi: Tensor) -> Iterator[Row]:
     yield Row(f"{FRAMES} frames of {SIDE} x {SIDE}", lambda: film(anew=False), peers)
 
 
-@torch.no_grad()
 def small_images(image: Tensor, psi: Tensor) -> Iterator[Row]:
     """As many pixels in small images as in one of 1024 x 1024."""
-    optics = TiDyOptics(sensor=None)
+    optics = TiDyOptics(sensor=None).requires_grad_(False)
     whole = [x[..., :1024, :1024].contiguous() for x in (image, depth_of(psi, optics))]
     side = 1024 // SMALL
     cut = [
