@@ -24,7 +24,9 @@ class TestPretrained(BaseTester):
         system = load_pretrained(name)
         task, kind = name.split("-")
         assert system.settings.task == task
-        assert system.settings.masks == ({"designed": 5, "flat": 1, "uncertain": 5}[kind] if kind.isalpha() else int(kind))
+        assert system.settings.masks == (
+            {"designed": 5, "flat": 1, "uncertain": 5}[kind] if kind.isalpha() else int(kind)
+        )
         assert not system.head.training
 
     @pytest.mark.parametrize("name", PRETRAINED)
