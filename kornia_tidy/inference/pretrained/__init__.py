@@ -86,7 +86,7 @@ def pretrained_record(name: str) -> dict[str, Any]:
 def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, half: bool = True) -> None:
     """Write a checkpoint for shipping: without the state of the run, the network's weights in half precision.
 
-    PSFs of a closed form are left out: :func:`~kornia_tidy.inference.trained.load_trained` computes them from the masks.
+    PSFs of a closed form are left out: :func:`~kornia_tidy.inference.trained.load_trained` computes them anew.
 
     Args:
         checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
