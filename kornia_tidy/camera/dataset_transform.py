@@ -37,13 +37,13 @@ class DatasetTransform:
           16-bit numbers, see :func:`~kornia_tidy.camera.image_types.image_tensor`; the capture is of the same kind.
         - The depth is a tensor (1, H, W), an array (H, W) or a PIL image, and comes back as it was.
 
-    Convention:
-        A sample is moved to the camera's device, and its capture back to where the image was.
-
     Raises:
         KeyError: if a mapping has no such image or depth, or a seed is set and the sample has no such entry.
         TypeError: if the image or the depth is of another kind.
         ValueError: as the camera.
+
+    Convention:
+        A sample is moved to the camera's device, and its capture back to where the image was.
 
     Example:
         >>> from kornia_tidy import TiDyOptics

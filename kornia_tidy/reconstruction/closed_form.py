@@ -29,8 +29,8 @@ WINDOW, SPACE = 7, 2.0  # of the bilateral filter, pixels
 COLOR, COLOR_EXPONENT = 0.2, 0.5  # difference of encoded colours
 LEAST_NOISE = 1e-5  # of full scale; its logarithm is finite
 LAYER_WEIGHT = 1e-2  # of the deconvolution for one depth, as an input of a network
-# Blended by the likelihood of depth, the best weight rises from 0.003 to 0.03 with a noise of 0.002 to 0.03; what one
-# weight costs is small, as the bilateral filter follows.
+# Blended by the likelihood of depth, the best weight rises from 0.003 to 0.03 with a noise of 0.002 to 0.03. With one
+# weight the images of joint-5 are 1.8 dB better than by the mean PSF at the one end, .3 dB worse at the other.
 BLEND_WEIGHT = 5e-3
 BLEND_SHARPNESS = 0.5  # best temperature of the likelihood at a noise of 0.002; it rises in proportion to the noise
 NODES = 11  # depths over which PSFs are averaged
@@ -313,7 +313,10 @@ def _renew_kernels(module: nn.Module, _: Any) -> None:
 
 
 def _take_window(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Give the PSFs the size that they have in a state, before it is loaded."""
+    """Give the PSFs the size that they have in a state, before it is loaded; if it has none, they stay."""
     stored = state.get(f"{prefix}psfs")
     if isinstance(module, ClosedForm) and stored is not None and stored.shape[:2] == module.psfs.shape[:2]:
-        module.psfs = module.psfs.new_empty(stored.shape)
+        if stored.numel():
+            module.psfs = module.psfs.new_empty(stored.shape)
+        else:
+            state[f"{prefix}psfs"] = module.psfs

@@ -11,7 +11,7 @@ import torch
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, about_pretrained, load_pretrained, ship
 from kornia_tidy.inference.state_file import read_state, write_state
-from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.inference.trained import load_trained, load_weights
 from kornia_tidy.training.evaluation import evaluate, mean_row
 from tests.base import BaseTester
 
@@ -80,6 +80,11 @@ class TestPretrained(BaseTester):
         again = load_trained(tmp_path / "small.safetensors").head.closed_form
         assert torch.equal(again.psfs, system.head.closed_form.psfs)
         assert torch.equal(again.kernels, system.head.closed_form.kernels)
+        capture = torch.rand(1, 3, 64, 64)
+        with torch.no_grad():
+            expected = system.head(capture)
+            load_weights(tmp_path / "small.safetensors", head=system.head)  # which keeps its own
+            assert torch.equal(system.head(capture), expected)
 
     def test_feature_networks_are_shipped_in_half_precision_and_loaded_in_single(self, tmp_path):
         whole = load_trained(FOLDER / "edof-5.safetensors")
