@@ -10,9 +10,11 @@ from torch import Tensor, nn
 from examples.paper.cameras import ELECTRONS, F_NUMBER
 from kornia_tidy import SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.inference.tasks import MAPS
+from kornia_tidy.sensor import electrons_at
 
 TEMPERATURES = (1.0, 4.0, 16.0, 64.0)
 """By which the log likelihood of depth is divided: neighbouring pixels are not independent."""
+READ_NOISE = 2.4  # electrons
 
 
 class ClosedForms(nn.Module):
@@ -56,14 +58,21 @@ class ClosedForms(nn.Module):
 
 
 def depth_limit(optics: TiDyOptics) -> float:
-    """Return the bound on the error of a bright point's depth, as a fraction of the range.
+    r"""Return the bound on the error of a bright point's depth, as a fraction of the range.
 
-    See :func:`~kornia_tidy.mask_design.candidates.depth_bound`; depths are uniform over the range.
+    .. math:: \sqrt{\langle 1 / (12 + I_\psi \, (\psi_{hi} - \psi_{lo})^2) \rangle}
+
+    The mean is over the depths of photographs; 12 is the information of a depth that is uniform over the range.
+
+    Source: Van Trees, Detection, Estimation, and Modulation Theory I, section 2.4 (Bayesian bound).
     """
-    from kornia_tidy.mask_design.candidates import depth_bound  # noqa: PLC0415
-    from kornia_tidy.mask_design.design_task import DesignTask  # noqa: PLC0415
+    from kornia_tidy.mask_design.fisher_information import crlb  # noqa: PLC0415
+    from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS  # noqa: PLC0415
 
-    lens = cast("ThinLensCamera", optics.camera)
-    task = DesignTask(electrons=ELECTRONS, reference_f_number=F_NUMBER, depth_weight=1.0)
+    lens = optics.psf_model
+    lo, hi = lens.camera.defocus_range
+    electrons = electrons_at(cast("ThinLensCamera", lens.camera).f_number, ELECTRONS, F_NUMBER)
     with torch.no_grad():
-        return float(depth_bound(task, optics.psf_model, lens.f_number))
+        bound = crlb(lens, photons=electrons, background=PHOTOGRAPHS.mean * electrons + READ_NOISE**2)
+        shares = PHOTOGRAPHS.depth_weights(torch.tensor(lens.defocus_nodes, dtype=bound.dtype))
+        return float(((12 + ((hi - lo) / bound).square()).reciprocal() * shares).sum().sqrt())

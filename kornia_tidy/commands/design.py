@@ -40,7 +40,7 @@ Everything is compared at the same exposure time: light is given as the electron
 white pixel at one f-number, and falls with the square of the f-number.
 
   search    flat lenses and masks at f-numbers one stop apart, by the error of the best linear
-            restoration (and the Cramer-Rao bound on depth); masks start from a
+            restoration (and of depth by texture); masks start from a
             focal sweep, a Fisher mask and noise, and see the modulator's switching and
             grey levels
   captures  the best of both take pictures of scenes (dead leaves, and yours), which the

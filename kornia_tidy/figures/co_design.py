@@ -76,7 +76,7 @@ def _search(axes: Axes, design: CoDesign) -> None:
             axes.plot(stops, values, linestyle="", marker=marker, markersize=4.5, color=color, label=label)
     axes.set_yscale("log")
     _f_numbers(axes, [one.f_number for one in design.candidates])
-    axes.set_title("Search: " + ("depth bound" if by_depth else "restoration error"), fontsize=TITLE, color=INK)
+    axes.set_title("Search: " + ("depth error" if by_depth else "restoration error"), fontsize=TITLE, color=INK)
     axes.set_ylabel("of the range" if by_depth else "relative to a uniform image", fontsize=LABEL, color=INK)
     open_chart(axes, LABEL)
     axes.legend(fontsize=SMALL, frameon=False)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.mask_design.depth_confusion import depth_confusion
 from kornia_tidy.mask_design.design_task import DesignTask, mask_of
-from kornia_tidy.mask_design.fisher_information import defocus_bound, defocus_response, fisher_information
 from kornia_tidy.mask_design.objectives import design, restoration_error
 from kornia_tidy.masks.base import mask_axes, metres_to_radians
 from kornia_tidy.masks.initial_heights import SMALL_NOISE, fisher_mask
@@ -38,9 +38,8 @@ class Candidate:
         start: ``"flat lens"``, or what its masks started from.
         f_number: focal length over aperture diameter.
         focus: in focus, as a fraction of the range of inverse depth, 0 at the far end.
-        image_error: error of the best linear restoration, NaN if the image has no weight; see
-            :func:`~kornia_tidy.mask_design.objectives.restoration_error`.
-        depth_error: bound on the RMSE of a point's inverse depth, as a fraction of the range; NaN if depth has no
+        image_error: error of the best linear restoration, NaN if the image has no weight; see :func:`cost_of`.
+        depth_error: expected RMSE of inverse depth from texture, as a fraction of the range; NaN if depth has no
             weight.
         cost: what is minimised, in dB: see :func:`cost_of`.
         phase: masks in radians at 530 nm, (K, N, N); None for a flat lens.
@@ -84,7 +83,8 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
 
     .. math:: 10 \log_{10} \left( R^{1 - w} E^{2 w} \right)
 
-    R is :func:`~kornia_tidy.mask_design.objectives.restoration_error`, E is :func:`depth_bound`, w the weight of depth.
+    w is the weight of depth. If it is 0, R is :func:`~kornia_tidy.mask_design.objectives.restoration_error`. Otherwise
+    R and E are the errors of image and depth of :func:`~kornia_tidy.mask_design.depth_confusion.depth_confusion`.
 
     Args:
         task: light, statistics of the scenes and weight.
@@ -95,28 +95,14 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
         Cost in dB, R and E, each 0-dimensional. What has no weight is NaN.
     """
     weight, unknown = task.depth_weight, torch.tensor(math.nan)
-    error = restoration_error(lens.psf_bank(), task.sensor(f_number), task.statistics) if weight < 1 else unknown
-    bound = depth_bound(task, lens, f_number) if weight > 0 else unknown
-    parts = [error.log10() * (10 * (1 - weight))] * (weight < 1) + [bound.log10() * (20 * weight)] * (weight > 0)
-    return torch.stack([part.float() for part in parts]).sum(), error, bound
-
-
-def depth_bound(task: DesignTask, lens: PSFModel, f_number: float) -> Tensor:
-    r"""Return the expected error of a point's inverse depth as a fraction of the range, from its Fisher information.
-
-    .. math:: \sqrt{\langle 1 / (12 + I_\psi \, (\psi_{hi} - \psi_{lo})^2) \rangle}
-
-    The point has the light of one white pixel, the background the mean light. 12 is the information of a depth that is
-    uniform over the range, so that no information gives the standard deviation of the range.
-
-    Source: Van Trees, Detection, Estimation, and Modulation Theory I, section 2.4 (Bayesian bound).
-    """
-    lo, hi = lens.camera.defocus_range
-    electrons = task.sensor(f_number).full_well or 0.0
-    background = task.statistics.mean * electrons + task.read_noise_electrons**2
-    bound = defocus_bound(fisher_information(defocus_response(lens), electrons, background))
-    shares = task.statistics.depth_weights(torch.tensor(lens.defocus_nodes, dtype=bound.dtype))
-    return ((12 + ((hi - lo) / bound).square()).reciprocal() * shares).sum().sqrt()
+    if weight == 0:
+        error = restoration_error(lens.psf_bank(), task.sensor(f_number), task.statistics)
+        return 10 * error.log10().float(), error, unknown
+    confusion = depth_confusion(lens.psf_bank(), task.noise(f_number), task.statistics)
+    cost = 20 * weight * confusion.depth.log10().float()
+    if weight == 1:
+        return cost, unknown, confusion.depth
+    return cost + 10 * (1 - weight) * confusion.image.log10().float(), confusion.image, confusion.depth
 
 
 def flat_candidate(task: DesignTask, f_number: float, focus: float) -> Candidate:

@@ -68,21 +68,23 @@ def plane_size(bank: PSFBank, size: tuple[int, int]) -> tuple[int, int]:
     return next_fast_size(size[0] + bank.window), next_fast_size(size[1] + bank.window)
 
 
-def restorations(capture: Tensor, wiener: WienerFilter) -> dict[str, Tensor]:
+def restorations(capture: Tensor, wiener: WienerFilter, by_depth: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
     """Return the restorations of a capture: as it is and by the Wiener filter, each without and with bilateral filter.
 
     Args:
         capture: (1, 3, H, W) linear light.
         wiener: of the camera.
+        by_depth: further restorations in linear light by name, see :func:`restored_by_depth`.
 
     Returns:
         By a name of the setting, (1, 3, H, W) sRGB in [0, 1].
 
     Source: Tomasi and Manduchi, Bilateral Filtering for Gray and Color Images (ICCV 1998).
     """
-    names = ("capture", *(f"Wiener x {factor:g}" for factor in NOISE_FACTORS))
+    names = (f"Wiener x {factor:g}" for factor in NOISE_FACTORS)
+    lights = {"capture": capture, **dict(zip(names, wiener(capture, NOISE_FACTORS), strict=True)), **(by_depth or {})}
     images = {}
-    for name, light in zip(names, (capture, *wiener(capture, NOISE_FACTORS)), strict=True):
+    for name, light in lights.items():
         encoded = linear_rgb_to_rgb(light.clamp(0, 1))
         pixels = np.ascontiguousarray(encoded[0].permute(1, 2, 0).float().numpy())
         for scale in BILATERAL:
@@ -92,6 +94,37 @@ def restorations(capture: Tensor, wiener: WienerFilter) -> dict[str, Tensor]:
             smooth = cv2.bilateralFilter(pixels, BILATERAL_WIDTH, scale, BILATERAL_SPACE)
             images[f"{name}, bilateral {scale:g}"] = torch.from_numpy(smooth).permute(2, 0, 1)[None]
     return images
+
+
+def depth_filters(
+    bank: PSFBank, noise: float, statistics: SceneStatistics, size: tuple[int, int]
+) -> list[WienerFilter]:
+    """Return the Wiener filter of each depth of a bank."""
+    veils = [None] * len(bank.psfs) if bank.veil is None else bank.veil.split(1)
+    parts = zip(bank.psfs.split(1), bank.defocus.split(1), bank.energy.split(1), veils, strict=True)
+    return [WienerFilter(PSFBank(*part), noise, statistics, size) for part in parts]
+
+
+def restored_by_depth(
+    capture: Tensor, filters: Sequence[WienerFilter], probabilities: dict[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return restorations by the filters of all depths, blended by the probability of each depth.
+
+    Args:
+        capture: (1, 3, H, W) linear light.
+        filters: see :func:`depth_filters`.
+        probabilities: of the filters' depths by name, (D, H, W), see :class:`DepthLikelihood`.
+
+    Returns:
+        By a name of the setting, (1, 3, H, W) linear light.
+    """
+    blends = {}
+    for factor in NOISE_FACTORS:
+        layers = torch.cat([each(capture, (factor,))[0] for each in filters])
+        for name, shares in probabilities.items():
+            blended = (shares[:, None] * layers).sum(0, keepdim=True)
+            blends[f"by depth ({name}), Wiener x {factor:g}"] = blended
+    return blends
 
 
 class DepthLikelihood:
@@ -130,22 +163,30 @@ class DepthLikelihood:
         self.mean = statistics.mean
 
     def __call__(self, capture: Tensor) -> dict[str, Tensor]:
-        """Return estimates of normalised inverse depth, (H, W) from 0 (far) to 1, by a name of the setting.
-
-        An estimate is the mean of the depth's probability, which is least wrong on average.
-        """
+        """Return the probability of each depth, (D, H, W), by a name of the setting."""
         height, width = capture.shape[-2:]
         spectrum = torch.fft.rfft2(periodic_extension(capture.mean(1) - self.mean, self.size))[0]
         planes = torch.fft.irfft2(self.filters * spectrum, s=self.size)[..., :height, :width].square()
-        depths = torch.linspace(0, 1, planes.shape[1])[:, None, None]
-        estimates = {}
+        probabilities = {}
         for window in WINDOWS:
             local = _window_mean(planes, window)
             likelihood = -0.5 * window**2 * (local + self.log_power[..., None, None])
             for temperature in TEMPERATURES:
                 posterior = (likelihood / temperature).logsumexp(0) + self.log_prior[:, None, None]
-                estimates[f"{window} px, temperature {temperature:g}"] = (posterior.softmax(0) * depths).sum(0)
-        return estimates
+                probabilities[f"{window} px, temperature {temperature:g}"] = posterior.softmax(0)
+        return probabilities
+
+
+def mean_depth(probability: Tensor) -> Tensor:
+    """Return normalised inverse depth, (H, W) from 0 (far) to 1: the mean of its probability (D, H, W).
+
+    It is least wrong on average.
+
+    Example:
+        >>> mean_depth(torch.tensor([0.0, 0.5, 0.5])[:, None, None])
+        tensor([[0.7500]])
+    """
+    return (probability * torch.linspace(0, 1, len(probability))[:, None, None]).sum(0)
 
 
 def _window_mean(planes: Tensor, window: int) -> Tensor:

@@ -107,9 +107,9 @@ def report_markdown(design: CoDesign) -> str:
         "## Search",
         "",
         "Error of the best linear restoration with one filter for all depths, by the statistics of scenes, relative to "
-        "a uniform image; bound on the error of a point's inverse depth, as a fraction of the range.",
+        "a uniform image; expected error of inverse depth from texture, as a fraction of the range.",
         "",
-        "| start | f-number | focus, m | restoration error | depth bound |",
+        "| start | f-number | focus, m | restoration error | depth error |",
         "|---|---|---|---|---|",
         *(_candidate_row(task, one) for one in sorted(design.candidates, key=lambda one: one.cost)),
         "",
@@ -126,7 +126,7 @@ def _candidate_data(task: DesignTask, one: Candidate) -> dict[str, Any]:
         "f_number": one.f_number,
         "focus_m": _known(focus_distance(task, one)),
         "restoration_error": _known(one.image_error),
-        "depth_bound": _known(one.depth_error),
+        "depth_error": _known(one.depth_error),
         "cost_dB": one.cost,
     }
 

@@ -1,7 +1,8 @@
 """Objectives of mask design, and their minimisation by gradient descent without an image or a network.
 
-For depth estimation the objective is the mean of :func:`~kornia_tidy.mask_design.fisher_information.crlb` over defocus.
-For extended depth of field it is :func:`restoration_error`, or :func:`point_error` if the image is not restored.
+For depth by texture the objective is :func:`~kornia_tidy.mask_design.depth_confusion.depth_confusion`, for that of
+points the mean of :func:`~kornia_tidy.mask_design.fisher_information.crlb` over defocus. For extended depth of field it
+is :func:`restoration_error`, or :func:`point_error` if the image is not restored.
 """
 
 from __future__ import annotations

@@ -15,7 +15,15 @@ from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.mask_design.candidates import Candidate
-from kornia_tidy.mask_design.closed_forms import DEPTHS, DepthLikelihood, WienerFilter, restorations
+from kornia_tidy.mask_design.closed_forms import (
+    DEPTHS,
+    DepthLikelihood,
+    WienerFilter,
+    depth_filters,
+    mean_depth,
+    restorations,
+    restored_by_depth,
+)
 from kornia_tidy.mask_design.design_task import DesignTask, flat_mask
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.seeds import keyed_seed
@@ -68,24 +76,28 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
     depths = optics.psf_bank(defocus=torch.linspace(lo, hi, DEPTHS).tolist()) if task.depth_weight > 0 else bank
 
     @lru_cache(maxsize=1)
-    def filters(size: tuple[int, int]) -> tuple[WienerFilter | None, DepthLikelihood | None]:
+    def forms(size: tuple[int, int]) -> tuple[WienerFilter | None, DepthLikelihood | None, list[WienerFilter]]:
         wiener = WienerFilter(bank, noise, task.statistics, size) if task.depth_weight < 1 else None
-        return wiener, DepthLikelihood(depths, noise, task.statistics, size) if task.depth_weight > 0 else None
+        likelihood = DepthLikelihood(depths, noise, task.statistics, size) if task.depth_weight > 0 else None
+        by_depth = depth_filters(depths, noise, task.statistics, size) if wiener and likelihood else []
+        return wiener, likelihood, by_depth
 
     for number, scene in enumerate(scenes):
-        wiener, likelihood = filters((scene.image.shape[-2], scene.image.shape[-1]))
+        wiener, likelihood, by_depth = forms((scene.image.shape[-2], scene.image.shape[-1]))
         depth = scene.depth.clamp(*task.depth_range)
         generator = torch.Generator().manual_seed(keyed_seed(seed, "noise", number))
         light = rgb_to_linear_rgb(scene.image.expand(3, -1, -1))[None]
         capture = optics(light, depth[None], generator=generator)
         scores: Scores = {}
+        probabilities = {} if likelihood is None else likelihood(capture)
         if wiener is not None:
-            images = restorations(capture, wiener)
+            blended = restored_by_depth(capture, by_depth, probabilities) if by_depth else None
+            images = restorations(capture, wiener, blended)
             truth, valid = linear_rgb_to_rgb(light), scene.valid[None].expand_as(light)
             scores["image"] = {name: _decibels(image - truth, valid) for name, image in images.items()}
-        if likelihood is not None:
+        if probabilities:
             truth, valid = _normalised_inverse(depth[0], task.depth_range), scene.valid[0]
-            scores["depth"] = {name: _decibels(one - truth, valid) for name, one in likelihood(capture).items()}
+            scores["depth"] = {name: _decibels(mean_depth(p) - truth, valid) for name, p in probabilities.items()}
         yield scores
 
 

@@ -40,8 +40,7 @@ RANGES = {
 WEIGHTS = {"image": 0.0, "depth": 1.0, "both": 0.5}
 SIZE, NUMBER = 256, 12  # pixels a side of the scenes, and scenes of each half
 EFFORT = Effort(coarse_steps=20, steps=60, starts=("focal sweep",), scenes=0)
-# Steps with depth compute derivatives of PSFs too, and take some fifty times as long.
-DEPTH_EFFORT = Effort(coarse_steps=5, steps=20, starts=("focal sweep", "Fisher"), scenes=0)
+DEPTH_EFFORT = Effort(coarse_steps=30, steps=100, scenes=0)  # masks that tell depth are far from a focal sweep
 
 
 def cells() -> list[tuple[str, str, int, int]]:

@@ -2,7 +2,16 @@ from __future__ import annotations
 
 import torch
 
-from kornia_tidy.mask_design.closed_forms import BILATERAL, NOISE_FACTORS, DepthLikelihood, WienerFilter, restorations
+from kornia_tidy.mask_design.closed_forms import (
+    BILATERAL,
+    NOISE_FACTORS,
+    DepthLikelihood,
+    WienerFilter,
+    depth_filters,
+    mean_depth,
+    restorations,
+    restored_by_depth,
+)
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.reconstruction.wiener import wiener
 from kornia_tidy.scene_statistics import PHOTOGRAPHS
@@ -49,6 +58,26 @@ class TestRestorations(BaseTester):
         assert spread["capture, bilateral 0.28"] < 0.5 * spread["capture"]
 
 
+class TestRestoredByDepth(BaseTester):
+    def test_feature_each_region_is_restored_by_its_own_depth(self):
+        """Left and right of a capture have different probabilities; of one depth it is the Wiener filter's result."""
+        bank, capture = gaussians([0.6, 2.0]), texture(40)
+        filters = depth_filters(bank, 0.01, PHOTOGRAPHS, (40, 40))
+        probability = torch.zeros(2, 40, 40)
+        probability[0, :, :20] = probability[1, :, 20:] = 1
+        both = restored_by_depth(capture, filters, {"given": probability})["by depth (given), Wiener x 0.8"]
+        for part, columns in enumerate((slice(0, 20), slice(20, 40))):
+            own = wiener(capture, bank.psfs[part : part + 1], 0.01 * 0.8**0.5)
+            self.assert_close(both[..., columns], own[..., columns])
+
+    def test_cardinality_they_are_filtered_as_the_others(self):
+        bank, capture = gaussians([1.0, 2.0]), texture(32)
+        filters = depth_filters(bank, 0.01, PHOTOGRAPHS, (32, 32))
+        further = restored_by_depth(capture, filters, {"given": torch.full((2, 32, 32), 0.5)})
+        images = restorations(capture, WienerFilter(bank, 0.01, PHOTOGRAPHS, (32, 32)), further)
+        assert len(images) == (1 + 2 * len(NOISE_FACTORS)) * len(BILATERAL)
+
+
 class TestDepthLikelihood(BaseTester):
     def test_feature_finds_by_which_psf_a_texture_is_blurred(self):
         """Sharp is far here and the widest PSF is near: three depths, three tenths apart, come out in their order."""
@@ -59,9 +88,9 @@ class TestDepthLikelihood(BaseTester):
         for depth in (2, 5, 8):
             transfer = torch.fft.rfft2(bank.psfs[depth], s=(size, size))
             capture = torch.fft.irfft2(torch.fft.rfft2(texture(size)) * transfer, s=(size, size)).roll((-7, -7), (2, 3))
-            estimates = likelihood(capture + noise)
-            assert {tuple(estimate.shape) for estimate in estimates.values()} == {(size, size)}
-            found.append([float(estimate[32:64, 32:64].mean()) for estimate in estimates.values()])
+            probabilities = likelihood(capture + noise)
+            assert {tuple(each.shape) for each in probabilities.values()} == {(11, size, size)}
+            found.append([float(mean_depth(each)[32:64, 32:64].mean()) for each in probabilities.values()])
         for far, middle, near in zip(*found, strict=True):
             assert far + 0.05 < middle < near - 0.05
 
@@ -70,5 +99,5 @@ class TestDepthLikelihood(BaseTester):
         shares = PHOTOGRAPHS.depth_weights(bank.defocus)
         expected = float((shares * torch.linspace(0, 1, 11)).sum())
         same = PSFBank(bank.psfs[:1].expand(11, -1, -1, -1).contiguous(), bank.defocus, bank.energy)
-        for estimate in DepthLikelihood(same, 0.01, PHOTOGRAPHS, (32, 32))(texture(32)).values():
-            self.assert_close(estimate, torch.full((32, 32), expected))
+        for probability in DepthLikelihood(same, 0.01, PHOTOGRAPHS, (32, 32))(texture(32)).values():
+            self.assert_close(mean_depth(probability), torch.full((32, 32), expected))
