@@ -132,6 +132,18 @@ class TestDataSets(BaseTester):
         self.assert_close(coded, self.camera()(*items[1]), rtol=0, atol=ROUNDING)
         assert depth is items[1][1]
 
+    def test_exception_a_picture_and_a_camera_on_two_devices(self, float64):
+        image, depth = torch.full((3, 32, 32), 0.5), torch.ones(1, 32, 32)
+        with SimulatedDevice(float64=float64) as device:
+            there = device.put(self.camera())
+            for camera, *sample in (
+                (there, image, depth),
+                (there, device.put(image), depth),
+                (self.camera(), device.put(image), device.put(depth)),
+            ):
+                with pytest.raises(ValueError, match="image and depth must be on the camera's device, .*: move them"):
+                    camera(*sample)
+
     def test_feature_a_data_set_is_rendered(self, float64, tmp_path):
         render_scenes(self.camera(SensorNoise(0.01)), self.scenes(), tmp_path / "cpu", seed=5)
         with SimulatedDevice(float64=float64) as device:

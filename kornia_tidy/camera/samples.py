@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, NamedTuple, Protocol, cast
 
 import torch
@@ -95,7 +96,7 @@ def read_sample(
 
     Raises:
         TypeError: if image or depth are not floating-point tensors, or the generator is none.
-        ValueError: if shapes do not fit, there is no depth, or the light makes no sense.
+        ValueError: if shapes or devices do not fit, there is no depth, or the light makes no sense.
         KeyError: if a mapping has no image or no depth.
     """
     form = None
@@ -117,6 +118,12 @@ def read_sample(
     check_float_tensor("image", image, 4 if batched else 3, "(B, C, H, W) or (C, H, W)")
     check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
     model, given = camera.psf_model, tuple(image.shape)
+    home = next(chain(model.masks.parameters(), model.masks.buffers()), image).device
+    if not image.device == depth.device == home:
+        raise ValueError(
+            f"image and depth must be on the camera's device, {home}, got {image.device} and {depth.device}: move them, "
+            f"or the camera with optics.to(...)"
+        )
     if not batched:
         image, depth = image[None], depth[None]
     channels = len(model.spectrum.weights)

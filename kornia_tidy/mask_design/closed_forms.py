@@ -118,11 +118,11 @@ def restored_by_depth(
     Returns:
         By a name of the setting, (1, 3, H, W) linear light.
     """
+    layers = zip(*(each(capture, NOISE_FACTORS) for each in filters), strict=True)
     blends = {}
-    for factor in NOISE_FACTORS:
-        layers = torch.cat([each(capture, (factor,))[0] for each in filters])
+    for factor, layer in zip(NOISE_FACTORS, layers, strict=True):
         for name, shares in probabilities.items():
-            blended = (shares[:, None] * layers).sum(0, keepdim=True)
+            blended = (shares[:, None] * torch.cat(layer)).sum(0, keepdim=True)
             blends[f"by depth ({name}), Wiener x {factor:g}"] = blended
     return blends
 
