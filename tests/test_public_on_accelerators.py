@@ -141,7 +141,7 @@ class TestDataSets(BaseTester):
                 (there, device.put(image), depth),
                 (self.camera(), device.put(image), device.put(depth)),
             ):
-                with pytest.raises(ValueError, match="image and depth must be on the camera's device, .*: move them"):
+                with pytest.raises(ValueError, match="image and depth must be on the camera's device"):
                     camera(*sample)
 
     def test_feature_a_data_set_is_rendered(self, float64, tmp_path):

@@ -121,8 +121,8 @@ def read_sample(
     home = next(chain(model.masks.parameters(), model.masks.buffers()), image).device
     if not image.device == depth.device == home:
         raise ValueError(
-            f"image and depth must be on the camera's device, {home}, got {image.device} and {depth.device}: move them, "
-            f"or the camera with optics.to(...)"
+            f"image and depth must be on the camera's device, {home}, got {image.device} and {depth.device}: move "
+            f"them, or the camera with optics.to(...)"
         )
     if not batched:
         image, depth = image[None], depth[None]

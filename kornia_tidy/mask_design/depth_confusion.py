@@ -13,7 +13,7 @@ from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS, SceneStatistics
 
 CONTRASTS = (1 / 16, 1 / 2, 4.0)  # of a patch's variance to that of all scenes, equally frequent
 SAMPLES = 20.0  # of a patch that count
-MISFIT = 10.0  # times the variance of the noise: what one PSF does not explain
+MISFIT = 10.0  # times the variance of the noise, as one PSF does not explain all light
 # Share of a patch's power that depth edges and other depths within the PSF add without blur. With it the prediction is
 # within .02 of the RMSE of closed-form estimates on nine real scenes, of .18 to .26; without it, it is .08 too low at
 # f/12.5.
