@@ -124,8 +124,7 @@ def read_sample(
             f"image and depth must be on the camera's device, {home}, got {image.device} and {depth.device}: move "
             f"them, or the camera with optics.to(...)"
         )
-    if not batched:
-        image, depth = image[None], depth[None]
+    image, depth = (image, depth) if batched else (image[None], depth[None])
     channels = len(model.spectrum.weights)
     if image.shape[1] not in (channels, 1):
         model.spectrum_of(image.shape[1], layout_remedy(given, channels))  # raises
