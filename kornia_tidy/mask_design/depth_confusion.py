@@ -38,7 +38,7 @@ def depth_confusion(bank: PSFBank, noise: float, statistics: SceneStatistics = P
 
     .. math::
         q_{dd'} \propto \pi_{d'} \sum_{a'} \exp (-N D_{da, d'a'}), \quad
-        D_{ij} = \tfrac12 \Big\langle \frac{P_i}{P_j} - 1 - \log \frac{P_i}{P_j} \Big\rangle_f, \quad
+        D_{ij} = \tfrac12 \langle \frac{P_i}{P_j} - 1 - \log \frac{P_i}{P_j} \rangle_f, \quad
         P_{daf} = a \, S_f \, (|H_{df}|^2 + \epsilon) + 10 \, \sigma^2
 
     with the power spectrum S of the scenes, the transfer function H of the PSF, and the distribution of depth
