@@ -14,13 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backends import direct, direct_occlusion
-from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, cheapest_grid
+from kornia_tidy.render.backends import direct, direct_occlusion, overlap
+from kornia_tidy.render.backends.tile_plan import BLOCKS, OVERLAPS, WINDOWS, cheapest_grid
 from kornia_tidy.render.cost_model import (
     DenseOcclusionWork,
     DenseWork,
     DirectOcclusionWork,
     DirectWork,
+    OverlapWork,
     TiledOcclusionWork,
     Work,
     seconds_of,
@@ -33,6 +34,7 @@ from kornia_tidy.render.scene import SAMPLE, Labels
 
 OCCLUSION_PLANES = 6  # of a chunk at a time: light, spectra, products and quotients; 0.99 to 1.46 of the measured peak
 DENSE_PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy
+OVERLAP_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,8 @@ def count_work(labels: Labels, layers: int, window: int, compositing: str = "gat
     blended, extra = 1 if labels.layer_weight is None else 2, window - 1
     occlusion = compositing == "occlusion"
     works: dict[str, Work] = {"tiled": cheapest_grid(labels, layers, window, WINDOWS if occlusion else BLOCKS)[0]}
+    if not occlusion and overlap.refusal(labels.layer_index.device, torch.float32) is None:
+        works["overlap"] = cheapest_grid(labels, layers, window, OVERLAPS)[0]
     if compositing == "gather":
         works["dense"] = DenseWork(height + extra, width + extra, present, pixels, blended, batch)
         if direct.can_go_directly(labels, torch.float32):
@@ -131,8 +135,9 @@ def rendering_seconds(scene: SceneWork, channels: int, *, double: bool = False, 
 def rendering_bytes(scene: SceneWork, channels: int, *, double: bool = False, threads: int | None = None) -> int:
     """Return the peak memory that rendering takes without gradients, by the fastest backend.
 
-    Directly that is a padded image, labels and what is returned. Tiles add the spectra of the PSFs and the planes of a
-    chunk, dense rendering some planes of the whole.
+    Directly that is a padded image, labels and what is returned. Overlapping windows add the spectra of the PSFs in one
+    channel and the window that a thread works on, tiles all spectra and the planes of a chunk, dense rendering some
+    planes of the whole.
 
     Args:
         scene: from :func:`count_work`.
@@ -154,6 +159,9 @@ def rendering_bytes(scene: SceneWork, channels: int, *, double: bool = False, th
         most = max(layers for layers, count in enumerate(work.windows) if count)
         chunk = OCCLUSION_PLANES * max(WINDOWS.chunk_bytes, 2 * plane * most)
         return 2 * scene.layers * plane + chunk + 2 * image + labels
+    if isinstance(work, OverlapWork):  # spectra of one channel, and the windows that each thread works on
+        planes = scene.layers + OVERLAP_PLANES * (threads or torch.get_num_threads())
+        return planes * real * work.size**2 + 3 * image + labels
     plane = 2 * real * work.size**2
     chunk = 3 * max(BLOCKS.chunk_bytes, plane * math.ceil(work.pairs / work.blocks))
     return 2 * scene.layers * channels * plane + chunk + 4 * image + labels

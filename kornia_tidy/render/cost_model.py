@@ -16,6 +16,7 @@ from kornia_tidy.render.cost_profile import CostProfile, Rates
 
 # Bytes of a tile's planes in one channel, beyond which they leave the cache, or are fetched from the system each time.
 TILE_CACHE, OCCLUSION_CACHE = 16 << 20, (64 << 20) // 3
+WINDOW_CACHE = 1 << 20  # the same for one plane of a window whose transforms are in C
 
 
 class Work(Protocol):
@@ -116,6 +117,30 @@ class TiledWork:
             each * samples * self.pairs,
             each * samples * self.pairs * _spill(planes, TILE_CACHE),
             self.channels * self.pairs,
+        )
+
+
+@dataclass(frozen=True)
+class OverlapWork(TiledWork):
+    """Gather or scatter by overlapping windows in C, see :mod:`kornia_tidy.render.backends.overlap`.
+
+    Its counts are those of :class:`TiledWork`; a block is a single tile.
+    """
+
+    rates: ClassVar[str] = "overlap"
+
+    @property
+    def terms(self) -> tuple[float, ...]:
+        """A block and a PSF are transformed once, a pair is transformed back."""
+        each, samples = self.channels * self.itemsize / 4, self.size**2
+        transforms = samples * (self.blocks + self.pairs + self.layers)
+        return (
+            1,
+            each * self.pixels,
+            each * 2 * math.log2(self.size) * transforms,
+            each * samples * self.blocks,
+            each * samples * self.pairs,
+            each * transforms * _spill(self.itemsize * samples, WINDOW_CACHE),
         )
 
 

@@ -100,6 +100,27 @@ class TiledRates(Rates):
 
 
 @dataclass(frozen=True)
+class OverlapRates(Rates):
+    """Overlapping windows in C for gather and scatter.
+
+    Args:
+        call: once.
+        pixel: a pixel of the output.
+        transform: a sample of a transform and a factor of two of its samples.
+        tile: a sample of a window: cut out of the image, with its labels.
+        pair: a sample of a pair of window and layer: multiplied by the PSF's spectrum, and added to the tile's sums.
+        large: a sample of a transform for each factor of two by which a window's plane exceeds the cache.
+    """
+
+    call: float
+    pixel: float
+    transform: float
+    tile: float
+    pair: float
+    large: float
+
+
+@dataclass(frozen=True)
 class DenseRates(Rates):
     """Transforms of the whole plane, for all kinds of compositing.
 
@@ -197,6 +218,7 @@ class CostProfile:
         name: what it is called.
         direct: gather by direct convolution.
         tiled: gather and scatter by tiles.
+        overlap: gather and scatter by overlapping windows in C.
         dense: gather and scatter by transforms of the whole plane.
         occlusion_direct: occlusion by direct convolution.
         occlusion_tiled: occlusion by tiles.
@@ -207,6 +229,7 @@ class CostProfile:
     name: str
     direct: DirectRates
     tiled: TiledRates
+    overlap: OverlapRates
     dense: DenseRates
     occlusion_direct: DirectOcclusionRates
     occlusion_tiled: TiledOcclusionRates
@@ -255,6 +278,7 @@ def _rates(name: str, numbers: Any) -> Rates:
 RATES: dict[str, type[Rates]] = {
     "direct": DirectRates,
     "tiled": TiledRates,
+    "overlap": OverlapRates,
     "dense": DenseRates,
     "occlusion_direct": DirectOcclusionRates,
     "occlusion_tiled": TiledOcclusionRates,
@@ -262,11 +286,13 @@ RATES: dict[str, type[Rates]] = {
     "bank": BankRates,
 }
 
-# One core of an idle 2.5 GHz Xeon. Dense rates and large planes were not measured there: they are EPYC's, scaled.
+# One core of an idle 2.5 GHz Xeon. Dense rates, overlapping windows and large
+# planes were not measured there: they are EPYC's, scaled.
 XEON = CostProfile(
     name="xeon-2.5",
     direct=DirectRates(1.0, 0, 0, 70, 0, 0.95),
     tiled=TiledRates(0.5, 0, 0, 8.5, 0.099, 1.98, 1.65, 1.7, 2200),
+    overlap=OverlapRates(0.9, 7e5, 1.5, 0.04, 1.4, 0.25, 0.12),
     dense=DenseRates(0.5, 9e4, 2.8, 0.13, 0.13, 0, 1.35),
     occlusion_direct=DirectOcclusionRates(1.0, 0, 0, 250, 3.7, 320, 3, 2.3, 12, 25),
     occlusion_tiled=TiledOcclusionRates(0.5, 0, 0, 6.9, 19.6, 8, 60, 15000),
@@ -280,6 +306,7 @@ EPYC = CostProfile(
     name="epyc-2.6",
     direct=DirectRates(0.95, 0, 0.74, 78, 13.9, 1.68),
     tiled=TiledRates(0.85, 2.07e6, 0, 6.28, 0.203, 0, 0.92, 1.69, 8800),
+    overlap=OverlapRates(0.9, 8e5, 1.6, 0.0437, 1.5, 0.27, 0.124),
     dense=DenseRates(0.7, 9.6e4, 3.1, 0.1425, 0.147, 0, 1.51),
     occlusion_direct=DirectOcclusionRates(0.95, 0, 1.44, 390, 4.84, 440, 0, 2.63, 7.06, 25),
     occlusion_tiled=TiledOcclusionRates(0.7, 2.07e6, 5, 7.94, 23.9, 1.8, 33.5, 3000),

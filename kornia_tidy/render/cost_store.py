@@ -26,7 +26,7 @@ from kornia_tidy.runtime.threads import SharedLock
 
 TUNE = "KORNIA_TIDY_TUNE"  # in the environment, "off": nothing is measured, nothing is read from the cache
 KINDS = {
-    "gather": ("direct", "tiled", "dense"),
+    "gather": ("direct", "tiled", "overlap", "dense"),
     "occlusion": ("occlusion_direct", "occlusion_tiled", "occlusion_dense"),
 }  # rates that are measured together
 LARGEST_FILE = 1 << 16  # bytes

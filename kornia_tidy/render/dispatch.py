@@ -17,6 +17,7 @@ from kornia_tidy.render.backend import Backend, GradientPairs
 from kornia_tidy.render.backends.batched import MOST_SAMPLES, BatchedBackend
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.direct import DirectBackend
+from kornia_tidy.render.backends.overlap import OverlapBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.backends.triton_direct import TritonBackend
 from kornia_tidy.render.cost_model import seconds_of
@@ -27,7 +28,10 @@ from kornia_tidy.render.scene import SAMPLE, LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
 
-BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (DirectBackend(), TiledBackend(), DenseBackend())}
+BACKENDS: dict[str, Backend] = {
+    backend.name: backend for backend in (DirectBackend(), OverlapBackend(), TiledBackend(), DenseBackend())
+}
+COMPILED = ("direct", "overlap")  # backends that may refuse a scene like one that they took before
 BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an estimate
 TRITON = TritonBackend()
 NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED, TRITON.name: TRITON}
@@ -43,7 +47,7 @@ def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"direct"``, ``"tiled"``, ``"dense"``, ``"batched"`` or ``"triton"``, or a backend.
+        method: ``"auto"``, ``"direct"``, ``"overlap"``, ``"tiled"``, ``"dense"``, ``"batched"`` or ``"triton"``, or a backend.
 
     Returns:
         (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
@@ -164,7 +168,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         layout["fingerprint"] = _fingerprint(scene)
     key = layout["fingerprint"]
     known = None if key is None else _choices.get(key)  # another thread may empty the memory meanwhile
-    if known is not None and (known[0].name != "direct" or known[0].refusal(scene) is None):  # others refuse nothing
+    if known is not None and (known[0].name not in COMPILED or known[0].refusal(scene) is None):
         best, grids = known
         scene.grids.update(grids)
         return best
@@ -270,7 +274,7 @@ def explain(scene: LayeredScene) -> Explanation:
         >>> image, psi, nodes = torch.rand(1, 3, 2, 40), torch.zeros(1, 1, 2, 40), torch.tensor([0.0, 4.0])
         >>> explanation = explain(layered_scene(image, psi, nodes, torch.rand(2, 3, 3, 3), compositing="scatter"))
         >>> sorted(explanation.seconds), explanation.objections
-        (['dense', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
+        (['dense', 'overlap', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
     """
     (height, width), (batch, channels), side = scene.output_size, scene.image.shape[:2], scene.psfs.shape[-1]
     words = (

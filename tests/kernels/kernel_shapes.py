@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
-from kornia_tidy.kernels import gather_ops, occlusion_ops
+from kornia_tidy.kernels import gather_ops, occlusion_ops, overlap_ops
 from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
@@ -115,6 +115,54 @@ def correlate(draw: random.Random) -> Call:
     return Call(about, "gather_direct_psf_gradient", arguments, scene.products, truth)
 
 
+def overlap_gather(draw: random.Random) -> Call:
+    """``gather`` of overlap.c."""
+    scene, size, correlate, weight_gradient = _overlapping(draw)
+
+    def truth() -> tuple[Tensor, float]:
+        psfs, weights = scene.psfs.double(), _weights(scene, gradient=weight_gradient)
+        expected = _mixed(scene.light.double(), psfs.flip((-2, -1)) if correlate else psfs, weights)
+        return expected, 2 * _transform_error(scene.light, scene.psfs, size)
+
+    arguments = scene.light, scene.psfs, scene.lower, scene.fraction, size, correlate, weight_gradient
+    about = f"{scene.about} size {size} correlate {correlate} weight_gradient {weight_gradient}"
+    return Call(about, "gather_overlap", arguments, scene.products, truth)
+
+
+def overlap_scatter(draw: random.Random) -> Call:
+    """``scatter`` of overlap.c: the transpose of ``gather``."""
+    scene, size, correlate, weight_gradient = _overlapping(draw)
+    pixels = _pixels(draw, scene)
+
+    def truth() -> tuple[Tensor, float]:
+        light, psfs = scene.light.double().requires_grad_(), scene.psfs.double()
+        weights = _weights(scene, gradient=weight_gradient)
+        coded = _mixed(light, psfs if correlate else psfs.flip((-2, -1)), weights)
+        expected = torch.autograd.grad((coded * pixels.double()).sum(), light)[0]
+        return expected, 4 * len(psfs) * _transform_error(pixels, scene.psfs, size)  # windows of four tiles overlap
+
+    arguments = pixels, scene.psfs, scene.lower, scene.fraction, size, correlate, weight_gradient
+    about = f"{scene.about} size {size} correlate {correlate} weight_gradient {weight_gradient}"
+    return Call(about, "scatter_overlap", arguments, scene.products, truth)
+
+
+def overlap_correlate(draw: random.Random) -> Call:
+    """``correlate`` of overlap.c: the gradient of a sum over pixels to the PSFs."""
+    scene, size, correlate, weight_gradient = _overlapping(draw)
+    pixels = _pixels(draw, scene)
+
+    def truth() -> tuple[Tensor, float]:
+        psfs = scene.psfs.double().requires_grad_()
+        turned = psfs.flip((-2, -1)) if correlate else psfs
+        coded = _mixed(scene.light.double(), turned, _weights(scene, gradient=weight_gradient))
+        expected = torch.autograd.grad((coded * pixels.double()).sum(), psfs)[0]
+        return expected, 2 * _transform_error(scene.light, pixels, size)
+
+    arguments = scene.light, pixels, scene.lower, scene.fraction, len(scene.psfs), size, correlate, weight_gradient
+    about = f"{scene.about} size {size} correlate {correlate} weight_gradient {weight_gradient}"
+    return Call(about, "overlap_psf_gradient", arguments, scene.products, truth)
+
+
 def occlude(draw: random.Random) -> Call:
     """``occlude`` and ``count`` of occlusion.c.
 
@@ -180,6 +228,9 @@ def energies(draw: random.Random) -> Call:
 
 
 KERNELS: dict[str, Callable[[random.Random], Call]] = {
+    "overlap.c: gather": overlap_gather,
+    "overlap.c: scatter": overlap_scatter,
+    "overlap.c: correlate": overlap_correlate,
     "direct.c: gather": gather,
     "direct.c: correlate": correlate,
     "occlusion.c": occlude,
@@ -218,6 +269,33 @@ def _gathered(draw: random.Random) -> _Scene:
         lower, fraction = (x if x is None else x.mT.contiguous().mT for x in (lower, fraction))
     about = f"{dtype} light {tuple(light.shape)} {memory} psfs {tuple(psfs.shape)} shared {fraction is not None}"
     return _Scene(light, psfs, lower, fraction, about, products)
+
+
+def _overlapping(draw: random.Random) -> tuple[_Scene, int, bool, bool]:
+    """A scene, the side of windows, whether PSFs are flipped, and whether the gradient of weights is meant."""
+    scene = _gathered(draw)
+    step, side = overlap_ops.size_step(scene.light.dtype), scene.psfs.shape[-1]
+    sizes = [n for n in range(step, 400, step) if n >= side and overlap_ops.is_window_size(n, scene.light.dtype)]
+    size = draw.choice(sizes[: draw.choice((1, 4, len(sizes)))])  # small ones, in which tiles are many, more often
+    return scene, size, draw.random() < 0.5, scene.fraction is not None and draw.random() < 0.3
+
+
+def _pixels(draw: random.Random, scene: _Scene) -> Tensor:
+    pixels = torch.randn(len(scene.light), scene.light.shape[1], *scene.lower.shape[-2:], dtype=scene.light.dtype)
+    return pixels.mT.contiguous().mT if draw.random() < 0.3 else pixels
+
+
+def _transform_error(light: Tensor, other: Tensor, size: int) -> float:
+    r"""Bound what a convolution by transforms is off by: normwise, as each of its samples is a sum over the window.
+
+    A transform of n samples is off by :math:`\gamma_{c \log_2 n}` of the norm of its input, where a stage of radix 5 or
+    less rounds each sample at most c = 24 times (Higham, 24.1). By Cauchy and Schwarz, errors of the two spectra and of
+    their product each reach :math:`|x|_2 |h|_2`, those of the transform back :math:`|x|_2 |h|_1`.
+    """
+    norms = light.double().square().sum((-2, -1)).sqrt().max(), other.double().square().sum((-2, -1)).sqrt().max()
+    largest = other.double().abs().sum((-2, -1)).max()
+    roundings = 24 * 2 * size.bit_length() + 8
+    return float(gamma(roundings, light.dtype) * norms[0] * (3 * norms[1] + largest) * len(light))
 
 
 def _layers(

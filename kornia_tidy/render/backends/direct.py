@@ -3,8 +3,8 @@
 A block of 4 x 32 pixels (in float32) is convolved with the PSFs of its own layers and with no other: P x P products a
 pixel for each. For PSFs of up to some 40 pixels that is faster than transforms, whose tiles are larger and hold more
 layers. The work is done in C (``direct.c``), compiled on the machine that it runs on, see
-:mod:`kornia_tidy.kernels.build`. The gradient with respect to the image is made by tiles: a pixel's light goes to
-pixels of many layers.
+:mod:`kornia_tidy.kernels.build`. The gradient with respect to the image is made by overlapping windows
+(``overlap.c``): a pixel's light goes to pixels of many layers.
 """
 
 from __future__ import annotations
@@ -18,13 +18,12 @@ from kornia_tidy.kernels import gather_ops
 from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.gather_ops import SOURCE, gather_direct, gather_direct_psf_gradient
 from kornia_tidy.kernels.occlusion_ops import occlusion_direct
+from kornia_tidy.kernels.overlap_ops import scatter_overlap
 from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends import direct_occlusion
 from kornia_tidy.render.backends.allocator import keep_memory
-from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
-from kornia_tidy.render.backends.tiled import gather_gradients
+from kornia_tidy.render.backends.tile_plan import OVERLAPS, WINDOWS, choose_grid
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.cost_model import DirectWork, Work
 from kornia_tidy.render.scene import Labels, LayeredScene
@@ -66,7 +65,7 @@ class DirectBackend:
         return gather_direct(scene.plane, scene.psfs, scene.labels.layer_index, scene.labels.layer_weight)
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-        """Return the gradients of PSFs and layer weight directly, those of the image and of occlusion by tiles."""
+        """Return the gradients of PSFs and layer weight directly, that of the image and of occlusion by transforms."""
         keep_memory()
         labels, layers, side = scene.labels, len(scene.psfs), scene.psfs.shape[-1]
         if scene.compositing == "occlusion":
@@ -76,8 +75,8 @@ class DirectBackend:
         plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
         if wants_gradient(tensors[0]):
-            plan = plan_blocks(labels, layers, choose_grid(labels, layers, side), BLOCKS, side - 1)
-            of_plane, _, _ = gather_gradients(plane, psfs, gradient, plan, (True, False, False))
+            size = choose_grid(labels, layers, side, OVERLAPS).size
+            of_plane = scatter_overlap(gradient, psfs, index, weight, size, correlate=True)
         if wants_gradient(tensors[1]):
             of_psfs = gather_direct_psf_gradient(plane, gradient, index, weight, layers)
         if wants_gradient(tensors[2]):

@@ -2,8 +2,8 @@
 
 Seen through PSFs of P pixels, a tile needs a window of ``size = tile + P - 1`` pixels a side, which is transformed.
 Larger tiles waste less on their overlap, smaller ones hold fewer layers: the grid with the lowest cost is chosen from a
-sample of the scene's labels. Gather and scatter work on blocks of two tiles (:data:`BLOCKS`), occlusion on single
-windows (:data:`WINDOWS`).
+sample of the scene's labels. Gather and scatter work on blocks of two tiles (:data:`BLOCKS`), in C on single ones
+(:data:`OVERLAPS`), occlusion on single windows (:data:`WINDOWS`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.render.cost_model import TiledOcclusionWork, TiledWork, seconds_of
+from kornia_tidy.render.cost_model import OverlapWork, TiledOcclusionWork, TiledWork, seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.cost_store import settled_profile
 from kornia_tidy.render.scene import SAMPLE, Labels
@@ -35,6 +35,8 @@ class TileKind:
         windowed: a layer counts wherever it lies in the window, not only in the tile.
         chunk_bytes: that the planes of a chunk may take on a processor, near its cache (see allocator.py), and
         accelerator_bytes: on an accelerator, enough to keep it busy.
+        every: sides are multiples of it.
+        work: what the work of gather and scatter is counted as.
     """
 
     sizes: tuple[int, ...]
@@ -43,6 +45,8 @@ class TileKind:
     windowed: bool
     chunk_bytes: int
     accelerator_bytes: int = 256 << 20
+    every: int = 1
+    work: type[TiledWork] = TiledWork
 
 
 # A block is two tiles: the left window is the real and the right one the imaginary part of a complex plane, so that one
@@ -56,6 +60,16 @@ BLOCKS = TileKind(
     across=2,
     windowed=False,
     chunk_bytes=5 << 20,
+)
+# Transforms in C, of vectors of rows and of columns. Nothing is held but a window and the spectra of the PSFs.
+OVERLAPS = TileKind(
+    sizes=tuple(32 * n for n in range(1, 65) if next_fast_size(n) == n),
+    candidates=8,
+    across=1,
+    windowed=False,
+    chunk_bytes=0,
+    every=32,
+    work=OverlapWork,
 )
 # With occlusion the neighbours of a tile emit and hide light in it. Bytes are those of all channels.
 WINDOWS = TileKind(
@@ -194,7 +208,8 @@ def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -
     smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
     whole = psf_size - 1 + max(height, math.ceil(width / kind.across))
     sizes = [size for size in kind.sizes if smallest <= size < 2 * whole][: kind.candidates]
-    return [_grid(batch, height, width, size, psf_size, kind) for size in sizes or [next_fast_size(smallest)]]
+    only = kind.every * next_fast_size(math.ceil(smallest / kind.every))
+    return [_grid(batch, height, width, size, psf_size, kind) for size in sizes or [only]]
 
 
 def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: TileKind) -> Grid:
@@ -217,7 +232,7 @@ def _works(grids: list[Grid], present: list[Tensor], blended: int, kind: TileKin
         return [TiledOcclusionWork(grid.size, tuple(own), n) for grid, own, n in zip(grids, held, pixels, strict=True)]
     layers, *pairs = torch.stack([present[0].any(0).sum(), *(own.sum() for own in present)]).tolist()
     return [
-        TiledWork(grid.size, grid.blocks, count, layers, n, blended)
+        kind.work(grid.size, grid.blocks, count, layers, n, blended)
         for grid, count, n in zip(grids, pairs, pixels, strict=True)
     ]
 

@@ -1,0 +1,668 @@
+// Convolution by transforms of windows that overlap, each with the PSFs of the layers in its tile and with no other:
+// overlap-save for gather, overlap-add for scatter, its transpose, and the gradient of both with respect to the PSFs.
+//
+// A window of rows x columns samples holds a tile of (rows - side + 1) x (columns - side + 1) pixels. It is transformed as
+// half as many complex samples: column j is a real part, column j + columns / 2 its imaginary part, and column j is turned
+// by exp(i pi j / columns). That diagonalises a convolution whose light changes its sign where it wraps around from right
+// to left (right-angle convolution; Nussbaumer 1981); what wraps around is not used. So no sample is lost to symmetry.
+//
+// LANES columns are transformed side by side, one in each lane, then LANES rows, all in the processor's cache. Forward
+// transforms decimate in frequency and backward ones in time, so that frequencies stay in the order they fall out in.
+//
+// Layers are given as in tile_plan.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one.
+//
+// Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
+
+#include <math.h>
+#include <stdlib.h>
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+#include "vectors.h"
+
+enum { STAGES = 16 };        // of a transform of up to 2^31 samples by fours
+enum { OUTSIDE = -2 };       // label of a sample that is no pixel of the tile: no layer, nor the one before the first
+
+typedef struct {
+    vec re, im;
+} wave;
+
+// The fields of `_Tiles` in overlap_ops.py. Strides count elements; width and height are those of the labelled pixels.
+typedef struct {
+    int64_t images, channels, height, width, layers, side, threads;
+    int64_t rows, columns;         // samples of a window: multiples of LANES and of 2 * LANES, products of 2, 3 and 5
+    int64_t origin;                // row and column of a window at which its tile begins: 0 or side - 1
+    int64_t correlate;             // 1: with PSFs flipped by 180 degrees
+    int64_t weight_gradient;       // 0: blend by weights; 1: the next layer less the pixel's own
+    int64_t plane_image, plane_channel, plane_row, pixels_image, pixels_channel, pixels_row;
+    int64_t index_image, index_row, weight_image, weight_row;
+    const REAL *psfs;              // (layers, channels, side, side); not for the gradient of the PSFs
+    const int64_t *index;          // (images, height, width)
+    const REAL *weight;            // like index, or null
+    const REAL *plane;             // (images, channels, height + side - 1, width + side - 1); not for scatter
+    const REAL *pixels;            // (images, channels, height, width); not for gather
+    REAL *out;                     // gather: as pixels; scatter: as the plane, zeros; gradient: as the PSFs, zeros
+} tiles;
+
+// One stage of a transform: `length` samples are cut into `radix` interleaved ones.
+typedef struct {
+    int32_t radix, length;
+    const REAL *turns;  // (length / radix, radix - 1) complex: exp(-2 pi i j q / length)
+} stage;
+
+typedef struct {
+    int64_t length;
+    int count;
+    stage stages[STAGES];
+} transform;
+
+INLINE wave turned(wave x, REAL re, REAL im) { return (wave){x.re * re - x.im * im, x.re * im + x.im * re}; }
+INLINE wave sum(wave a, wave b) { return (wave){a.re + b.re, a.im + b.im}; }
+INLINE wave difference(wave a, wave b) { return (wave){a.re - b.re, a.im - b.im}; }
+
+// The transform of a few samples; `sign` is that of the exponent.
+INLINE void few(wave *x, int radix, const REAL sign) {
+    if (radix == 2) {
+        wave a = x[0];
+        x[0] = sum(a, x[1]);
+        x[1] = difference(a, x[1]);
+    } else if (radix == 4) {
+        wave a = sum(x[0], x[2]), b = difference(x[0], x[2]), c = sum(x[1], x[3]);
+        wave e = difference(x[1], x[3]);
+        wave d = sign > 0 ? (wave){-e.im, e.re} : (wave){e.im, -e.re};
+        x[0] = sum(a, c);
+        x[1] = sum(b, d);
+        x[2] = difference(a, c);
+        x[3] = difference(b, d);
+    } else if (radix == 3) {
+        const REAL s = sign * (REAL)0.86602540378443864676;
+        wave a = sum(x[1], x[2]), e = difference(x[1], x[2]);
+        wave b = {x[0].re - (REAL)0.5 * a.re, x[0].im - (REAL)0.5 * a.im};
+        wave d = {-s * e.im, s * e.re};
+        x[0] = sum(x[0], a);
+        x[1] = sum(b, d);
+        x[2] = difference(b, d);
+    } else {
+        const REAL c1 = (REAL)0.30901699437494742410, c2 = (REAL)-0.80901699437494742410;
+        const REAL s1 = sign * (REAL)0.95105651629515357212, s2 = sign * (REAL)0.58778525229247312917;
+        wave a = sum(x[1], x[4]), b = sum(x[2], x[3]), d = difference(x[1], x[4]), e = difference(x[2], x[3]);
+        wave p = {x[0].re + c1 * a.re + c2 * b.re, x[0].im + c1 * a.im + c2 * b.im};
+        wave q = {x[0].re + c2 * a.re + c1 * b.re, x[0].im + c2 * a.im + c1 * b.im};
+        wave u = {-(s1 * d.im + s2 * e.im), s1 * d.re + s2 * e.re};
+        wave v = {-(s2 * d.im - s1 * e.im), s2 * d.re - s1 * e.re};
+        x[0] = sum(x[0], sum(a, b));
+        x[1] = sum(p, u);
+        x[4] = difference(p, u);
+        x[2] = sum(q, v);
+        x[3] = difference(q, v);
+    }
+}
+
+INLINE void forward_stage(wave *x, int64_t n, const stage *s, int radix) {
+    int64_t step = s->length / radix;
+    for (int64_t j = 0; j < step; j++) {
+        const REAL *turn = s->turns + 2 * j * (radix - 1);
+        for (int64_t b = j; b < n; b += s->length) {
+            wave y[5];
+#pragma GCC unroll 5
+            for (int q = 0; q < radix; q++) y[q] = x[b + q * step];
+            few(y, radix, -1);
+            x[b] = y[0];
+#pragma GCC unroll 5
+            for (int q = 1; q < radix; q++) x[b + q * step] = turned(y[q], turn[2 * q - 2], turn[2 * q - 1]);
+        }
+    }
+}
+
+INLINE void backward_stage(wave *x, int64_t n, const stage *s, int radix) {
+    int64_t step = s->length / radix;
+    for (int64_t j = 0; j < step; j++) {
+        const REAL *turn = s->turns + 2 * j * (radix - 1);
+        for (int64_t b = j; b < n; b += s->length) {
+            wave y[5];
+            y[0] = x[b];
+#pragma GCC unroll 5
+            for (int q = 1; q < radix; q++) y[q] = turned(x[b + q * step], turn[2 * q - 2], -turn[2 * q - 1]);
+            few(y, radix, 1);
+#pragma GCC unroll 5
+            for (int q = 0; q < radix; q++) x[b + q * step] = y[q];
+        }
+    }
+}
+
+static void forward(wave *x, const transform *t) {
+    for (int i = 0; i < t->count; i++) {
+        const stage *s = t->stages + i;
+        if (s->radix == 4) forward_stage(x, t->length, s, 4);
+        else if (s->radix == 3) forward_stage(x, t->length, s, 3);
+        else if (s->radix == 2) forward_stage(x, t->length, s, 2);
+        else forward_stage(x, t->length, s, 5);
+    }
+}
+
+static void backward(wave *x, const transform *t) {
+    for (int i = t->count - 1; i >= 0; i--) {
+        const stage *s = t->stages + i;
+        if (s->radix == 4) backward_stage(x, t->length, s, 4);
+        else if (s->radix == 3) backward_stage(x, t->length, s, 3);
+        else if (s->radix == 2) backward_stage(x, t->length, s, 2);
+        else backward_stage(x, t->length, s, 5);
+    }
+}
+
+// Lists the stages of a transform in `memory`, which has room for 2 * length complex numbers, and returns the rest of it.
+static REAL *plan(transform *t, int64_t length, REAL *memory) {
+    const int radices[] = {4, 3, 5, 2};
+    *t = (transform){.length = length};
+    for (int k = 0; k < 4; k++)
+        for (int radix = radices[k]; length % radix == 0; length /= radix) {
+            t->stages[t->count++] = (stage){radix, length, memory};
+            for (int64_t j = 0; j < length / radix; j++)
+                for (int q = 1; q < radix; q++, memory += 2) {
+                    double angle = -2 * M_PI * (double)(j * q) / (double)length;
+                    memory[0] = cos(angle);
+                    memory[1] = sin(angle);
+                }
+        }
+    return memory;
+}
+
+// ---------------------------------------------------------------------- rows to lanes
+
+#define IS_float 1
+#define IS_double 0
+#define JOINED(a, b) a##b
+#define IS(type) JOINED(IS_, type)
+#ifdef __AVX__
+#define PART 32
+#else
+#define PART 16
+#endif
+
+enum { PIECE = PART / sizeof(REAL), PIECES = LANES / PIECE };
+typedef REAL part __attribute__((vector_size(PART), may_alias));
+
+#if defined(__clang__) || __GNUC__ >= 12
+#define PICK(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#elif IS(REAL)
+typedef int32_t places __attribute__((vector_size(PART)));
+#define PICK(a, b, ...) __builtin_shuffle(a, b, (places){__VA_ARGS__})
+#else
+typedef int64_t places __attribute__((vector_size(PART)));
+#define PICK(a, b, ...) __builtin_shuffle(a, b, (places){__VA_ARGS__})
+#endif
+
+// Exchanges the upper right and the lower left of every square of 2 * half x 2 * half numbers.
+#define EXCHANGE(x, half, first, second)                       \
+    for (int i = 0; i < PIECE; i++)                            \
+        if (!(i & half)) {                                     \
+            part a = x[i], b = x[i + half];                    \
+            x[i] = PICK(a, b, first), x[i + half] = PICK(a, b, second); \
+        }
+#define LIST(...) __VA_ARGS__
+
+INLINE void transpose_piece(part *x) {
+#if PART == 32 && IS(REAL)
+    EXCHANGE(x, 4, LIST(0, 1, 2, 3, 8, 9, 10, 11), LIST(4, 5, 6, 7, 12, 13, 14, 15))
+    EXCHANGE(x, 2, LIST(0, 1, 8, 9, 4, 5, 12, 13), LIST(2, 3, 10, 11, 6, 7, 14, 15))
+    EXCHANGE(x, 1, LIST(0, 8, 2, 10, 4, 12, 6, 14), LIST(1, 9, 3, 11, 5, 13, 7, 15))
+#elif PART == 32 || IS(REAL)
+    EXCHANGE(x, 2, LIST(0, 1, 4, 5), LIST(2, 3, 6, 7))
+    EXCHANGE(x, 1, LIST(0, 4, 2, 6), LIST(1, 5, 3, 7))
+#else
+    EXCHANGE(x, 1, LIST(0, 2), LIST(1, 3))
+#endif
+}
+
+// Turns LANES waves, whose lanes become waves. `to` is LANES waves apart from nothing else.
+INLINE void transpose(const wave *from, wave *to) {
+    for (int plane = 0; plane < 2; plane++)
+        for (int r = 0; r < PIECES; r++)
+            for (int c = 0; c < PIECES; c++) {
+                const part *source = (const part *)from + plane * PIECES + c;
+                part *target = (part *)to + plane * PIECES + r, x[PIECE];
+#pragma GCC unroll 8
+                for (int i = 0; i < PIECE; i++) x[i] = source[(r * PIECE + i) * 2 * PIECES];
+                transpose_piece(x);
+#pragma GCC unroll 8
+                for (int i = 0; i < PIECE; i++) target[(c * PIECE + i) * 2 * PIECES] = x[i];
+            }
+}
+
+// ---------------------------------------------------------------------- windows
+
+INLINE int thread_number(void) {
+#ifdef _OPENMP
+    return omp_get_thread_num();
+#else
+    return 0;
+#endif
+}
+
+// What all windows of one call share.
+typedef struct {
+    const tiles *s;
+    int64_t tile_rows, tile_columns;                // pixels of a tile
+    int64_t down, across, tiles;                    // tiles of an image
+    int64_t groups, bands, waves;                   // LANES columns of waves, LANES rows, waves in a row
+    transform in_rows, in_columns;
+    REAL scale;                                     // of a transform there and back
+    REAL *numbers;                                  // of the transforms
+    wave *turns;                                    // (groups,): exp(i pi j / columns)
+    uint8_t *needed;                                // (tiles, layers, groups): whether a layer has pixels there
+    int64_t *place;                                 // (layers,): of a layer's spectrum, -1 for layers without pixels
+    wave *psfs;                                     // (layers with pixels, bands, waves) in one channel; or of slabs
+} work;
+
+// What a thread computes a tile in. Planes of numbers are (2 * groups, rows) vectors, spectra (bands, waves).
+typedef struct {
+    vec *light, *label, *weight, *sums;
+    wave *spectrum, *total, *half, *row;
+} desk;
+
+// A tile: its image, its number there, its first pixel, and how much of it lies in the image.
+typedef struct {
+    int64_t image, number, top, left, height, width;
+} tile;
+
+INLINE tile tile_at(const work *w, int64_t image, int64_t number) {
+    const int64_t top = number / w->across * w->tile_rows, left = number % w->across * w->tile_columns;
+    return (tile){image, number, top, left, least(w->tile_rows, w->s->height - top), least(w->tile_columns, w->s->width - left)};
+}
+
+INLINE uint8_t *needed_by(const work *w, tile t, int64_t layer) {
+    return w->needed + ((t.image * w->down * w->across + t.number) * w->s->layers + layer) * w->groups;
+}
+
+INLINE int any_of(const uint8_t *needed, int64_t groups) { return memchr(needed, 1, groups) != 0; }
+
+// The spectrum of a plane of numbers; groups of columns that are not needed are black.
+static void analyse(const work *w, const vec *light, const uint8_t *needed, wave *column, wave *spectrum) {
+    const int64_t rows = w->s->rows;
+    for (int64_t g = 0; g < w->groups; g++) {
+        if (needed && !needed[g]) {
+            for (int64_t band = 0; band < w->bands; band++)
+                memset(spectrum + band * w->waves + g * LANES, 0, LANES * sizeof(wave));
+            continue;
+        }
+        const vec *left = light + g * rows, *right = left + w->groups * rows;
+        const wave turn = w->turns[g];
+        for (int64_t y = 0; y < rows; y++)
+            column[y] = (wave){left[y] * turn.re - right[y] * turn.im, left[y] * turn.im + right[y] * turn.re};
+        forward(column, &w->in_columns);
+        for (int64_t band = 0; band < w->bands; band++)
+            transpose(column + band * LANES, spectrum + band * w->waves + g * LANES);
+    }
+    for (int64_t band = 0; band < w->bands; band++) forward(spectrum + band * w->waves, &w->in_rows);
+}
+
+// Multiplies by the spectrum of a PSF, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
+INLINE void multiply(const wave *x, const wave *psf, int64_t count, REAL sign, int add, wave *product) {
+    for (int64_t k = 0; k < count; k++) {
+        vec im = sign * psf[k].im;
+        wave z = {x[k].re * psf[k].re - x[k].im * im, x[k].re * im + x[k].im * psf[k].re};
+        product[k] = add ? sum(product[k], z) : z;
+    }
+}
+
+// Transforms a row of waves back and hands it on to the columns that are needed.
+static void row_back(const work *w, wave *row, int64_t band, const uint8_t *needed, wave *half) {
+    backward(row, &w->in_rows);
+    for (int64_t g = 0; g < w->groups; g++)
+        if (!needed || needed[g]) transpose(row + g * LANES, half + g * w->s->rows + band * LANES);
+}
+
+// Copies numbers into a black window, from a row and a column of it on.
+static void cut(const work *w, const REAL *from, int64_t pitch, int64_t height, int64_t width, int64_t origin, vec *to) {
+    const int64_t rows = w->s->rows;
+    memset(to, 0, 2 * w->groups * rows * sizeof(vec));
+    for (int64_t y = 0; y < height; y++)
+        for (int64_t x = 0, column = origin; x < width;) {
+            const int64_t lane = column % LANES, count = least(LANES - lane, width - x);
+            REAL *target = (REAL *)(to + column / LANES * rows + origin + y) + lane;
+            if (count == LANES) memcpy(target, from + y * pitch + x, sizeof(vec));
+            else memcpy(target, from + y * pitch + x, count * sizeof(REAL));
+            x += count, column += count;
+        }
+}
+
+// Cuts the window of a tile out of the plane, or the tile out of the pixels.
+INLINE void cut_window(const work *w, tile t, int64_t channel, vec *to) {
+    const tiles *s = w->s;
+    const REAL *from = s->plane + t.image * s->plane_image + channel * s->plane_channel + t.top * s->plane_row + t.left;
+    cut(w, from, s->plane_row, t.height + s->side - 1, t.width + s->side - 1, 0, to);
+}
+
+INLINE void cut_tile(const work *w, tile t, int64_t channel, vec *to) {
+    const tiles *s = w->s;
+    const REAL *from = s->pixels + t.image * s->pixels_image + channel * s->pixels_channel + t.top * s->pixels_row + t.left;
+    cut(w, from, s->pixels_row, t.height, t.width, s->origin, to);
+}
+
+// Reads the labels and weights of a tile as numbers, in the layout of its window.
+static void read_labels(const work *w, tile t, desk *d) {
+    const tiles *s = w->s;
+    const int64_t *index = s->index + t.image * s->index_image + t.top * s->index_row + t.left;
+    for (int64_t n = 0; n < 2 * w->groups * s->rows; n++) d->label[n] = (vec){0} + OUTSIDE;
+    for (int64_t y = 0; y < t.height; y++)
+        for (int64_t x = 0, column = s->origin; x < t.width;) {
+            const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
+            REAL *target = (REAL *)(d->label + column / LANES * s->rows + s->origin + y) + lane;
+            for (int64_t i = 0; i < count; i++) target[i] = index[y * s->index_row + x + i];
+            x += count, column += count;
+        }
+    if (!s->weight) return;
+    const REAL *weight = s->weight + t.image * s->weight_image + t.top * s->weight_row + t.left;
+    cut(w, weight, s->weight_row, t.height, t.width, s->origin, d->weight);
+}
+
+// The share of a layer in samples with some labels and, where the scene has them, weights of the next layer.
+INLINE vec share(const tiles *s, vec label, const vec *weight, int64_t layer) {
+    vec own = -__builtin_convertvector(label == (REAL)layer, vec);
+    if (!s->weight) return own;
+    vec next = -__builtin_convertvector(label == (REAL)(layer - 1), vec);
+    return s->weight_gradient ? next - own : own * (1 - *weight) + next * *weight;
+}
+
+// Adds the light of a column of waves and its layer's share to the sums of a tile.
+INLINE void add_shares(const work *w, tile t, int64_t layer, int64_t g, const wave *column, desk *d) {
+    const tiles *s = w->s;
+    const wave turn = w->turns[g];
+    for (int64_t y = s->origin; y < s->origin + t.height; y++) {
+        const int64_t n = g * s->rows + y, m = n + w->groups * s->rows;
+        const wave x = column[y];
+        d->sums[n] += share(s, d->label[n], d->weight + n, layer) * (x.re * turn.re + x.im * turn.im);
+        d->sums[m] += share(s, d->label[m], d->weight + m, layer) * (x.im * turn.re - x.re * turn.im);
+    }
+}
+
+static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
+    const tiles *s = w->s;
+    const int64_t rows = s->rows;
+    cut_window(w, t, channel, d->light);
+    analyse(w, d->light, 0, d->half, d->spectrum);
+    read_labels(w, t, d);
+    memset(d->sums, 0, 2 * w->groups * rows * sizeof(vec));
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        const uint8_t *needed = needed_by(w, t, layer);
+        if (!any_of(needed, w->groups)) continue;
+        const wave *psf = w->psfs + w->place[layer] * w->bands * w->waves;
+        for (int64_t band = 0; band < w->bands; band++) {
+            const wave *x = d->spectrum + band * w->waves, *y = psf + band * w->waves;
+            if (s->correlate) multiply(x, y, w->waves, -1, 0, d->row);
+            else multiply(x, y, w->waves, 1, 0, d->row);
+            row_back(w, d->row, band, needed, d->half);
+        }
+        for (int64_t g = 0; g < w->groups; g++)
+            if (needed[g]) {
+                backward(d->half + g * rows, &w->in_columns);
+                add_shares(w, t, layer, g, d->half + g * rows, d);
+            }
+    }
+    REAL *out = s->out + ((t.image * s->channels + channel) * s->height + t.top) * s->width + t.left;
+    for (int64_t y = 0; y < t.height; y++)
+        for (int64_t x = 0, column = s->origin; x < t.width;) {
+            const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
+            const REAL *from = (const REAL *)(d->sums + column / LANES * rows + s->origin + y) + lane;
+            memcpy(out + y * s->width + x, from, count * sizeof(REAL));
+            x += count, column += count;
+        }
+}
+
+// The spectrum of a layer's share of the pixels, which lie in `sums`.
+static void analyse_layer(const work *w, tile t, int64_t layer, desk *d) {
+    const int64_t rows = w->s->rows;
+    const uint8_t *needed = needed_by(w, t, layer);
+    for (int64_t g = 0; g < 2 * w->groups; g++)
+        for (int64_t n = g * rows; needed[g % w->groups] && n < (g + 1) * rows; n++)
+            d->light[n] = share(w->s, d->label[n], d->weight + n, layer) * d->sums[n];
+    analyse(w, d->light, needed, d->half, d->spectrum);
+}
+
+// Adds the first numbers of each row of a wave's columns to a plane.
+static void add_columns(const work *w, int64_t g, const wave *column, int64_t height, int64_t width, REAL *out, int64_t pitch) {
+    const wave turn = w->turns[g];
+    for (int side = 0; side < 2; side++) {
+        const int64_t first = (g + side * w->groups) * LANES, count = least(LANES, width - first);
+        for (int64_t y = 0; count > 0 && y < height; y++) {
+            const wave x = column[y];
+            const vec value = side ? x.im * turn.re - x.re * turn.im : x.re * turn.re + x.im * turn.im;
+            REAL *target = out + y * pitch + first;
+            vec there = {0};
+            if (count == LANES) {
+                memcpy(&there, target, sizeof(vec));
+                there += value;
+                memcpy(target, &there, sizeof(vec));
+            } else {
+                memcpy(&there, target, count * sizeof(REAL));
+                there += value;
+                memcpy(target, &there, count * sizeof(REAL));
+            }
+        }
+    }
+}
+
+static void scatter_tile(const work *w, int64_t channel, tile t, desk *d) {
+    const tiles *s = w->s;
+    const int64_t all = w->bands * w->waves;
+    cut_tile(w, t, channel, d->sums);
+    read_labels(w, t, d);
+    memset(d->total, 0, all * sizeof(wave));
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        if (!any_of(needed_by(w, t, layer), w->groups)) continue;
+        analyse_layer(w, t, layer, d);
+        const wave *psf = w->psfs + w->place[layer] * all;
+        if (s->correlate) multiply(d->spectrum, psf, all, -1, 1, d->total);
+        else multiply(d->spectrum, psf, all, 1, 1, d->total);
+    }
+    for (int64_t band = 0; band < w->bands; band++) row_back(w, d->total + band * w->waves, band, 0, d->half);
+    const int64_t height = s->height + s->side - 1, width = s->width + s->side - 1;
+    REAL *out = s->out + ((t.image * s->channels + channel) * height + t.top) * width + t.left;
+    for (int64_t g = 0; g < w->groups; g++) {
+        backward(d->half + g * s->rows, &w->in_columns);
+        add_columns(w, g, d->half + g * s->rows, t.height + s->side - 1, t.width + s->side - 1, out, width);
+    }
+}
+
+// Adds the spectra of a tile's correlations to those of a slab.
+static void correlate_tile(const work *w, int64_t channel, tile t, desk *d, wave *slab) {
+    const tiles *s = w->s;
+    const int64_t all = w->bands * w->waves;
+    cut_window(w, t, channel, d->light);
+    analyse(w, d->light, 0, d->half, d->total);
+    cut_tile(w, t, channel, d->sums);
+    read_labels(w, t, d);
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        if (!any_of(needed_by(w, t, layer), w->groups)) continue;
+        analyse_layer(w, t, layer, d);
+        wave *found = slab + w->place[layer] * all;
+        if (s->correlate) multiply(d->total, d->spectrum, all, -1, 1, found);
+        else multiply(d->spectrum, d->total, all, -1, 1, found);
+    }
+}
+
+// ---------------------------------------------------------------------- a call
+
+enum { GATHER, SCATTER, CORRELATE };
+
+// Notes the layers of each tile, by groups of columns. Returns whether all pixels lie in a layer.
+static int note_layers(const work *w) {
+    const tiles *s = w->s;
+    int bad = 0;
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads) reduction(| : bad)
+    for (int64_t n = 0; n < s->images * w->tiles; n++) {
+        const tile t = tile_at(w, n / w->tiles, n % w->tiles);
+        uint8_t *needed = needed_by(w, t, 0);
+        for (int64_t y = t.top; y < t.top + t.height; y++) {
+            const int64_t *index = s->index + t.image * s->index_image + y * s->index_row + t.left;
+            const REAL *weight = s->weight ? s->weight + t.image * s->weight_image + y * s->weight_row + t.left : 0;
+            for (int64_t x = 0; x < t.width; x++) {
+                const int64_t group = (x + s->origin) / LANES % w->groups;
+                const int next = weight && (s->weight_gradient || !(weight[x] <= 0));
+                if ((uint64_t)index[x] >= (uint64_t)(s->layers - next)) {
+                    bad = 1;
+                    continue;
+                }
+                needed[index[x] * w->groups + group] = 1;
+                if (next) needed[(index[x] + 1) * w->groups + group] = 1;
+            }
+        }
+    }
+    return !bad;
+}
+
+// Numbers the layers that have pixels and returns how many there are.
+static int64_t place_layers(const work *w) {
+    int64_t present = 0;
+    for (int64_t layer = 0; layer < w->s->layers; layer++) {
+        w->place[layer] = -1;
+        for (int64_t n = 0; n < w->s->images * w->tiles && w->place[layer] < 0; n++)
+            if (any_of(needed_by(w, tile_at(w, n / w->tiles, n % w->tiles), layer), w->groups)) w->place[layer] = present++;
+    }
+    return present;
+}
+
+// Makes the spectra of the PSFs that are needed, in one channel, scaled for a transform there and back.
+static void transform_psfs(const work *w, int64_t channel, desk *desks) {
+    const tiles *s = w->s;
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        if (w->place[layer] < 0) continue;
+        desk *d = desks + thread_number();
+        cut(w, s->psfs + (layer * s->channels + channel) * s->side * s->side, s->side, s->side, s->side, 0, d->light);
+        for (int64_t n = 0; n < 2 * w->groups * s->rows; n++) d->light[n] *= w->scale;
+        analyse(w, d->light, 0, d->half, w->psfs + w->place[layer] * w->bands * w->waves);
+    }
+}
+
+// Gathers or scatters all tiles of a channel. Tiles whose windows overlap are not scattered at the same time, so that
+// the order of additions is always the same.
+static void render_tiles(const work *w, int64_t channel, desk *desks, int kind) {
+    const tiles *s = w->s;
+    const int64_t down = kind == SCATTER ? (s->rows + w->tile_rows - 1) / w->tile_rows : 1;
+    const int64_t across = kind == SCATTER ? (s->columns + w->tile_columns - 1) / w->tile_columns : 1;
+    for (int64_t phase = 0; phase < least(down, w->down) * across; phase++) {
+        const int64_t y = phase / across, x = phase % across;
+        const int64_t own = (w->down - y + down - 1) / down, beside = (w->across - x + across - 1) / across;
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+        for (int64_t n = 0; n < s->images * own * beside; n++) {
+            const int64_t row = n / beside % own * down + y, column = n % beside * across + x;
+            const tile t = tile_at(w, n / (own * beside), row * w->across + column);
+            if (kind == SCATTER) scatter_tile(w, channel, t, desks + thread_number());
+            else gather_tile(w, channel, t, desks + thread_number());
+        }
+    }
+}
+
+// Correlates all tiles of a channel, a slab of them in each thread; then the slabs are added in their order.
+static void correlate_tiles(const work *w, int64_t channel, desk *desks, int64_t present) {
+    const tiles *s = w->s;
+    const int64_t all = w->bands * w->waves, count = s->images * w->tiles;
+    memset(w->psfs, 0, s->threads * present * all * sizeof(wave));
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+    for (int64_t slab = 0; slab < s->threads; slab++)
+        for (int64_t n = count * slab / s->threads; n < count * (slab + 1) / s->threads; n++) {
+            const tile t = tile_at(w, n / w->tiles, n % w->tiles);
+            correlate_tile(w, channel, t, desks + thread_number(), w->psfs + slab * present * all);
+        }
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        if (w->place[layer] < 0) continue;
+        desk *d = desks + thread_number();
+        wave *found = w->psfs + w->place[layer] * all;
+        for (int64_t slab = 1; slab < s->threads; slab++)
+            for (int64_t k = 0; k < all; k++) found[k] = sum(found[k], found[slab * present * all + k]);
+        for (int64_t k = 0; k < all; k++) found[k] = (wave){found[k].re * w->scale, found[k].im * w->scale};
+        for (int64_t band = 0; band < w->bands; band++) row_back(w, found + band * w->waves, band, 0, d->half);
+        REAL *out = s->out + (layer * s->channels + channel) * s->side * s->side;
+        for (int64_t g = 0; g < w->groups; g++) {
+            backward(d->half + g * s->rows, &w->in_columns);
+            add_columns(w, g, d->half + g * s->rows, s->side, s->side, out, s->side);
+        }
+    }
+}
+
+static void *take(int64_t count, size_t size) {
+    const size_t bytes = (count * size + sizeof(vec) - 1) / sizeof(vec) * sizeof(vec);
+    return aligned_alloc(sizeof(vec), bytes ? bytes : sizeof(vec));
+}
+
+static int take_desk(const work *w, desk *d) {
+    const int64_t plane = 2 * w->groups * w->s->rows, waves = w->bands * w->waves;
+    d->light = take(plane, sizeof(vec));
+    d->label = take(plane, sizeof(vec));
+    d->weight = take(w->s->weight ? plane : 0, sizeof(vec));
+    d->sums = take(plane, sizeof(vec));
+    d->spectrum = take(waves, sizeof(wave));
+    d->total = take(waves, sizeof(wave));
+    d->half = take(w->groups * w->s->rows, sizeof(wave));
+    d->row = take(w->waves, sizeof(wave));
+    return d->light && d->label && d->weight && d->sums && d->spectrum && d->total && d->half && d->row;
+}
+
+static void free_desk(desk *d) {
+    free(d->light);
+    free(d->label);
+    free(d->weight);
+    free(d->sums);
+    free(d->spectrum);
+    free(d->total);
+    free(d->half);
+    free(d->row);
+}
+
+// Computes in memory that was taken. Returns as the functions below.
+static int compute_in(work *w, desk *desks, int kind) {
+    const tiles *s = w->s;
+    if (!note_layers(w)) return 1;
+    plan(&w->in_columns, s->rows, plan(&w->in_rows, w->waves, w->numbers));
+    for (int64_t j = 0; j < w->waves; j++) {
+        w->turns[j / LANES].re[j % LANES] = cos(M_PI * (double)j / (double)s->columns);
+        w->turns[j / LANES].im[j % LANES] = sin(M_PI * (double)j / (double)s->columns);
+    }
+    const int64_t present = place_layers(w);
+    w->psfs = take(present * w->bands * w->waves * (kind == CORRELATE ? s->threads : 1), sizeof(wave));
+    if (!w->psfs) return 2;
+    for (int64_t channel = 0; channel < s->channels; channel++) {
+        if (kind == CORRELATE) {
+            correlate_tiles(w, channel, desks, present);
+            continue;
+        }
+        transform_psfs(w, channel, desks);
+        render_tiles(w, channel, desks, kind);
+    }
+    free(w->psfs);
+    return 0;
+}
+
+static int compute(const tiles *s, int kind) {
+    work w = {.s = s, .tile_rows = s->rows - s->side + 1, .tile_columns = s->columns - s->side + 1};
+    w.down = (s->height + w.tile_rows - 1) / w.tile_rows;
+    w.across = (s->width + w.tile_columns - 1) / w.tile_columns;
+    w.tiles = w.down * w.across;
+    w.waves = s->columns / 2, w.groups = w.waves / LANES, w.bands = s->rows / LANES;
+    w.scale = 1 / ((REAL)s->rows * (REAL)w.waves);
+    w.numbers = take(4 * (s->rows + w.waves), sizeof(REAL));
+    w.turns = take(w.groups, sizeof(wave));
+    w.place = take(s->layers, sizeof(int64_t));
+    w.needed = calloc(s->images * w.tiles * s->layers, w.groups);
+    desk *desks = calloc(s->threads, sizeof(desk));
+    int taken = desks && w.numbers && w.turns && w.place && w.needed;
+    for (int64_t n = 0; taken && n < s->threads; n++) taken = take_desk(&w, desks + n);
+    const int failed = taken ? compute_in(&w, desks, kind) : 2;
+    for (int64_t n = 0; desks && n < s->threads; n++) free_desk(desks + n);
+    free(desks);
+    free(w.numbers);
+    free(w.turns);
+    free(w.place);
+    free(w.needed);
+    return failed;
+}
+
+// Return 0, 1 if a pixel lies in no layer, 2 if there is no memory.
+int gather(const tiles *s) { return compute(s, GATHER); }
+
+int scatter(const tiles *s) { return compute(s, SCATTER); }
+
+int correlate(const tiles *s) { return compute(s, CORRELATE); }

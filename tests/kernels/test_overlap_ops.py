@@ -1,0 +1,200 @@
+"""Gather and scatter by overlapping windows as operators: values, gradients of any order, refused arguments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from kornia_tidy.kernels.overlap_ops import (
+    SOURCE,
+    gather_overlap,
+    is_window_size,
+    overlap_psf_gradient,
+    scatter_overlap,
+    size_step,
+)
+from tests.kernels import kernel_shapes
+from tests.kernels.operator_tester import OperatorTester, needs_compiler
+
+KINDS = ("nearest", "linear", "weight gradient")
+
+
+def scene(**changes: Any) -> dict[str, Any]:
+    """Arguments of ``gather_overlap``: 2 images, 2 channels, 3 layers, 3x3 PSFs."""
+    arguments = {
+        "plane": torch.randn(2, 2, 6, 19, dtype=torch.float64),
+        "psfs": torch.randn(3, 2, 3, 3, dtype=torch.float64),
+        "layer_index": torch.randint(2, (2, 4, 17)),
+        "layer_weight": torch.rand(2, 4, 17, dtype=torch.float64),
+        "size": 16,
+    }
+    return {**arguments, **changes}
+
+
+def pixels() -> torch.Tensor:
+    return torch.randn(2, 2, 4, 17, dtype=torch.float64)
+
+
+class OverlapTester(OperatorTester):
+    source = SOURCE
+    differentiable = (0, 1, 3)
+
+    def check_derivatives(self, operator, first, second, kind, correlate, *more) -> None:
+        """Of any order, to the first two arguments and to the weight."""
+        given = scene()
+        index, fixed = given["layer_index"], given["layer_weight"] if kind == "weight gradient" else None
+
+        def function(first, second, weight=fixed):
+            rest = index, weight, *more, 16, correlate, kind == "weight gradient"
+            return operator(first, second, *rest)
+
+        inputs = [first.requires_grad_(), second.requires_grad_()]
+        if kind == "linear":
+            inputs.append(given["layer_weight"].requires_grad_())
+        self.gradcheck(function, tuple(inputs))
+        assert torch.autograd.gradgradcheck(function, inputs, fast_mode=True)
+
+
+class TestGatherOverlap(OverlapTester):
+    draw = staticmethod(kernel_shapes.overlap_gather)
+
+    def smallest(self):
+        return gather_overlap(**scene())
+
+    @needs_compiler
+    @pytest.mark.parametrize("correlate", [False, True])
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_gradcheck_of_any_order(self, kind, correlate):
+        given = scene()
+        self.check_derivatives(torch.ops.kornia_tidy.gather_overlap, given["plane"], given["psfs"], kind, correlate)
+
+    @needs_compiler
+    def test_feature_negated_and_shared_memory(self):
+        """Views whose sign torch keeps as a bit, and planes that channels and images share."""
+        given = scene()
+        plane = torch.view_as_complex(torch.randn(2, 1, 6, 19, 2, dtype=torch.float64)).conj().imag
+        plane = plane.expand(-1, 2, -1, -1)
+        assert plane.is_neg()
+        index = given["layer_index"][:1].expand(2, -1, -1)
+        expected = gather_overlap(plane.clone().contiguous(), given["psfs"], index.contiguous(), None, 16)
+        assert torch.equal(gather_overlap(plane, given["psfs"], index, None, 16), expected)
+
+    @needs_compiler
+    @pytest.mark.parametrize("layer", [-(2**63), -1, 3, 2**40])
+    def test_exception_pixels_in_no_layer(self, layer):
+        """A depth that is not a number may give any of these."""
+        given = scene(layer_weight=None)
+        given["layer_index"][1, 3, 16] = layer
+        with pytest.raises(IndexError, match="a pixel lies in none of the 3 layers"):
+            gather_overlap(**given)
+
+    @needs_compiler
+    def test_exception_a_share_of_a_layer_beyond_the_last(self):
+        given = scene()
+        given["layer_index"][0, 0, 0], given["layer_weight"][0, 0, 0] = 2, 0.5
+        with pytest.raises(IndexError, match="a pixel lies in none of the 3 layers"):
+            gather_overlap(**given)
+
+    @needs_compiler
+    def test_feature_no_image_and_windows_much_larger_than_the_image(self):
+        given = scene()
+        empty = {name: x[:0] if name not in ("psfs", "size") else x for name, x in given.items()}
+        assert gather_overlap(**empty).shape == (0, 2, 4, 17)
+        large, small = gather_overlap(**{**given, "size": 480}), gather_overlap(**given)
+        self.assert_close(large, small, rtol=0, atol=1e-13)
+
+    @needs_compiler
+    def test_feature_threads_change_no_bit(self):
+        before, got = torch.get_num_threads(), []
+        given = scene(plane=torch.randn(2, 2, 82, 93, dtype=torch.float64), layer_weight=None)
+        given["layer_index"] = torch.randint(3, (2, 80, 91))
+        spread = {**given, "pixels": torch.randn(2, 2, 80, 91, dtype=torch.float64)}
+        del spread["plane"]
+        try:
+            for threads in (1, 2, 3):
+                torch.set_num_threads(threads)
+                got.append((gather_overlap(**given), scatter_overlap(**spread)))
+        finally:
+            torch.set_num_threads(before)
+        for gathered, scattered in got[1:]:
+            assert torch.equal(gathered, got[0][0])
+            assert torch.equal(scattered, got[0][1])
+
+    @pytest.mark.parametrize(
+        ("changes", "error", "words"),
+        [
+            ({"plane": torch.zeros(2, 2, 6, 19).half()}, TypeError, "plane must be float32 or float64, got .*float16"),
+            ({"psfs": torch.zeros(3, 2, 3, 3)}, TypeError, "psfs must be of the light's dtype torch.float64, got .*32"),
+            ({"layer_index": torch.zeros(2, 4, 17)}, TypeError, "layer_index must be int64, got torch.float32"),
+            ({"layer_weight": torch.zeros(2, 4, 17)}, TypeError, "layer_weight must be of the light's dtype .*float32"),
+            ({"plane": torch.zeros(6, 19).double()}, ValueError, r"plane must have four dimensions, .*, got \(6, 19\)"),
+            ({"psfs": torch.zeros(3, 2, 4, 4).double()}, ValueError, "odd side of at least 1 pixel, got 4"),
+            ({"psfs": torch.zeros(3, 1, 3, 3).double()}, ValueError, r"psfs must have shape \(D, 2, P, P\), got"),
+            ({"layer_index": torch.zeros(2, 4, 9).long()}, ValueError, r"layer_index must have .*\(2, 4, 17\), got .*9"),
+            ({"layer_weight": torch.zeros(1, 4, 17).double()}, ValueError, "layer_weight must have .*, got .*1, 4, 17"),
+            ({"layer_weight": None, "weight_gradient": True}, ValueError, "weight_gradient needs a layer_weight"),
+            ({"size": 24}, ValueError, "size must be at least the PSFs' side 3, a multiple of 16 and .*, got 24"),
+            ({"size": 112}, ValueError, "without prime factors but 2, 3 and 5, got 112"),
+        ],
+    )
+    def test_exception(self, changes, error, words):
+        with pytest.raises(error, match=words):
+            gather_overlap(**scene(**changes))
+
+    def test_cardinality_sizes_of_windows(self, dtype):
+        if dtype not in (torch.float32, torch.float64):
+            pytest.skip("compiled in float32 and float64")
+        sizes = [n for n in range(1, 1000) if is_window_size(n, dtype)]
+        assert all(n % size_step(dtype) == 0 for n in sizes)
+        assert {96, 160, 288, 320, 480, 960} <= set(sizes)
+        assert not {16 * 7, 32 * 11, 100, 0} & set(sizes)
+
+
+class TestScatterOverlap(OverlapTester):
+    draw = staticmethod(kernel_shapes.overlap_scatter)
+
+    def smallest(self):
+        given = scene()
+        del given["plane"]
+        return scatter_overlap(pixels(), **given)
+
+    @needs_compiler
+    @pytest.mark.parametrize("correlate", [False, True])
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_gradcheck_of_any_order(self, kind, correlate):
+        operator = torch.ops.kornia_tidy.scatter_overlap
+        self.check_derivatives(operator, pixels(), scene()["psfs"], kind, correlate)
+
+    @needs_compiler
+    def test_feature_conserves_light(self):
+        """What a pixel sends out arrives: PSFs of sum one keep the sum."""
+        given = scene(psfs=torch.rand(3, 2, 5, 5, dtype=torch.float64))
+        given["psfs"] /= given["psfs"].sum((-2, -1), keepdim=True)
+        del given["plane"]
+        light = pixels()
+        sums = scatter_overlap(light, **given).sum((-2, -1))
+        self.assert_close(sums, light.sum((-2, -1)), rtol=0, atol=1e-12)
+
+
+class TestOverlapPsfGradient(OverlapTester):
+    draw = staticmethod(kernel_shapes.overlap_correlate)
+
+    def smallest(self):
+        given = scene()
+        labels = given["layer_index"], given["layer_weight"]
+        return overlap_psf_gradient(given["plane"], pixels(), *labels, 3, 16)
+
+    @needs_compiler
+    @pytest.mark.parametrize("correlate", [False, True])
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_gradcheck_of_any_order(self, kind, correlate):
+        operator = torch.ops.kornia_tidy.overlap_psf_gradient
+        self.check_derivatives(operator, scene()["plane"], pixels(), kind, correlate, 3)
+
+    @needs_compiler
+    def test_feature_layers_without_a_pixel_have_no_gradient(self):
+        given = scene(layer_index=torch.ones(2, 4, 17, dtype=torch.int64))
+        got = overlap_psf_gradient(given["plane"], pixels(), given["layer_index"], None, 3, 16)
+        assert [bool(layer.any()) for layer in got] == [False, True, False]
