@@ -1,12 +1,12 @@
-"""Operators of gather and scatter by transforms of overlapping windows: light, and the gradient of the PSFs. In C.
+r"""Operators of gather and scatter by transforms of overlapping windows: light, and the gradient of the PSFs. In C.
 
 With the share :math:`w_d` that a pixel takes of layer d, all three are the derivatives of one sum that is linear in the
 plane L, in the pixels I and in the PSFs h:
 
-.. math:: T = \\sum_{c d y} I_c(y) \\, w_d(y) \\, (L_c * h_{dc})(y)
+.. math:: T = \sum_{c d y} I_c(y) \, w_d(y) \, (L_c * h_{dc})(y)
 
-:func:`gather_overlap` is its derivative to I, :func:`scatter_overlap` to L and :func:`overlap_psf_gradient` to h. So they
-are each other's derivatives, of any order.
+:func:`gather_overlap` is its derivative to I, :func:`scatter_overlap` to L and :func:`overlap_psf_gradient` to h. So
+they are each other's derivatives, of any order.
 
 Operators are defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
 """
@@ -95,8 +95,8 @@ def scatter_overlap(
         layer_index: (B, H, W).
         layer_weight: (B, H, W), or None.
         size: side of a window in samples.
-        correlate: as there. To scatter light by a camera's PSFs it is False; the gradient of :func:`gather_overlap` with
-            respect to its plane takes the opposite of what that took.
+        correlate: with PSFs that are flipped. The gradient of :func:`gather_overlap` with respect to its plane takes
+            the opposite of what that took.
         weight_gradient: as there.
 
     Returns:
@@ -241,7 +241,9 @@ def _check(
         if tensor.dtype not in REALS:
             raise TypeError(f"{name} must be float32 or float64, got {tensor.dtype}")
         if tensor.ndim != 4 or 0 in tensor.shape[1:]:
-            raise ValueError(f"{name} must have four dimensions, none but the first one empty, got {tuple(tensor.shape)}")
+            raise ValueError(
+                f"{name} must have four dimensions, only the first may be empty, got {tuple(tensor.shape)}"
+            )
         lost = side - 1 if name == "plane" else 0
         shapes.append((name, tensor.dtype, (tensor.shape[0], tensor.shape[2] - lost, tensor.shape[3] - lost)))
     (name, dtype, shape), (other, other_dtype, other_shape) = shapes[0], shapes[-1]
@@ -284,7 +286,13 @@ def _new_pixels(
 
 
 def _new_plane(
-    pixels: Tensor, psfs: Tensor, index: Tensor, weight: Tensor | None, size: int, correlate: bool, weight_gradient: bool
+    pixels: Tensor,
+    psfs: Tensor,
+    index: Tensor,
+    weight: Tensor | None,
+    size: int,
+    correlate: bool,
+    weight_gradient: bool,
 ) -> Tensor:
     _check({"pixels": pixels}, psfs.shape[-1], (index, weight), size, weight_gradient)
     _check_psfs(psfs, pixels)

@@ -31,7 +31,6 @@ from kornia_tidy.runtime.tracing import is_transformed
 BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DirectBackend(), OverlapBackend(), TiledBackend(), DenseBackend())
 }
-COMPILED = ("direct", "overlap")  # backends that may refuse a scene like one that they took before
 BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an estimate
 TRITON = TritonBackend()
 NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED, TRITON.name: TRITON}
@@ -47,7 +46,8 @@ def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"direct"``, ``"overlap"``, ``"tiled"``, ``"dense"``, ``"batched"`` or ``"triton"``, or a backend.
+        method: ``"auto"``, ``"direct"``, ``"overlap"``, ``"tiled"``, ``"dense"``, ``"batched"`` or ``"triton"``, or a
+            backend.
 
     Returns:
         (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
@@ -168,7 +168,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         layout["fingerprint"] = _fingerprint(scene)
     key = layout["fingerprint"]
     known = None if key is None else _choices.get(key)  # another thread may empty the memory meanwhile
-    if known is not None and (known[0].name not in COMPILED or known[0].refusal(scene) is None):
+    if known is not None and (known[0].name != "direct" or known[0].refusal(scene) is None):  # others refuse nothing
         best, grids = known
         scene.grids.update(grids)
         return best

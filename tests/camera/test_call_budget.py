@@ -24,7 +24,10 @@ Call = tuple[str, str, int]  # file, function, and how many functions of ours ar
 
 
 def calls_of(work: Callable[[], object]) -> list[Call]:
-    """The calls of our functions in their order; comprehensions and lambdas are parts of the function around them."""
+    """The calls of our functions in their order; comprehensions and lambdas are parts of the function around them.
+
+    An operator of compiled code is followed no further: its docstring says all that a reader of a capture must know.
+    """
     found: list[Call] = []
     within: list[str] = []  # files of the functions of ours that are being called
 
@@ -36,7 +39,8 @@ def calls_of(work: Callable[[], object]) -> list[Call]:
             within.pop()
             return
         within.append(file.relative_to(PACKAGE).as_posix())
-        found.append((within[-1], frame.f_code.co_qualname, len(within)))
+        if not any(file.startswith("kernels/") for file in within[:-1]):
+            found.append((within[-1], frame.f_code.co_qualname, len(within)))
 
     before = sys.getprofile()
     sys.setprofile(watch)
@@ -60,8 +64,6 @@ def calls(request) -> list[Call]:
     if request.param == "leaves":
         leaves = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
         image, depth = (part[None] for part in leaves)
-        if (backend := optics.explain(image, depth).backend) == "direct":
-            pytest.skip(f"on this machine the cheapest backend is {backend!r}, whose path through C is longer")
     done = threading.Event()
     beside = threading.Thread(target=done.wait)  # with other threads a capture takes care that no mask is half written
     beside.start()

@@ -37,7 +37,7 @@ class TestInfo(BaseTester):
         topics = self.told(capsys)
         assert f"torch {torch.__version__.split('+', maxsplit=1)[0]}" in topics["uses"][0]
         assert f"{os.cpu_count()} cores" in topics["processor"][0]
-        assert len(topics["kernel"]) == 6
+        assert len(topics["kernel"]) == 2 * len(info.SOURCES)
 
     @pytest.mark.skipif(compiled.build(info.SOURCES[0], torch.float32).library is None, reason="no C compiler")
     def test_feature_kernels_and_their_cache(self, capsys):

@@ -132,7 +132,11 @@ class TestGatherOverlap(OverlapTester):
             ({"plane": torch.zeros(6, 19).double()}, ValueError, r"plane must have four dimensions, .*, got \(6, 19\)"),
             ({"psfs": torch.zeros(3, 2, 4, 4).double()}, ValueError, "odd side of at least 1 pixel, got 4"),
             ({"psfs": torch.zeros(3, 1, 3, 3).double()}, ValueError, r"psfs must have shape \(D, 2, P, P\), got"),
-            ({"layer_index": torch.zeros(2, 4, 9).long()}, ValueError, r"layer_index must have .*\(2, 4, 17\), got .*9"),
+            (
+                {"layer_index": torch.zeros(2, 4, 9).long()},
+                ValueError,
+                r"layer_index must .*\(2, 4, 17\), got .*9",
+            ),
             ({"layer_weight": torch.zeros(1, 4, 17).double()}, ValueError, "layer_weight must have .*, got .*1, 4, 17"),
             ({"layer_weight": None, "weight_gradient": True}, ValueError, "weight_gradient needs a layer_weight"),
             ({"size": 24}, ValueError, "size must be at least the PSFs' side 3, a multiple of 16 and .*, got 24"),

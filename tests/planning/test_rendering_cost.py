@@ -19,7 +19,7 @@ from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
 from kornia_tidy.render.backends.window_plan import plan_windows
 from kornia_tidy.render.cost_model import TiledWork
-from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
+from kornia_tidy.render.dispatch import BACKENDS, refusal
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester, needs_data
 from tests.capture_memory import predicted_over_used
@@ -126,15 +126,16 @@ class TestCost(BaseTester):
             assert (rendering_bytes(scene, 3) < rendering_bytes(others, 3)) == directly
 
     def test_feature_dense_counts_only_where_the_dispatcher_may_take_it(self):
-        """Its memory is not bounded: large images go elsewhere, whatever it would save."""
+        """Its memory is not bounded: large images go elsewhere, whatever it would save over tiles."""
         psi, nodes = torch.zeros(1, 1, 256, 256), (-1.0, 0.0, 1.0)
-        works = count_work(label_pixels(psi, 1, nodes, "nearest"), 3, 129).works
-        scene = layered_scene(torch.rand(1, 1, 256, 256), psi, torch.tensor(nodes), torch.rand(3, 1, 129, 129))
-        assert choose(scene).name == "dense"
-        many = count_work(label_pixels(psi, 200, nodes, "nearest"), 3, 129)
-        assert set(works) == set(many.works)
+        one, many = (count_work(label_pixels(psi, batch, nodes, "nearest"), 3, 129) for batch in (1, 200))
+
+        def seconds(scene, *names):
+            return rendering_seconds(replace(scene, works={name: scene.works[name] for name in names}), 3)
+
+        assert seconds(one, "dense") == seconds(one, "tiled", "dense") < seconds(one, "tiled")
+        assert seconds(many, "tiled", "dense") == seconds(many, "tiled")
         dense = {"dense": many.works["dense"]}
-        assert rendering_seconds(replace(many, works={"tiled": many.works["tiled"]}), 3) == rendering_seconds(many, 3)
         with pytest.raises(ValueError, match="empty"):
             rendering_seconds(replace(many, works=dense), 3)
 

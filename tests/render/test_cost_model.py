@@ -11,6 +11,7 @@ from kornia_tidy.render.cost_model import (
     DenseWork,
     DirectOcclusionWork,
     DirectWork,
+    OverlapWork,
     TiledOcclusionWork,
     TiledWork,
     seconds_of,
@@ -21,6 +22,7 @@ from tests.base import BaseTester
 WORKS = (
     DirectWork(pixels=2**18, strips=2**13, psf_size=23),
     TiledWork(size=72, blocks=64, pairs=200, layers=7, pixels=2**18, blended=2),
+    OverlapWork(size=96, blocks=64, pairs=200, layers=7, pixels=2**18, blended=2),
     DenseWork(height=600, width=534, layers=7, pixels=2**18, blended=1),
     DirectOcclusionWork(pixels=2**18, alone=500, pairs=4000, columns=10**6, edges=10**5, psf_size=23, layers=7),
     TiledOcclusionWork(size=64, windows=(0, 20, 30, 10), pixels=2**18),

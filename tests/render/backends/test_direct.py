@@ -182,7 +182,7 @@ class TestChoice(BaseTester):
         scenes = {side: layered_scene(image, psi, torch.arange(8.0), torch.rand(8, 1, side, side)) for side in sides}
         direct = [side for side in sides if choose(scenes[side]).name == "direct"]
         assert direct[0] == 1
-        assert 13 < direct[-1] < 100
+        assert direct[-1] < 100
         assert direct == list(range(1, direct[-1] + 1, 6))
 
     @pytest.mark.parametrize(
