@@ -4,8 +4,8 @@
 linearly on [-20, 20] rad, in 8 nearest layers, float32. Backends take turns. Of each the least processor time of
 ``ROUNDS`` counts, because other programs can only lengthen it.
 
-``tiles`` is the number of transformed samples of the chosen tiles, their layers and PSFs, with the logarithms of the
-sides, over that of a round trip: what tiles cost if nothing but transforms took time.
+``transforms`` is the number of transformed samples of the chosen windows, their layers and PSFs, with the logarithms of
+the sides, over that of a round trip: what windows cost if nothing but transforms took time, at its speed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from math import log2, prod
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backends.tile_plan import BLOCKS, cheapest_grid
+from kornia_tidy.render.backends.tile_plan import BLOCKS, OVERLAPS, TileKind, cheapest_grid
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import explain
@@ -29,6 +29,7 @@ from tests.render.scenes import Bank
 LAYERS, ROUNDS = 8, 3
 WINDOWS = (65, 129, 257, 513)
 LARGEST_DIRECT = 65  # px; direct convolution of larger windows takes many seconds
+KINDS = {"overlap": OVERLAPS, "tiled": BLOCKS}
 
 
 def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
@@ -42,15 +43,17 @@ def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
     return least
 
 
-def tile_transforms(image: Tensor, psi: Tensor, bank: Bank) -> tuple[str, float]:
-    """Return the chosen tiles in words, and their transforms in round trips."""
+def window_transforms(image: Tensor, psi: Tensor, bank: Bank, kind: TileKind) -> str:
+    """Return the transforms of the chosen windows in round trips, and the windows in words."""
     scene = layered_scene(image, psi, bank.defocus, bank.psfs, layers="nearest")
-    work, grid = cheapest_grid(scene.labels, LAYERS, bank.psfs.shape[-1], BLOCKS)
+    work, grid = cheapest_grid(scene.labels, LAYERS, bank.psfs.shape[-1], kind)
     side = bank.psfs.shape[-1] - 1
     plane = prod(next_fast_size(n + side) for n in image.shape[-2:])
-    samples = (work.blocks + work.pairs + work.layers) * grid.size**2 * 2 * log2(grid.size)
-    words = f"{grid.tile} px in {grid.size}, {work.pairs / work.blocks:.1f} layers"
-    return words, samples / (plane * log2(plane))
+    transforms = (work.blocks + work.pairs + work.layers) * grid.across  # of real numbers; a round trip takes two
+    samples = transforms / 2 * grid.size**2 * 2 * log2(grid.size)
+    pixels = f"{grid.across} x {grid.tile}" if grid.across > 1 else grid.tile
+    held = f"{pixels} px in {grid.size}, {work.pairs / work.blocks:.1f} layers"
+    return f"{samples / (plane * log2(plane)):.1f} ({held})"
 
 
 def gradient_calls(image: Tensor, psi: Tensor, bank: Bank, compositing: str, methods: list[str]) -> dict:
@@ -69,24 +72,24 @@ def measure(window: int) -> None:
     bank = make_bank(LAYERS, window)
     scene = layered_scene(image, psi, bank.defocus, bank.psfs, layers="nearest")
     print(explain(scene), file=sys.stderr)
-    methods = ["auto", "tiled", "dense", *(["direct"] if window <= LARGEST_DIRECT else [])]
+    methods = ["overlap", "tiled", "dense", *(["direct"] if window <= LARGEST_DIRECT else [])]
     calls: dict[str, Callable[[], object]] = {"round trip": lambda: round_trip(image, psi, bank)}
     for method in methods:
         calls[f"gather, {method}"] = lambda m=method: render(image, psi, bank, layers="nearest", method=m)
-    for method in ("auto", "tiled", "dense"):
+    for method in ("overlap", "tiled", "dense"):
         calls[f"scatter, {method}"] = lambda m=method: render(image, psi, bank, "scatter", layers="nearest", method=m)
-    calls |= gradient_calls(image, psi, bank, "gather", ["auto"])
+    calls |= gradient_calls(image, psi, bank, "gather", ["overlap"])
     times = least_seconds(calls)
-    words, transforms = tile_transforms(image, psi, bank)
     unit = times.pop("round trip")
     for name, seconds in times.items():
-        bound = f"{transforms:.1f} ({words})" if name == "gather, tiled" else ""
+        kind = KINDS.get(name.removeprefix("gather, "))
+        bound = window_transforms(image, psi, bank, kind) if kind else ""
         print(f"| {window} | {name} | {1e3 * seconds:.0f} | {seconds / unit:.2f} | {bound} |", flush=True)
 
 
 def main(windows: list[int]) -> None:
     torch.set_num_threads(1)
-    print("| window | call | ms | round trips | tiles |\n|---|---|---|---|---|")
+    print("| window | call | ms | round trips | transforms |\n|---|---|---|---|---|")
     for window in windows:
         measure(window)
 

@@ -120,14 +120,14 @@ class TestChoice(RenderTester):
             assert window_size(scene) == scene.grids[OVERLAPS].size
 
     @pytest.mark.parametrize(
-        ("where", "dtype", "compositing", "message"),
+        ("where", "compositing", "message"),
         [
-            ("meta", torch.float32, "gather", "are transformed on processors, and the image is on 'meta'"),
-            ("cpu", torch.float32, "occlusion", "gather and scatter light, and hide none"),
+            ("meta", "gather", "are transformed on processors, and the image is on 'meta'"),
+            ("cpu", "occlusion", "gather and scatter light, and hide none"),
         ],
     )
-    def test_exception_scenes_that_are_not_supported(self, where, dtype, compositing, message):
-        bank = make_bank(3, 1, 5, dtype=dtype)
+    def test_exception_scenes_that_are_not_supported(self, where, compositing, message):
+        bank = make_bank(3, 1, 5, dtype=torch.float32)
         image, defocus = make_scene(bank, 1, 20, 40)
         scene = layered_scene(image, defocus, bank.defocus, bank.psfs, compositing=compositing)
         if where == "meta":
