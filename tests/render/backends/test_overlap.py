@@ -112,7 +112,7 @@ class TestChoice(RenderTester):
 
     @needs_compiler
     def test_feature_it_is_taken_for_psfs_of_an_ordinary_size(self):
-        bank = make_bank(8, 3, 41, dtype=torch.float32)
+        bank = make_bank(6, 3, 41, dtype=torch.float32)
         image, defocus = make_scene(bank, 1, 400, 400)
         for compositing in COMPOSITINGS:
             scene = layered_scene(image, defocus, bank.defocus, bank.psfs, compositing=compositing)
