@@ -32,10 +32,10 @@ Learn the phase masks of a camera together with the network that reads its captu
 an all-in-focus image (edof), a depth map (depth), or both (joint).
 
 Scenes are painted, like photographs (photographic-leaves) or with sharp outlines and full
-textures (dead-leaves), or read from --root: the frames of FlyingThings3D
-(flying-things), the paper's patches of them (flying-things-patches), NYU Depth v2 (nyu),
-all as published, or your own folder (rgbd-folder), in which rgbd.json gives the pairs of
-files and the unit of depth:
+textures (dead-leaves), or cut out of your own photographs in --root (photo-collages); or
+read from --root: the frames of FlyingThings3D (flying-things), the paper's patches of them
+(flying-things-patches), NYU Depth v2 (nyu), all as published, or your own folder
+(rgbd-folder), in which rgbd.json gives the pairs of files and the unit of depth:
   {"image": "*.png", "depth": "*_depth.png", "scale": 0.001}
 Published splits are kept; of a folder a tenth is for validation and a tenth for testing.
 FlyingThings3D has no metric scale: its nearest points are put at the camera's near end.

@@ -1,4 +1,4 @@
-"""Scenes with depth: readers for image and depth files, published data sets, and dead leaves, painted at random.
+"""Scenes with depth: readers for image and depth files, published data sets, and scenes painted at random.
 
 Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first.
 """
@@ -10,6 +10,7 @@ from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
+from kornia_tidy.data.photo_collages import PhotoCollages, photo_collage, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves, photographic_leaves
 from kornia_tidy.data.published_folders import hypersim, kitti, middlebury, scannet, seven_scenes
 from kornia_tidy.data.rgbd import Scene, read_rgbd
@@ -25,6 +26,7 @@ __all__ = [
     "FlyingThings3D",
     "NYUDepthV2",
     "Patches",
+    "PhotoCollages",
     "PhotographicLeaves",
     "RGBDFolder",
     "Scene",
@@ -40,7 +42,9 @@ __all__ = [
     "kitti",
     "middlebury",
     "paper_patches",
+    "photo_collage",
     "photographic_leaves",
+    "photographs_in",
     "random_crop",
     "read_depth",
     "read_image",

@@ -75,9 +75,9 @@ def photographic_leaves(
     leaves = scatter_leaves(ZOOM * height, ZOOM * width, count, rng, LARGEST_RADIUS)
     index, inverse_depth = rasterise(ZOOM * height, ZOOM * width, leaves)
     light = photographic_light(index, leaves.center, leaves.radius, leaves.angle, ZOOM, rng)
-    image = _photographed(light.clip(0, 1), rng)
+    image = photographed(light.clip(0, 1), rng)
 
-    depth = depth_of(_of_most(inverse_depth), near, far)
+    depth = depth_of(of_most(inverse_depth), near, far)
     encoded = linear_rgb_to_rgb(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None])[0]
     return encoded.clamp(0, 1), torch.from_numpy(depth[None])
 
@@ -134,7 +134,7 @@ class PhotographicLeaves(SceneDataset):
         return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
 
 
-def _photographed(light: NDArray[np.float32], rng: Generator) -> NDArray[np.float32]:
+def photographed(light: NDArray[np.float32], rng: Generator) -> NDArray[np.float32]:
     """Return light averaged over the final pixels, softened in a share of the scenes."""
     image = averaged(light)
     soft, place = rng.random(2)
@@ -150,11 +150,11 @@ def averaged(light: NDArray[np.float32]) -> NDArray[np.float32]:
     return light.reshape(height, ZOOM, width, ZOOM, 3).mean((1, 3))
 
 
-def _of_most(inverse_depth: NDArray[np.float64]) -> NDArray[np.float64]:
+def of_most(inverse_depth: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return for each final pixel the third of its four values from below: the surface of most, or the nearer of two.
 
     Example:
-        >>> _of_most(np.array([[0.0, 0.5], [0.5, 0.5]])), _of_most(np.array([[0.5, 0.0], [0.0, 0.0]]))
+        >>> of_most(np.array([[0.0, 0.5], [0.5, 0.5]])), of_most(np.array([[0.5, 0.0], [0.0, 0.0]]))
         (array([[0.5]]), array([[0.]]))
     """
     height, width = inverse_depth.shape[0] // ZOOM, inverse_depth.shape[1] // ZOOM

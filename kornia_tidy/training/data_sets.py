@@ -15,6 +15,7 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.flying_things import FOCAL_PX, NEAREST, paper_patches, split_frames
 from kornia_tidy.data.nyu_depth import NYUDepthV2
 from kornia_tidy.data.patches import central_crop, random_crop
+from kornia_tidy.data.photo_collages import PhotoCollages, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves
 from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.data.rgbd_folder import described_folder
@@ -64,11 +65,21 @@ def make_scenes(settings: TrainingSettings, split: str, count: int | None = None
 
 def _painted(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
     counts = {"train": settings.scenes, "validation": settings.validation_scenes, "test": count or TESTED}
+    size, seed = (counts[split], settings.size, settings.size), keyed_seed(settings.seed, split)
     depths = settings.depth_range or (0.3, math.inf)
-    seed = keyed_seed(settings.seed, split)
-    kind = PhotographicLeaves if settings.data == "photographic-leaves" else DeadLeaves
-    leaves = kind(counts[split], settings.size, settings.size, depth_range=depths, seed=seed)
-    return leaves if settings.learn == "network" else Remembered(leaves)  # captures are remembered in files
+    scenes: Dataset[Any]
+    if settings.data == "photo-collages":
+        scenes = PhotoCollages(_photographs(settings, split), *size, depth_range=depths, seed=seed)
+    else:
+        kind = PhotographicLeaves if settings.data == "photographic-leaves" else DeadLeaves
+        scenes = kind(*size, depth_range=depths, seed=seed)
+    return scenes if settings.learn == "network" else Remembered(scenes)  # captures are remembered in files
+
+
+def _photographs(settings: TrainingSettings, split: str) -> list[Path]:
+    """A tenth of the photographs for validation and a tenth for testing, drawn by the seed."""
+    found = photographs_in(_root(settings))
+    return [found[place] for place in _order(len(found), settings.seed)[_tenths(len(found), split, _root(settings))]]
 
 
 def _flying_things(settings: TrainingSettings, split: str, count: int | None) -> Dataset[Any]:
@@ -104,17 +115,23 @@ def _rgbd_folder(settings: TrainingSettings, split: str, count: int | None) -> D
     pairs = described_folder(_root(settings), _Cut.of(settings, split))
     if split == "all":
         return _limited(pairs, settings, split, count)
-    part = max(1, len(pairs) // SHARE)
-    if len(pairs) < 3:
-        raise ValueError(f"{_root(settings)} has {len(pairs)} scenes: 3 or more are needed to train, validate and test")
-    ends = {"validation": (0, part), "test": (part, 2 * part), "train": (2 * part, len(pairs))}[split]
-    return _limited(Subset(pairs, _order(len(pairs), settings.seed)[slice(*ends)]), settings, split, count)
+    own = _order(len(pairs), settings.seed)[_tenths(len(pairs), split, _root(settings))]
+    return _limited(Subset(pairs, own), settings, split, count)
+
+
+def _tenths(count: int, split: str, root: Path) -> slice:
+    """Return which of shuffled scenes or photographs belong to a split."""
+    part = max(1, count // SHARE)
+    if count < 3:
+        raise ValueError(f"{root} has {count} scenes: 3 or more are needed to train, validate and test")
+    return slice(*{"validation": (0, part), "test": (part, 2 * part), "train": (2 * part, count)}[split])
 
 
 Maker = Callable[[TrainingSettings, str, int | None], Dataset[Any]]
 SCENES: dict[str, Maker] = {
     "photographic-leaves": _painted,
     "dead-leaves": _painted,
+    "photo-collages": _painted,
     "flying-things": _flying_things,
     "flying-things-patches": _flying_things_patches,
     "nyu": _nyu,

@@ -1,0 +1,205 @@
+"""Collages of photographs: dead leaves that are cut out of pictures, with exact depth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from numbers import Integral
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_tidy.data.dead_leaves import check_arguments, depth_of, rasterise, scatter_leaves
+from kornia_tidy.data.image_files import SUFFIXES, read_image
+from kornia_tidy.data.photographic_leaves import LARGEST_RADIUS, ZOOM, of_most, photographed
+from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.seeds import keyed_seed
+
+PIXELS_A_LEAF = (1500.0, 150_000.0)  # of the final picture, uniform in its logarithm over the scenes
+MOST_PHOTOGRAPHS = 4  # that a scene shows
+REDUCTION = (1.0, 3.0)  # of a photograph's sides, uniform in its logarithm
+EXPOSURE, TINT = 0.25, 0.15  # standard deviations of the logarithms of a leaf's light and of its three colours
+
+
+def photo_collage(
+    photographs: Sequence[str | os.PathLike[str]],
+    height: int,
+    width: int,
+    *,
+    depth_range: tuple[float, float] = (0.3, 10.0),
+    seed: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """Paint a dead-leaves scene whose shapes show parts of photographs, with the depth of every pixel.
+
+    Shapes and depths are those of :func:`~kornia_tidy.data.dead_leaves.dead_leaves`, sampling and softness those of
+    :func:`~kornia_tidy.data.photographic_leaves.photographic_leaves`. A scene shows up to four photographs, reduced to
+    a third of their sides or more, in one shape for 1,500 to 150,000 pixels. Shapes differ in exposure and tint. Depth
+    has nothing to do with what the photographs show, so that a network can learn it from defocus alone.
+
+    Args:
+        photographs: paths of files that :func:`~kornia_tidy.data.image_files.read_image` reads, in sRGB, all of them
+            in focus. A photograph that is smaller than the scene is enlarged.
+        height: rows in pixels.
+        width: columns in pixels.
+        depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
+        seed: of all that is random. The scene does not depend on the global generators or the number of threads.
+
+    Returns:
+        The image, :math:`(3, H, W)` float32, sRGB-encoded in [0, 1], and the depth, :math:`(1, H, W)` float32, metres.
+
+    Raises:
+        FileNotFoundError: if a photograph that the scene shows is missing.
+        ValueError: if there is no photograph or one cannot be read, or as
+            :func:`~kornia_tidy.data.photographic_leaves.photographic_leaves` does.
+
+    Convention:
+        The depth of a pixel is that of the surface that fills most of it, of the nearer one if two are equal; depths
+        are not mixed. Light beyond full scale is clipped, as by a sensor.
+
+    Source: Lee, Mumford and Huang, Occlusion models for natural images, IJCV 41 (2001); Mayer et al., A large dataset
+    to train convolutional networks, CVPR 2016 (photographs on objects of random depth).
+
+    Example:
+        >>> import tempfile
+        >>> from kornia_tidy.data import write_image
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_image(f"{folder}/wall.png", torch.rand(3, 90, 120))
+        ...     image, depth = photo_collage([f"{folder}/wall.png"], 48, 64, depth_range=(0.5, float("inf")), seed=1)
+        >>> image.shape, depth.shape, bool(depth.min() >= 0.5)
+        (torch.Size([3, 48, 64]), torch.Size([1, 48, 64]), True)
+    """
+    check_arguments(height, width, depth_range, 1, seed)
+    if not photographs:
+        raise ValueError("photographs must hold one path or more, got none")
+    near, far = depth_range
+    rng = np.random.default_rng(seed)
+    fewest, most = (height * width / pixels for pixels in reversed(PIXELS_A_LEAF))
+    count = max(1, round(fewest * (most / fewest) ** rng.random()))
+    leaves = scatter_leaves(ZOOM * height, ZOOM * width, count, rng, LARGEST_RADIUS)
+    index, inverse_depth = rasterise(ZOOM * height, ZOOM * width, leaves)
+    image = photographed(_collage(index, photographs, rng).clip(0, 1), rng)
+
+    depth = depth_of(of_most(inverse_depth), near, far)
+    encoded = linear_rgb_to_rgb(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None])[0]
+    return encoded.clamp(0, 1), torch.from_numpy(depth[None])
+
+
+class PhotoCollages(SceneDataset):
+    """Data set of collages of photographs. See :func:`photo_collage`.
+
+    Args:
+        photographs: paths, see :func:`photographs_in`.
+        length: number of scenes.
+        height: rows in pixels.
+        width: columns in pixels.
+        depth_range: nearest and farthest depth in metres; the farthest may be ``inf``.
+        seed: data sets of different seeds share no scene, but scenes of the same photographs show the same things: use
+            some photographs for training and others for testing.
+        transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
+
+    Raises:
+        ValueError: if the length is not a positive integer, or as :func:`photo_collage` does.
+
+    Example:
+        >>> import tempfile
+        >>> from kornia_tidy.data import write_image
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_image(f"{folder}/wall.png", torch.rand(3, 90, 120))
+        ...     scenes = PhotoCollages(photographs_in(folder), 1000, 48, 64)
+        ...     len(scenes), scenes[7]["image"].shape, scenes[7]["name"]
+        (1000, torch.Size([3, 48, 64]), 'photo collage 0/7')
+    """
+
+    def __init__(
+        self,
+        photographs: Sequence[str | os.PathLike[str]],
+        length: int,
+        height: int,
+        width: int,
+        *,
+        depth_range: tuple[float, float] = (0.3, 10.0),
+        seed: int = 0,
+        transform: Transform | None = None,
+    ) -> None:
+        super().__init__(transform)
+        if not isinstance(length, Integral) or length < 1:
+            raise ValueError(f"length must be a positive integer, got {length!r}")
+        if not photographs:
+            raise ValueError("photographs must hold one path or more, got none")
+        check_arguments(height, width, depth_range, 1, seed)
+        self.photographs = [Path(path) for path in photographs]
+        self.length, self.height, self.width = length, height, width
+        self.depth_range, self.seed = depth_range, seed
+
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+        return self.length
+
+    def name(self, index: int) -> str:
+        """Return the seed and the number of a scene."""
+        return f"photo collage {self.seed}/{index}"
+
+    def read(self, index: int) -> Scene:
+        """Paint a scene."""
+        seed = keyed_seed(self.seed, "photo collage", index)
+        size = (self.height, self.width)
+        image, depth = photo_collage(self.photographs, *size, depth_range=self.depth_range, seed=seed)
+        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:
+    """Return the PNG, TIFF and JPEG files in a folder and the folders in it, in the order of their paths.
+
+    Args:
+        folder: where to look.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or none of these files in it.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise FileNotFoundError(f"there is no folder {root}: it must hold photographs ({', '.join(SUFFIXES)})")
+    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not found:
+        raise FileNotFoundError(f"{root} holds no photographs ({', '.join(SUFFIXES)})")
+    return found
+
+
+def _collage(
+    index: NDArray[np.int32], photographs: Sequence[str | os.PathLike[str]], rng: Generator
+) -> NDArray[np.float32]:
+    """Return the linear light of leaves, (H, W, 3), each of which shows its place in one of a few photographs."""
+    shown = rng.choice(len(photographs), min(len(photographs), 1 + rng.integers(MOST_PHOTOGRAPHS)), replace=False)
+    leaves = int(index.max()) + 1
+    photograph = rng.integers(len(shown), size=leaves)
+    gain = np.exp(rng.normal(0, EXPOSURE, (leaves, 1)) + rng.normal(0, TINT, (leaves, 3))).astype(np.float32)
+    light = np.empty((*index.shape, 3), np.float32)
+    for number, place in enumerate(shown):
+        draws = rng.random(4)  # however many leaves show it, if any
+        here = photograph[index] == number
+        if here.any():
+            light[here] = _cut(photographs[place], *index.shape, draws)[here]
+    return light * gain[index]
+
+
+def _cut(path: str | os.PathLike[str], height: int, width: int, draws: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return linear light of a part of a photograph, (H, W, 3), reduced, at a place and mirrored by four draws."""
+    photograph = read_image(path)
+    rows, columns = photograph.shape[-2:]
+    largest = min(rows / height, columns / width)  # photograph's pixels along one that is painted
+    least, most = (min(largest, value / ZOOM) for value in REDUCTION)
+    reduction = least * (most / least) ** draws[0]
+    high, wide = max(1, round(height * reduction)), max(1, round(width * reduction))
+    top, left = round(draws[1] * (rows - high)), round(draws[2] * (columns - wide))
+    part = photograph[:, top : top + high, left : left + wide].expand(3, -1, -1)
+    light = rgb_to_linear_rgb(part[None])[0].numpy().transpose(1, 2, 0)
+    kind = cv2.INTER_AREA if reduction > 1 else cv2.INTER_LINEAR
+    light = cv2.resize(np.ascontiguousarray(light), (width, height), interpolation=kind)
+    return light[:, ::-1] if draws[3] < 0.5 else light
