@@ -25,7 +25,8 @@ from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.settings import TrainingSettings
 
-PAINTED = ("photographic-leaves", "dead-leaves")  # scenes that depend on their number alone, however many there are
+# Scenes that depend on their number alone (and on the photographs that they show), however many there are.
+PAINTED = ("photographic-leaves", "dead-leaves", "photo-collages")
 SPLITS = ("train", "validation", "test", "all")
 PUBLISHED: dict[str, Literal["train", "val", "test"]] = {"train": "train", "validation": "val", "test": "test"}
 SHARE = 10  # one scene in ten is for validation, and one for testing where no split is published

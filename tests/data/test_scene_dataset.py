@@ -15,17 +15,19 @@ from kornia_tidy.data import (
     FlyingThings3D,
     NYUDepthV2,
     Patches,
+    PhotoCollages,
     PhotographicLeaves,
     RGBDFolder,
     Scene,
     SceneDataset,
     TUMSequence,
     UnreadableItemError,
+    photographs_in,
 )
 from tests.base import BaseTester
 from tests.data.published import write_flying_things, write_frames, write_nyu
 
-KINDS = ("dead leaves", "photographic leaves", "flying things", "nyu", "folder", "tum", "sun rgb-d")
+KINDS = ("dead leaves", "photographic leaves", "photo collages", "flying things", "nyu", "folder", "tum", "sun rgb-d")
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +44,7 @@ def data(tmp_path_factory):
     sets = (
         DeadLeaves(3, 40, 48, num_leaves=60),
         PhotographicLeaves(3, 40, 48),
+        PhotoCollages(photographs_in(root / "frames_cleanpass"), 3, 40, 48),
         FlyingThings3D(root, subsets="A"),
         NYUDepthV2(root, "all"),
         RGBDFolder(root, "frames_cleanpass/TRAIN/*/*/*/*.png", "disparity/TRAIN/*/*/*/*.pfm", **things),

@@ -14,7 +14,7 @@ from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, photographic_leaves
 from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.seeds import keyed_seed
-from kornia_tidy.training.data_sets import PAINTED, SCENES, make_scenes
+from kornia_tidy.training.data_sets import PAINTED, SCENES, _photographs, make_scenes
 from kornia_tidy.training.scenes import SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
@@ -33,7 +33,9 @@ MILLIMETRES = {"image": "*.png", "depth": "*_depth.png", "scale": 0.001}
 @pytest.fixture(scope="module")
 def roots(tmp_path_factory):
     """A folder of each kind of data."""
-    things, nyu, pairs = (tmp_path_factory.mktemp(name) for name in ("things", "nyu", "pairs"))
+    things, nyu, pairs, photographs = (
+        tmp_path_factory.mktemp(name) for name in ("things", "nyu", "pairs", "photographs")
+    )
     write_flying_things(things, {**PARTS, "TRAIN/A": 8}, size=(279, 280))
     write_nyu(nyu, 8)
     row, column = np.indices(SIDES)
@@ -41,8 +43,10 @@ def roots(tmp_path_factory):
         picture = np.stack([row, column, np.full(SIDES, number)], -1)[..., ::-1].astype(np.uint8)  # RGB, stored BGR
         assert cv2.imwrite(str(pairs / f"{number:02d}.png"), picture)
         assert cv2.imwrite(str(pairs / f"{number:02d}_depth.png"), (400 + 50 * row + column).astype(np.uint16))
+        assert cv2.imwrite(str(photographs / f"{number:02d}.png"), np.full((40, 50, 3), 10 * (1 + number), np.uint8))
     (pairs / "rgbd.json").write_text(json.dumps(MILLIMETRES))
-    return {"flying-things": things, "flying-things-patches": things, "nyu": nyu, "rgbd-folder": pairs}
+    files = {"flying-things": things, "flying-things-patches": things, "nyu": nyu, "rgbd-folder": pairs}
+    return {"photo-collages": photographs, **files}
 
 
 FILES = [name for name in SCENES if name not in PAINTED]
@@ -60,7 +64,7 @@ def names_of(scenes):
 class TestMakeScenes(BaseTester):
     @pytest.mark.parametrize("name", SCENES)
     def test_smoke_every_split_gives_scenes_of_the_size_in_metres(self, name, roots):
-        settings = settings_of(name, {**roots, **dict.fromkeys(PAINTED, ".")})
+        settings = settings_of(name, {**dict.fromkeys(PAINTED, "."), **roots})
         for split in ("train", "validation", "test"):
             sample = make_scenes(settings, split, 2)[0]
             assert sample["image"].shape == (3, 32, 32)
@@ -95,6 +99,13 @@ class TestMakeScenes(BaseTester):
         if name.startswith("flying"):
             assert all(one.startswith("TEST/") for one in test)
             assert all(one.startswith("TRAIN/") for one in train | validation)
+
+    def test_feature_no_photograph_is_in_two_splits(self, roots):
+        settings = settings_of("photo-collages", roots)
+        paths = [set(_photographs(settings, split)) for split in ("train", "validation", "test")]
+        assert [len(part) for part in paths] == [10, 1, 1]
+        assert len(set.union(*paths)) == 12
+        assert paths != [set(_photographs(settings.replace(seed=2), part)) for part in ("train", "validation", "test")]
 
     def test_feature_a_folder_is_split_by_the_seed(self, roots):
         settings = settings_of("rgbd-folder", roots)
@@ -165,6 +176,7 @@ class TestMakeScenes(BaseTester):
             ("flying-things", "FlyingThings3D is not in data/flying-things: download"),
             ("flying-things-patches", "FlyingThings3D is not in data/flying-things-patches: download"),
             ("nyu", "NYU Depth v2 is not in data/nyu: download"),
+            ("photo-collages", "there is no folder data/photo-collages: it must hold photographs (.png, .tif,"),
             ("rgbd-folder", "there is no data/rgbd-folder/rgbd.json: it tells which files"),
         ],
     )
@@ -188,7 +200,8 @@ class TestMakeScenes(BaseTester):
 
     def test_exception_names_the_bad_value(self, roots):
         with pytest.raises(
-            ValueError, match="data must be one of 'photographic-leaves', 'dead-leaves', 'flying-things'"
+            ValueError,
+            match="data must be one of 'photographic-leaves', 'dead-leaves', 'photo-collages', 'flying-things'",
         ):
             make_scenes(TrainingSettings(data="kitti"), "train")
         with pytest.raises(ValueError, match="split must be one of 'train', 'validation', 'test', got 'all'"):

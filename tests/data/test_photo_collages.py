@@ -1,0 +1,170 @@
+"""Collages: reproducible, made of the photographs alone, anti-aliased in linear light, with exact depth."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from kornia.color import rgb_to_linear_rgb
+
+from kornia_tidy.data import PhotoCollages, photo_collage, photographs_in
+from kornia_tidy.data import photo_collages as module
+from kornia_tidy.data.photo_collages import _cut
+from tests.base import BaseTester
+
+COLOURS = {"red": (200, 30, 20), "green": (25, 150, 60), "blue": (30, 60, 220)}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three photographs of one colour each, a grey one in a folder of its own, and a file that is none."""
+    root = tmp_path_factory.mktemp("photographs")
+    for name, colour in COLOURS.items():
+        assert cv2.imwrite(str(root / f"{name}.PNG"), np.full((60, 90, 3), colour[::-1], np.uint8))
+    (root / "more").mkdir()
+    assert cv2.imwrite(str(root / "more" / "grey.jpg"), np.full((50, 40), 128, np.uint8))
+    (root / "notes.txt").write_text("no photograph")
+    return root
+
+
+@pytest.fixture(autouse=True)
+def _as_photographed(request, monkeypatch):
+    """Unless a test is about them, shapes have the exposure and tint of the photographs, and no scene is softened."""
+    if "varied" not in request.fixturenames:
+        monkeypatch.setattr(module, "EXPOSURE", 0.0)
+        monkeypatch.setattr(module, "TINT", 0.0)
+        monkeypatch.setattr(sys.modules["kornia_tidy.data.photographic_leaves"], "SOFT_SHARE", 0.0)
+
+
+@pytest.fixture
+def varied():
+    """Exposure, tint and softness as they are."""
+
+
+class TestPhotographs(BaseTester):
+    def test_feature_photographs_of_a_folder_and_those_below(self, folder):
+        assert [path.name for path in photographs_in(folder)] == ["blue.PNG", "green.PNG", "grey.jpg", "red.PNG"]
+
+    def test_exception_no_folder_or_no_photographs(self, folder, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"there is no folder .*nowhere: it must hold photographs \(.png, "):
+            photographs_in(folder / "nowhere")
+        with pytest.raises(FileNotFoundError, match="holds no photographs"):
+            photographs_in(tmp_path)
+
+
+class TestPhotoCollage(BaseTester):
+    @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 50), (7, 3), (33, 64), (130, 20)])
+    def test_cardinality(self, height, width, folder):
+        image, depth = photo_collage(photographs_in(folder), height, width)
+        assert image.shape == (3, height, width)
+        assert depth.shape == (1, height, width)
+        assert image.is_contiguous()
+
+    def test_feature_the_seed_decides_whatever_the_global_state(self, folder, varied):
+        paths = photographs_in(folder)
+        first = photo_collage(paths, 48, 40, seed=5)
+        np.random.seed(123)  # noqa: NPY002 - the legacy global state is what must not matter
+        torch.manual_seed(123)
+        state = torch.get_rng_state()
+        second, other = photo_collage(paths, 48, 40, seed=5), photo_collage(paths, 48, 40, seed=6)
+        assert torch.equal(torch.get_rng_state(), state)
+        assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+        assert (first[0] != other[0]).float().mean() > 0.9
+
+    def test_feature_pixels_are_of_the_photographs_and_at_outlines_quarters_of_them_in_linear_light(self, folder):
+        """Each of a pixel's four samples shows one of the photographs; all mixtures of four of them are listed."""
+        paths = [folder / f"{name}.PNG" for name in COLOURS]
+        seen = set()
+        light = rgb_to_linear_rgb(torch.tensor(list(COLOURS.values())).reshape(3, 3, 1, 1) / 255)[..., 0, 0].double()
+        parts = torch.cartesian_prod(*(torch.arange(5) for _ in COLOURS))
+        parts = parts[parts.sum(1) == 4]
+        mixtures = parts.double() @ light / 4
+        for seed in range(12):
+            image, _ = photo_collage(paths, 64, 64, seed=seed)
+            pixels = rgb_to_linear_rgb(image[None])[0].flatten(1).T.double()
+            away = (pixels[:, None] - mixtures).abs().amax(-1)
+            assert away.min(1).values.max() < 1e-5
+            seen |= set(away.argmin(1).tolist())
+        assert seen >= set((parts > 0).sum(1).le(2).nonzero()[:, 0].tolist())  # three meet in few pixels
+
+    def test_feature_shapes_differ_in_exposure_and_tint(self, folder, varied):
+        image, _ = photo_collage([folder / "more" / "grey.jpg"], 200, 200, seed=3)
+        light = rgb_to_linear_rgb(image[None])[0].flatten(1)
+        assert light.mean(0).std() > 0.01
+        assert (light[0] / light[2]).std() > 0.01
+
+    @pytest.mark.parametrize(("reduction", "draws"), [((1.0, 1.0), (0, 0, 0, 1)), ((1.0, 1.0), (0.3, 1, 0.5, 1))])
+    def test_feature_a_part_that_is_not_reduced_is_that_of_the_file(self, reduction, draws, tmp_path, monkeypatch):
+        """At two samples a pixel and a reduction of one, a sample is half a pixel of the file: enlarged twice."""
+        monkeypatch.setattr(module, "REDUCTION", (2.0 * reduction[0], 2.0 * reduction[1]))
+        stored = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
+        assert cv2.imwrite(str(tmp_path / "a.png"), stored[..., ::-1])
+        light = rgb_to_linear_rgb(torch.from_numpy(stored.transpose(2, 0, 1))[None] / 255)[0].numpy()
+        top, left = round(draws[1] * 20), round(draws[2] * 24)
+        part = light[:, top : top + 10, left : left + 16].transpose(1, 2, 0)
+        self.assert_close(_cut(tmp_path / "a.png", 10, 16, np.array(draws)), part, rtol=0, atol=1e-6)
+        mirrored = _cut(tmp_path / "a.png", 10, 16, np.array((*draws[:3], 0.2)))
+        self.assert_close(np.ascontiguousarray(mirrored), np.ascontiguousarray(part[:, ::-1]), rtol=0, atol=1e-6)
+
+    def test_feature_photographs_are_reduced_and_smaller_ones_enlarged(self, tmp_path, monkeypatch):
+        """Across a ramp of light whose slope tells the scale."""
+        ramp = np.tile(np.linspace(0, 60000, 300)[None, :, None], (200, 1, 3)).astype(np.uint16)
+        assert cv2.imwrite(str(tmp_path / "ramp.png"), ramp)
+        monkeypatch.setattr(module, "rgb_to_linear_rgb", lambda image: image)
+        slope = float(60000 / 65535 / 299)
+        for draw, size, reduction in ((0.0, 40, 0.5), (1.0, 40, 1.5), (0.5, 400, 0.5)):
+            cut = _cut(tmp_path / "ramp.png", size, size, np.array((draw, 0.5, 0.5, 1.0)))
+            found = float(np.diff(cut[size // 2, 5:-5, 0]).mean())
+            assert found == pytest.approx(slope * reduction, rel=0.03), (draw, size)
+
+    def test_feature_depth_is_uniform_in_no_photograph(self, folder):
+        """Depth does not follow from what is shown: over many scenes each photograph is seen near and far."""
+        paths = [folder / "red.PNG", folder / "blue.PNG"]
+        nearness = {0: [], 2: []}
+        for seed in range(60):
+            image, depth = photo_collage(paths, 24, 24, depth_range=(1.0, 2.0), seed=seed)
+            for channel in nearness:
+                nearness[channel] += depth[0][image.argmax(0) == channel].tolist()
+        means = [np.mean(values) for values in nearness.values()]
+        assert abs(means[0] - means[1]) < 0.15  # of 1 m; a scene's own mean varies by .2, so that of 40 by .03
+        assert min(np.std(values) for values in nearness.values()) > 0.15
+
+    @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(
+        st.tuples(st.integers(1, 24), st.integers(1, 24)), st.integers(0, 2**64), st.floats(0.01, 10),
+        st.floats(1.01, 1e6),
+    )  # fmt: skip
+    def test_property_values_stay_within_their_ranges(self, folder, varied, size, seed, near, ratio):
+        image, depth = photo_collage(photographs_in(folder), *size, depth_range=(near, near * ratio), seed=seed)
+        assert bool(((image >= 0) & (image <= 1)).all())
+        assert bool(((depth >= np.float32(near)) & (depth <= np.float32(near * ratio))).all())
+
+    @pytest.mark.parametrize(
+        ("changed", "message"),
+        [
+            ({"height": 0}, "height must be a positive integer, got 0"),
+            ({"seed": -1}, "seed must be an integer of 0 or more, got -1"),
+            ({"depth_range": (2.0, 1.0)}, r"0 < near < far, got \(2.0, 1.0\)"),
+            ({"photographs": []}, "photographs must hold one path or more, got none"),
+        ],
+    )
+    def test_exception_names_the_bad_value(self, changed, message, folder):
+        given = {"photographs": photographs_in(folder), "height": 8, "width": 8, **changed}
+        with pytest.raises(ValueError, match=message):
+            photo_collage(**given)
+        with pytest.raises(ValueError, match=message):
+            PhotoCollages(**{**given, "length": 2})
+
+    def test_exception_a_data_set_without_scenes(self, folder):
+        with pytest.raises(ValueError, match="length must be a positive integer, got 0"):
+            PhotoCollages(photographs_in(folder), 0, 8, 8)
+
+    def test_exception_a_photograph_that_cannot_be_read(self, tmp_path):
+        (tmp_path / "a.png").write_bytes(b"no picture")
+        with pytest.raises(ValueError, match=r"a\.png"):
+            photo_collage([tmp_path / "a.png"], 8, 8)
