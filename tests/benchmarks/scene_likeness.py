@@ -1,8 +1,8 @@
 """How like photographs the painted training scenes are: distances in power spectrum, gradients, light and colour.
 
-``python -m tests.benchmarks.scene_likeness [--scenes N]`` prints a table. The photographs are those of half A of the
-real scenes (``HALF_A``), from which settings may be taken; nothing is trained on them. A row compares the two halves of
-half A, which is as near as sets of this size come to each other.
+``python -m tests.benchmarks.scene_likeness [--scenes N] [--photographs FOLDER]`` prints a table. The photographs to
+compare with are those of half A of the real scenes (``HALF_A``), from which settings may be taken; nothing is trained
+on them. A row compares the two halves of half A, which is as near as sets of this size come to each other.
 
 All pictures are cut into tiles of 224 px and rounded to 8 bits. Each scene counts the same.
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data.photo_collages import PhotoCollages, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves
 from kornia_tidy.data.scene_dataset import SceneDataset
 from tests.scenes import ENTRIES, load_scene
@@ -114,7 +116,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=64, help="painted scenes of each kind (default: 64)")
-    count = parser.parse_args().scenes
+    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="measure collages of them, too")
+    args = parser.parse_args()
+    count = args.scenes
     if not ENTRIES:
         raise SystemExit("../shared/data is not on this machine: there are no photographs to compare with")
     pictures = {name: load_scene(name).image for name in half_a()}
@@ -123,6 +127,8 @@ def main() -> None:
         "dead leaves": DeadLeaves(count, 256, 256, seed=SEED),
         "photographic leaves": PhotographicLeaves(count, 256, 256, seed=SEED),
     }
+    if args.photographs is not None:
+        painted["photo collages"] = PhotoCollages(photographs_in(args.photographs), count, 256, 256, seed=SEED)
     sets = {
         f"photographs of half A ({len(photographs)})": photographs,
         "every second one of them": photographs[::2],
