@@ -187,7 +187,7 @@ class TestExplain(BaseTester):
         assert lines[0].startswith("scatter of 1 x 3 channels of 40x60 px, 6 of 6 layers, PSFs of 31x31 px, ")
         assert lines[0].endswith(f": {explanation.backend}")
         assert lines[1].startswith(f"  {explanation.backend}: about ")
-        assert lines[-1] == "  direct: direct convolution gathers light and does not scatter it"
+        assert "  direct: direct convolution gathers light and does not scatter it" in lines
 
     def test_feature_every_backend_has_a_time_or_an_objection(self):
         for compositing in COMPOSITING:
