@@ -201,5 +201,5 @@ def _cut(path: str | os.PathLike[str], height: int, width: int, draws: NDArray[n
     part = photograph[:, top : top + high, left : left + wide].expand(3, -1, -1)
     light = rgb_to_linear_rgb(part[None])[0].numpy().transpose(1, 2, 0)
     kind = cv2.INTER_AREA if reduction > 1 else cv2.INTER_LINEAR
-    light = cv2.resize(np.ascontiguousarray(light), (width, height), interpolation=kind)
-    return light[:, ::-1] if draws[3] < 0.5 else light
+    painted = cv2.resize(np.ascontiguousarray(light), (width, height), interpolation=kind).astype(np.float32)
+    return painted[:, ::-1] if draws[3] < 0.5 else painted

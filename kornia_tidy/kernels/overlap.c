@@ -18,6 +18,9 @@
 #ifdef _OPENMP
 #include <omp.h>
 #endif
+#ifdef __linux__
+#include <sys/mman.h>
+#endif
 
 #include "vectors.h"
 
@@ -277,22 +280,22 @@ INLINE uint8_t *needed_by(const work *w, tile t, int64_t layer) {
 
 INLINE int any_of(const uint8_t *needed, int64_t groups) { return memchr(needed, 1, groups) != 0; }
 
-// The spectrum of a plane of numbers; groups of columns that are not needed are black.
-static void analyse(const work *w, const vec *light, const uint8_t *needed, wave *column, wave *spectrum) {
+// Transforms a group of columns and hands them on to the rows of a spectrum.
+static void columns_to_rows(const work *w, int64_t g, wave *column, wave *spectrum) {
+    forward(column, &w->in_columns);
+    for (int64_t band = 0; band < w->bands; band++)
+        transpose(column + band * LANES, spectrum + band * w->waves + g * LANES);
+}
+
+// The spectrum of a plane of numbers.
+static void analyse(const work *w, const vec *light, wave *column, wave *spectrum) {
     const int64_t rows = w->s->rows;
     for (int64_t g = 0; g < w->groups; g++) {
-        if (needed && !needed[g]) {
-            for (int64_t band = 0; band < w->bands; band++)
-                memset(spectrum + band * w->waves + g * LANES, 0, LANES * sizeof(wave));
-            continue;
-        }
         const vec *left = light + g * rows, *right = left + w->groups * rows;
         const wave turn = w->turns[g];
         for (int64_t y = 0; y < rows; y++)
             column[y] = (wave){left[y] * turn.re - right[y] * turn.im, left[y] * turn.im + right[y] * turn.re};
-        forward(column, &w->in_columns);
-        for (int64_t band = 0; band < w->bands; band++)
-            transpose(column + band * LANES, spectrum + band * w->waves + g * LANES);
+        columns_to_rows(w, g, column, spectrum);
     }
     for (int64_t band = 0; band < w->bands; band++) forward(spectrum + band * w->waves, &w->in_rows);
 }
@@ -381,7 +384,7 @@ static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
     const tiles *s = w->s;
     const int64_t rows = s->rows;
     cut_window(w, t, channel, d->light);
-    analyse(w, d->light, 0, d->half, d->spectrum);
+    analyse(w, d->light, d->half, d->spectrum);
     read_labels(w, t, d);
     memset(d->sums, 0, 2 * w->groups * rows * sizeof(vec));
     for (int64_t layer = 0; layer < s->layers; layer++) {
@@ -410,14 +413,27 @@ static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
         }
 }
 
-// The spectrum of a layer's share of the pixels, which lie in `sums`.
-static void analyse_layer(const work *w, tile t, int64_t layer, desk *d) {
-    const int64_t rows = w->s->rows;
+// The transformed columns of a layer's share of the pixels, which lie in `sums`. Its rows are left to be transformed.
+static void layer_columns(const work *w, tile t, int64_t layer, desk *d) {
+    const tiles *s = w->s;
     const uint8_t *needed = needed_by(w, t, layer);
-    for (int64_t g = 0; g < 2 * w->groups; g++)
-        for (int64_t n = g * rows; needed[g % w->groups] && n < (g + 1) * rows; n++)
-            d->light[n] = share(w->s, d->label[n], d->weight + n, layer) * d->sums[n];
-    analyse(w, d->light, needed, d->half, d->spectrum);
+    wave *column = d->half;
+    for (int64_t g = 0; g < w->groups; g++) {
+        if (!needed[g]) {
+            for (int64_t band = 0; band < w->bands; band++)
+                memset(d->spectrum + band * w->waves + g * LANES, 0, LANES * sizeof(wave));
+            continue;
+        }
+        const wave turn = w->turns[g];
+        memset(column, 0, s->rows * sizeof(wave));
+        for (int64_t y = s->origin; y < s->origin + t.height; y++) {
+            const int64_t n = g * s->rows + y, m = n + w->groups * s->rows;
+            const vec left = share(s, d->label[n], d->weight + n, layer) * d->sums[n];
+            const vec right = share(s, d->label[m], d->weight + m, layer) * d->sums[m];
+            column[y] = (wave){left * turn.re - right * turn.im, left * turn.im + right * turn.re};
+        }
+        columns_to_rows(w, g, column, d->spectrum);
+    }
 }
 
 // Adds the first numbers of each row of a wave's columns to a plane.
@@ -451,10 +467,14 @@ static void scatter_tile(const work *w, int64_t channel, tile t, desk *d) {
     memset(d->total, 0, all * sizeof(wave));
     for (int64_t layer = 0; layer < s->layers; layer++) {
         if (!any_of(needed_by(w, t, layer), w->groups)) continue;
-        analyse_layer(w, t, layer, d);
+        layer_columns(w, t, layer, d);
         const wave *psf = w->psfs + w->place[layer] * all;
-        if (s->correlate) multiply(d->spectrum, psf, all, -1, 1, d->total);
-        else multiply(d->spectrum, psf, all, 1, 1, d->total);
+        for (int64_t k = 0; k < all; k += w->waves) {
+            wave *row = d->spectrum + k;
+            forward(row, &w->in_rows);
+            if (s->correlate) multiply(row, psf + k, w->waves, -1, 1, d->total + k);
+            else multiply(row, psf + k, w->waves, 1, 1, d->total + k);
+        }
     }
     for (int64_t band = 0; band < w->bands; band++) row_back(w, d->total + band * w->waves, band, 0, d->half);
     const int64_t height = s->height + s->side - 1, width = s->width + s->side - 1;
@@ -470,15 +490,19 @@ static void correlate_tile(const work *w, int64_t channel, tile t, desk *d, wave
     const tiles *s = w->s;
     const int64_t all = w->bands * w->waves;
     cut_window(w, t, channel, d->light);
-    analyse(w, d->light, 0, d->half, d->total);
+    analyse(w, d->light, d->half, d->total);
     cut_tile(w, t, channel, d->sums);
     read_labels(w, t, d);
     for (int64_t layer = 0; layer < s->layers; layer++) {
         if (!any_of(needed_by(w, t, layer), w->groups)) continue;
-        analyse_layer(w, t, layer, d);
+        layer_columns(w, t, layer, d);
         wave *found = slab + w->place[layer] * all;
-        if (s->correlate) multiply(d->total, d->spectrum, all, -1, 1, found);
-        else multiply(d->spectrum, d->total, all, -1, 1, found);
+        for (int64_t k = 0; k < all; k += w->waves) {
+            wave *row = d->spectrum + k;
+            forward(row, &w->in_rows);
+            if (s->correlate) multiply(d->total + k, row, w->waves, -1, 1, found + k);
+            else multiply(row, d->total + k, w->waves, -1, 1, found + k);
+        }
     }
 }
 
@@ -532,7 +556,7 @@ static void transform_psfs(const work *w, int64_t channel, desk *desks) {
         desk *d = desks + thread_number();
         cut(w, s->psfs + (layer * s->channels + channel) * s->side * s->side, s->side, s->side, s->side, 0, d->light);
         for (int64_t n = 0; n < 2 * w->groups * s->rows; n++) d->light[n] *= w->scale;
-        analyse(w, d->light, 0, d->half, w->psfs + w->place[layer] * w->bands * w->waves);
+        analyse(w, d->light, d->half, w->psfs + w->place[layer] * w->bands * w->waves);
     }
 }
 
@@ -583,9 +607,15 @@ static void correlate_tiles(const work *w, int64_t channel, desk *desks, int64_t
     }
 }
 
+// Memory for vectors; much of it in huge pages where the system has them, because columns jump from page to page.
 static void *take(int64_t count, size_t size) {
-    const size_t bytes = (count * size + sizeof(vec) - 1) / sizeof(vec) * sizeof(vec);
-    return aligned_alloc(sizeof(vec), bytes ? bytes : sizeof(vec));
+    const size_t huge = 2 << 20, unit = count * size < 2 * huge ? sizeof(vec) : huge;
+    const size_t bytes = (count * size + unit - 1) / unit * unit;
+    void *memory = aligned_alloc(unit, bytes ? bytes : unit);
+#ifdef MADV_HUGEPAGE
+    if (memory && unit == huge) madvise(memory, bytes, MADV_HUGEPAGE);
+#endif
+    return memory;
 }
 
 static int take_desk(const work *w, desk *d) {

@@ -157,8 +157,32 @@ def is_window_size(size: int, dtype: torch.dtype) -> bool:
         >>> [n for n in range(1, 200) if is_window_size(n, torch.float32)]
         [32, 64, 96, 128, 160, 192]
     """
-    if size < 1 or size % size_step(dtype):
-        return False
+    return size >= 1 and size % size_step(dtype) == 0 and _is_fast(size)
+
+
+def needed_side(size: int, pixels: int, psf_side: int, step: int) -> int:
+    """Return the least side of windows that cut an axis into as many tiles as windows of a size do.
+
+    Args:
+        size: side of a window, in samples.
+        pixels: along the axis.
+        psf_side: P, of the PSFs.
+        step: what the side is a multiple of, as :func:`is_window_size` wants it.
+
+    Returns:
+        Samples, ``size`` at most.
+
+    Example:
+        >>> needed_side(1280, 1110, 513, 16), needed_side(1280, 1282, 513, 32)
+        (1152, 1280)
+    """
+    tiles = -(-pixels // (size - psf_side + 1))
+    least = -(-pixels // tiles) + psf_side - 1
+    return next(side for side in range(-(-least // step) * step, size + 1, step) if _is_fast(side))
+
+
+def _is_fast(size: int) -> bool:
+    """Return whether a transform's length has no prime factors but 2, 3 and 5."""
     for factor in (2, 3, 5):
         while size % factor == 0:
             size //= factor
@@ -194,16 +218,18 @@ def _call(
     kept["index"] = rows_in_memory(labels[0])
     if labels[1] is not None:
         kept["weight"] = rows_in_memory(labels[1])
+    images, height, width = labels[0].shape
+    step = size_step(out.dtype)
     given = _Tiles(
-        images=len(labels[0]),
+        images=images,
         channels=out.shape[1],
-        height=labels[0].shape[1],
-        width=labels[0].shape[2],
+        height=height,
+        width=width,
         layers=layers,
         side=side,
         threads=torch.get_num_threads(),
-        rows=size,
-        columns=size,
+        rows=needed_side(size, height, side, step // 2),
+        columns=needed_side(size, width, side, step),
         origin=(side - 1) * (correlate == (function == "scatter")),
         correlate=correlate,
         weight_gradient=weight_gradient,
@@ -217,7 +243,7 @@ def _call(
     kept["out"] = out
     for name, tensor in kept.items():
         setattr(given, name, tensor.data_ptr())
-    status = getattr(load(SOURCE, out.dtype), function)(ctypes.byref(given)) if given.images and out.numel() else 0
+    status = getattr(load(SOURCE, out.dtype), function)(ctypes.byref(given)) if images and out.numel() else 0
     if status == NO_LAYER:
         raise IndexError(f"a pixel lies in none of the {layers} layers: its depth or defocus is not a number")
     if status == NO_MEMORY:

@@ -18,6 +18,7 @@ from math import log2, prod
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.overlap_ops import needed_side, size_step
 from kornia_tidy.render.backends.tile_plan import BLOCKS, OVERLAPS, TileKind, cheapest_grid
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.compositing import render
@@ -50,9 +51,15 @@ def window_transforms(image: Tensor, psi: Tensor, bank: Bank, kind: TileKind) ->
     side = bank.psfs.shape[-1] - 1
     plane = prod(next_fast_size(n + side) for n in image.shape[-2:])
     transforms = (work.blocks + work.pairs + work.layers) * grid.across  # of real numbers; a round trip takes two
-    samples = transforms / 2 * grid.size**2 * 2 * log2(grid.size)
+    sides = [grid.size, grid.size]
+    if kind is OVERLAPS:
+        step = size_step(image.dtype)
+        sides = [
+            needed_side(grid.size, n, side + 1, s) for n, s in zip(image.shape[-2:], (step // 2, step), strict=True)
+        ]
+    samples = transforms / 2 * prod(sides) * log2(prod(sides))
     pixels = f"{grid.across} x {grid.tile}" if grid.across > 1 else grid.tile
-    held = f"{pixels} px in {grid.size}, {work.pairs / work.blocks:.1f} layers"
+    held = f"{pixels} px in {sides[0]} x {sides[1]}, {work.pairs / work.blocks:.1f} layers"
     return f"{samples / (plane * log2(plane)):.1f} ({held})"
 
 
