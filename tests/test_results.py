@@ -20,6 +20,7 @@ from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
 from kornia_tidy.mask_design.candidates import FLAT as FLAT_LENS
 from tests.base import BaseTester
+from tests.benchmarks import depth_uncertainty
 from tests.benchmarks.results import __main__ as command
 from tests.benchmarks.results import measure
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
@@ -477,3 +478,22 @@ class TestCommand(BaseTester):
         assert "Dead leaves: not measured yet." in text
         assert "Real scenes: not measured yet." not in text
         assert "Not measured yet: noise 0.002, noise 0.03, 57,000 electrons" in text
+
+
+class TestDepthUncertainty(BaseTester):
+    @pytest.fixture(autouse=True)
+    def painted(self, monkeypatch):
+        monkeypatch.setattr(depth_uncertainty, "real_scenes", lambda: dead_leaves(6, 96))
+
+    def test_smoke_a_row_of_errors_and_of_their_prediction(self):
+        line = depth_uncertainty.row(available()["joint-uncertain"](), FIXED[0])
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert cells[:2] == ["joint-uncertain", FIXED[0]]
+        textured, everywhere, surest = (float(cell.split(" ± ")[0]) for cell in cells[2:5])
+        assert 0 < surest < everywhere < 0.4
+        assert 0 < textured < 0.4
+        assert cells[5].endswith(" %")
+
+    def test_exception_a_network_that_does_not_tell_is_named(self):
+        with pytest.raises(ValueError, match="joint-5 does not tell how sure"):
+            depth_uncertainty.row(available()["joint-5"](), FIXED[0])

@@ -41,7 +41,8 @@ _RUN = {
     "precision": "precision of the network",
 }
 _ESTIMATES = {"image": "the image in focus everywhere", "depth": "depth"}
-_PAINTED = "dead-leaves"
+_PAINTED = {"dead-leaves": "dead leaves", "photographic-leaves": "leaves like photographs"}
+_COLLAGES = "photo-collages"
 _IDENTIFIER = re.compile(r"[a-z0-9][a-z0-9.+-]{0,63}")
 
 CITATION = """\
@@ -196,17 +197,32 @@ def _limits(system: TrainedSystem) -> list[str]:
     data = system.run.get("data")
     limits = [
         "Captures of another lens, sensor or set of masks are not what the network was trained for.",
-        f"It was trained with a noise of {settings.sigma:.4g} of full scale. Other noise was not seen in training.",
+        _noise_seen(system),
         f"Depths nearer than {near:.4g} m"
         + ("" if math.isinf(far) else f" or farther than {far:.4g} m")
         + " are beyond the camera's range and are taken for its ends.",
         "Captures were simulated: thin lens, on-axis PSFs, one depth for each pixel, no motion.",
     ]
-    if data == _PAINTED:
-        limits.append("It was trained on painted scenes (dead leaves) alone. Photographs have other statistics.")
+    if data in _PAINTED:
+        limits.append(f"Its last training was on painted scenes ({_PAINTED[data]}). Photographs have other statistics.")
+    if data == _COLLAGES:
+        limits.append(
+            "It was trained on collages of photographs, in which depth has nothing to do with what they show."
+        )
     if "depth" in MAPS[settings.task]:
-        limits.append("Depth is a guess in areas without texture. The network does not tell how sure it is.")
+        sure = "It tells how sure it is." if settings.depth_classes else "The network does not tell how sure it is."
+        limits.append(f"Depth is a guess in areas without texture. {sure}")
     return limits
+
+
+def _noise_seen(system: TrainedSystem) -> str:
+    """Return the noise of the training: a range where captures were rendered once, else that of the camera."""
+    noise = system.run.get("noise_range")
+    if system.run.get("learn") != "network" or not noise:
+        seen = f"It was trained with a noise of {system.settings.sigma:.4g} of full scale."
+        return f"{seen} Other noise was not seen in training."
+    least, largest = noise
+    return f"Half of its training had a noise of {least:.4g} to {largest:.4g} of full scale, half had shot noise."
 
 
 def _value(value: Any) -> str:

@@ -68,5 +68,15 @@ class TestModelCard(BaseTester):
             assert sentence in painted
             assert sentence not in other
 
+    def test_feature_noise_and_certainty_are_those_of_the_training(self):
+        run = {"data": "photo-collages", "learn": "network", "noise_range": [0.001, 0.03]}
+        card = model_card(untrained(task="joint", depth_classes=21, refocus=9)._replace(run=run), "t")
+        for sentence in ("noise of 0.001 to 0.03", "collages of photographs", "It tells how sure it is"):
+            assert sentence in card
+        assert "does not tell" not in card
+        card = model_card(untrained(task="joint", sigma=0.004)._replace(run={**run, "learn": "both"}), "t")
+        for sentence in ("a noise of 0.004 of full scale. Other noise", "does not tell how sure"):
+            assert sentence in card
+
     def test_feature_a_title_of_several_lines_stays_a_title(self):
         assert "\n# a # b\n" in model_card(untrained(), "a\n# b")
