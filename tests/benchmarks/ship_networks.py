@@ -32,6 +32,7 @@ COMMANDS, SCORES = "commands.txt", "scores.json"
 def record(folder: Path) -> dict[str, Any]:
     """Return what heads.json tells of a run: commands, settings, minutes, validation, scores, machine and date."""
     rows = {name: list(csv.DictReader((folder / f"{name}.csv").open())) for name in ("training", "validation")}
+    settings = TrainingSettings.read(folder / "settings.json")
     seconds = [float(row["seconds_a_step"]) for row in rows["training"]]
     return {
         "command": (folder / COMMANDS).read_text().strip(),
@@ -39,9 +40,9 @@ def record(folder: Path) -> dict[str, Any]:
         "commit": subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], text=True).strip(),
         "machine": f"{platform.machine()}, one thread a run, {os.cpu_count()} cores shared",
         "torch": torch.__version__,
-        "seed": TrainingSettings.read(folder / "settings.json").seed,
+        "seed": settings.seed,
         "seeds tried": 1,
-        "settings": TrainingSettings.read(folder / "settings.json").as_dict(),
+        "settings": {**settings.as_dict(), "root": None},  # a place on one machine
         "validation": rows["validation"],
         "minutes": round(len(seconds) * statistics.median(seconds) / 60, 1),
         "scores": scores_of(folder),

@@ -63,10 +63,12 @@ class TestPretrained(BaseTester):
         state = read_state(FOLDER / "edof-5.safetensors")
         weights = dict(state["state_dict"])
         state["state_dict"] = {**weights, "head.extra": torch.ones(1000, 1000), "average.steps": torch.tensor(1)}
-        write_state(tmp_path / "run.safetensors", {**state, "optimizer": {"lr": 1.0}})
+        settings = {**state["settings"], "root": "a place on one machine"}
+        write_state(tmp_path / "run.safetensors", {**state, "settings": settings, "optimizer": {"lr": 1.0}})
         ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors", half=False)
         again = read_state(tmp_path / "small.safetensors")
         assert set(again) == {"settings", "global_step", "state_dict"}
+        assert again["settings"] == {**state["settings"], "root": None}
         assert again["state_dict"].keys() == weights.keys()
         assert all(torch.equal(again["state_dict"][key], value) for key, value in weights.items())
 

@@ -86,7 +86,8 @@ def pretrained_record(name: str) -> dict[str, Any]:
 def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, half: bool = True) -> None:
     """Write a checkpoint for shipping: without the state of the run, the network's weights in half precision.
 
-    PSFs of a closed form are left out: :func:`~kornia_tidy.inference.trained.load_trained` computes them anew.
+    PSFs of a closed form are left out: :func:`~kornia_tidy.inference.trained.load_trained` computes them anew. So is
+    the folder of the data, a place on one machine.
 
     Args:
         checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
@@ -106,4 +107,5 @@ def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, ha
         parameters = load_trained(checkpoint).head.named_parameters()
         weights = halved(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
     weights |= {name: value[..., :0, :0] for name, value in weights.items() if name.endswith("closed_form.psfs")}
-    write_state(path, {**{key: state[key] for key in ("settings", "global_step")}, "state_dict": weights})
+    settings = {name: None if name == "root" else value for name, value in state["settings"].items()}
+    write_state(path, {"settings": settings, "global_step": state["global_step"], "state_dict": weights})
