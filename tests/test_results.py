@@ -19,8 +19,10 @@ from kornia_tidy.inference.pretrained import load_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
 from kornia_tidy.mask_design.candidates import FLAT as FLAT_LENS
+from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from tests.base import BaseTester
 from tests.benchmarks import depth_uncertainty
+from tests.benchmarks.fit_temperature import temperature_by_moments
 from tests.benchmarks.results import __main__ as command
 from tests.benchmarks.results import measure
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
@@ -492,8 +494,19 @@ class TestDepthUncertainty(BaseTester):
         textured, everywhere, surest = (float(cell.split(" ± ")[0]) for cell in cells[2:5])
         assert 0 < surest < everywhere < 0.4
         assert 0 < textured < 0.4
-        assert cells[5].endswith(" %")
+        assert 0 < float(cells[5]) < 0.4
+        assert cells[6].endswith(" %")
 
     def test_exception_a_network_that_does_not_tell_is_named(self):
         with pytest.raises(ValueError, match="joint-5 does not tell how sure"):
             depth_uncertainty.row(available()["joint-5"](), FIXED[0])
+
+    def test_feature_variances_of_a_fitted_temperature_are_as_large_as_squared_errors(self):
+        generator = torch.Generator().manual_seed(0)
+        logits = 9 * torch.randn(2, 9, 20, 20, generator=generator)
+        depth = torch.rand(2, 1, 20, 20, generator=generator)
+        mask = torch.rand(2, 1, 20, 20, generator=generator) < 0.7
+        found = temperature_by_moments(logits, depth, mask)
+        mean, deviation = depth_moments(logits.double() / found)
+        errors = (mean - depth).square()[mask].mean()
+        assert float(deviation.square()[mask].mean()) == pytest.approx(float(errors), rel=1e-6)

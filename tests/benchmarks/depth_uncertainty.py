@@ -2,7 +2,8 @@
 
 A SYSTEM is a shipped one or a checkpoint. On half B of the real scenes, with PSFs of 129 pixels and all stray light, it
 prints the RMSE of the depth over textured pixels, over all known pixels and over the surest 70 % of each scene, means
-over the scenes with their standard errors, and how far predicted errors are from found ones, over all scenes together.
+over the scenes with their standard errors; and over all scenes together the RMSE of the surest 70 % of all pixels, and
+how far predicted errors are from found ones.
 """
 
 from __future__ import annotations
@@ -59,9 +60,11 @@ def row(system: System, noise: str) -> str:
             errors[key].append(value)
         for part, maps in zip(parts, (depth, deviation, scene.inverse_depth), strict=True):
             part.append(maps[scene.known].view(1, 1, 1, -1))
-    curve = reliability_curve(*(torch.cat(part, -1) for part in parts))
+    together = [torch.cat(part, -1) for part in parts]
+    curve, surest = reliability_curve(*together), sparsification_curve(*together, shares=(SURE,))
     words = [mean_and_error([value for value in values if math.isfinite(value)]) for values in errors.values()]
-    return f"| {system.name} | {noise} | {' | '.join(words)} | {100 * curve.calibration_error():.0f} % |"
+    words += [f"{float(surest):.3f}", f"{100 * curve.calibration_error():.0f} %"]
+    return f"| {system.name} | {noise} | {' | '.join(words)} |"
 
 
 def mean_and_error(values: list[float]) -> str:
@@ -79,8 +82,15 @@ def main() -> None:
     makers = [
         known[name] if name in known else (lambda path=Path(name): from_checkpoint(path)) for name in options.systems
     ]
-    print("| system | noise | RMSE, textured | RMSE | RMSE of the surest 70 % | predicted from found errors |")
-    print("|---|---|---|---|---|---|")
+    columns = (
+        "RMSE, textured",
+        "RMSE",
+        "surest 70 % of each scene",
+        "surest 70 % of all",
+        "predicted from found errors",
+    )
+    print(f"| system | noise | {' | '.join(columns)} |")
+    print("|---" * (2 + len(columns)) + "|")
     for make in makers:
         system = make()
         for noise in options.noises:
