@@ -64,13 +64,20 @@ class Block(NamedTuple):
     line: int
     language: str
     text: str
-    needs: str = ""  # package without which it is only compiled
+    needs: str = ""  # package, or folder beside the project, without which it is only compiled
     slow: bool = False  # run with --runslow alone
     options: str = ""  # appended to its commands where it is run
 
     @property
     def place(self) -> str:
         return f"{self.page}:{self.line}"
+
+    @property
+    def lacks(self) -> bool:
+        """Whether what it needs is not on this machine."""
+        if self.needs.startswith(".."):
+            return not (ROOT / self.needs).exists()
+        return bool(self.needs) and importlib.util.find_spec(self.needs) is None
 
 
 def blocks(name: str, text: str) -> list[Block]:
@@ -105,8 +112,9 @@ def run_page(name: str, text: str, *, slow: bool = False) -> None:
     namespace: dict[str, Any] = {"__name__": "__main__"}
     printed: str | None = ""
     for block in blocks(name, text):
-        if block.needs and importlib.util.find_spec(block.needs) is None:
-            compile(block.text, str(ROOT / name), "exec")
+        if block.lacks:
+            if block.language == "python":
+                compile(block.text, str(ROOT / name), "exec")
             printed = None
         elif block.language == "text":
             if printed is not None:
@@ -187,13 +195,12 @@ class TestEveryPage(BaseTester):
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_what_is_seldom_run_names_what_is_there(self, name):
         for block in blocks(name, (ROOT / name).read_text(encoding="utf-8")):
-            missing = block.needs and importlib.util.find_spec(block.needs) is None
-            seldom = block.slow or missing
+            seldom = block.slow or block.lacks
             if seldom and block.language == "python":
                 try:
                     check_names(block)
                 except ImportError as error:
-                    if not missing or (error.name or "").partition(".")[0] != block.needs:
+                    if not block.lacks or (error.name or "").partition(".")[0] != block.needs:
                         raise
             elif seldom and block.language == "bash":
                 for words in shell_lines(block):
@@ -264,6 +271,12 @@ class TestRunPage(BaseTester):
     def test_exception_another_command(self, folder):
         with pytest.raises(AssertionError, match=r"p\.md:1: ls is not known here"):
             run_page("p.md", page("```bash", "ls", "```"))
+
+    def test_feature_a_block_that_needs_a_folder_beside_the_project_is_run_where_it_is(self, folder):
+        block = page("<!-- needs: ../{} -->", "```bash", "ls", "```")
+        run_page("p.md", block.format("no such folder"))
+        with pytest.raises(AssertionError, match="ls is not known here"):  # so it was run
+            run_page("p.md", block.format(ROOT.name))
 
     def test_feature_a_block_that_needs_a_package_is_run_where_it_is(self, folder):
         block = page("<!-- needs: {} -->", "```python", "print(1 / {})", "```", "```text", "1.0", "```")
