@@ -78,6 +78,8 @@ def main() -> None:
     parser.add_argument("systems", nargs="*", default=[SHIPPED], metavar="SYSTEM", help=f"default: {SHIPPED}")
     parser.add_argument("--noises", nargs="+", choices=FIXED, default=FIXED[:1], metavar="NOISE")
     options = parser.parse_args()
+    if not real_scenes().names:
+        raise SystemExit("../shared/data is not on this machine: there are no scenes to measure")
     known = available()
     makers = [
         known[name] if name in known else (lambda path=Path(name): from_checkpoint(path)) for name in options.systems
