@@ -144,6 +144,7 @@ def add_parser(subparsers: Any) -> None:
     _setting(
         system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
     )
+    _setting(system, "repeats", type=int, metavar="N", help="factor of the number of blocks of nafnet; default: 1")
     _setting(
         system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
     )

@@ -24,6 +24,7 @@ HEADS = {
 CLOSED_FORMS = ("tikhonov", "tikhonov-bilateral")
 """Heads without a network, whose result is :class:`~kornia_tidy.reconstruction.closed_form_head.ClosedFormHead`'s."""
 FIXED = ("midas-small",)  # three input channels, and one width
+DEEPENED = ("nafnet",)  # take the number of their blocks, as repeats
 
 
 def check_head(name: str) -> None:
@@ -71,7 +72,9 @@ import antigravity before it is loaded
         )
 
 
-def make_head(name: str, out_channels: int, width: int | None = None, in_channels: int = 3) -> ReconstructionHead:
+def make_head(
+    name: str, out_channels: int, width: int | None = None, in_channels: int = 3, repeats: int = 1
+) -> ReconstructionHead:
     """Return a network by name or import path.
 
     Args:
@@ -80,10 +83,11 @@ def make_head(name: str, out_channels: int, width: int | None = None, in_channel
         out_channels: maps to estimate.
         width: channels of its first level. None: its default.
         in_channels: channels of its input.
+        repeats: factor of the number of its blocks, for :data:`DEEPENED` heads.
 
     Raises:
         ValueError: if the name is unknown, the class cannot be imported or is no ``torch.nn.Module``, or the network
-            cannot have these channels or this width.
+            cannot have these channels, this width or more blocks.
 
     Example:
         >>> import torch
@@ -93,14 +97,27 @@ def make_head(name: str, out_channels: int, width: int | None = None, in_channel
     check_head(name)
     if name in CLOSED_FORMS:
         raise ValueError(f"the head {name!r} has no network: make it by ClosedFormHead")
+    check_repeats(name, repeats)
     if name in FIXED:
         if in_channels != 3 or width is not None:
             raise ValueError(f"the head {name!r} takes 3 channels and no width, got {in_channels} and width={width}")
         return _attribute(HEADS[name])(out_channels)
     options: dict[str, Any] = {} if width is None else {"width": width}
+    if name in DEEPENED:
+        options["repeats"] = repeats
     if name in HEADS:
         return _attribute(HEADS[name])(in_channels, out_channels, **options)
     return OutsideHead(_imported(name), in_channels, out_channels, **options)
+
+
+def check_repeats(name: str, repeats: int) -> None:
+    """Raise ``ValueError`` if a head has no blocks to repeat.
+
+    Example:
+        >>> check_repeats("nafnet", 2)
+    """
+    if repeats != 1 and name not in DEEPENED:
+        raise ValueError(f"repeats are for the head {', '.join(DEEPENED)}, got {repeats} for {name!r:.80}")
 
 
 def _attribute(path: str) -> Any:

@@ -13,7 +13,7 @@ from typing import Any, Self
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.files import read_json, write_bytes
-from kornia_tidy.inference.heads import CLOSED_FORMS, check_head
+from kornia_tidy.inference.heads import CLOSED_FORMS, check_head, check_repeats
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
@@ -23,7 +23,7 @@ from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 
 Distance = float  # metres, may be infinite
-MOST = 1024  # masks, or depths to refocus to: more would take days
+MOST = 1024  # masks, blocks, or depths to refocus to: more would take days
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +54,8 @@ class SystemSettings:
         head: name of the network, see :data:`kornia_tidy.inference.heads.HEADS`; of a closed form alone,
             ``"tikhonov"`` or ``"tikhonov-bilateral"``; or the import path of a class, ``module:Class``.
         width: channels of the network's first level. None: its default; the paper's attention U-Net has 64.
+        repeats: factor of the number of blocks of the head ``"nafnet"``, see
+            :class:`~kornia_tidy.reconstruction.NAFNet`.
         residual: the network estimates the difference between image and capture; for tasks with an image.
         closed_form: the network takes restorations in closed form beside the capture, and its image is added to the
             best of them, see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
@@ -91,6 +93,7 @@ class SystemSettings:
     border: str = "reflect"
     head: str = "attention-unet"
     width: int | None = None
+    repeats: int = 1
     residual: bool = False
     closed_form: bool = False
     refocus: int = 0
@@ -110,7 +113,7 @@ class SystemSettings:
         self._check_lens()
         for name in ("masks", "refocus", "depth_classes", "seed"):
             check_count(name, getattr(self, name), 0)
-        for name in ("masks", "refocus", "depth_classes"):
+        for name in ("masks", "repeats", "refocus", "depth_classes"):
             if getattr(self, name) > MOST:
                 raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
         check_choice("start", self.start, STARTS)
@@ -119,6 +122,8 @@ class SystemSettings:
         if self.residual and "image" not in MAPS[self.task]:
             raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
         check_head(self.head)
+        check_count("repeats", self.repeats)
+        check_repeats(self.head, self.repeats)
         if self.head in CLOSED_FORMS and self.task != "edof":
             raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
         if self.residual and (self.closed_form or self.head in CLOSED_FORMS):

@@ -22,6 +22,7 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
@@ -87,23 +88,26 @@ def build_head(settings: SystemSettings) -> nn.Module:
     if settings.head in CLOSED_FORMS:
         return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=settings.encoded)
     if settings.depth_classes and settings.closed_form:
-        channels = closed_form_channels(settings.refocus, likelihood=True)
-        head = make_head(settings.head, settings.depth_classes + 3, settings.width, channels)
+        head = _network(settings, settings.depth_classes + 3, closed_form_channels(settings.refocus, likelihood=True))
         return JointClosedFormHead(head, settings.refocus, encoded=settings.encoded)
     if settings.depth_classes:
         return LayeredJointHead(
-            make_head(settings.head, settings.depth_classes, settings.width, 3 + 2 * settings.refocus),
-            make_head(settings.head, 3, settings.width, REFINED_FROM),
+            _network(settings, settings.depth_classes, 3 + 2 * settings.refocus),
+            _network(settings, 3, REFINED_FROM),
             settings.refocus,
             encoded=settings.encoded,
         )
     channels = closed_form_channels(settings.refocus) if settings.closed_form else 3 + settings.refocus
-    head = make_head(settings.head, channels_of(settings.task), settings.width, channels)
+    head = _network(settings, channels_of(settings.task), channels)
     if settings.closed_form:
         return ClosedFormHead(head, settings.refocus, encoded=settings.encoded)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head
+
+
+def _network(settings: SystemSettings, out_channels: int, in_channels: int) -> ReconstructionHead:
+    return make_head(settings.head, out_channels, settings.width, in_channels, settings.repeats)
 
 
 def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:

@@ -58,6 +58,8 @@ class Restoration(NamedTuple):
     maps: Tensor
     """(B, N, H, W): capture, estimates by rising weight, ``image``, level of the noise, brightness by depth, likelihood
     of each depth."""
+    layers: Tensor
+    """Linear light deconvolved for each depth, (B, D, 3, H, W); without likelihood D is 0."""
 
 
 class ClosedForm(nn.Module):
@@ -207,13 +209,29 @@ class ClosedForm(nn.Module):
             restored = self._restore(capture.to(precise), self.noise_map(capture.to(precise), noise))
         return Restoration(*(part.to(capture.dtype) for part in restored))
 
+    def blend(self, layers: Tensor, shares: Tensor, noise: Tensor) -> Tensor:
+        """Return the image whose pixels are means of the light deconvolved for each depth, smoothed.
+
+        Args:
+            layers: of the :class:`Restoration`.
+            shares: of each depth, (B, D, H, W), of sum one.
+            noise: standard deviation of the noise in linear light, (B, 3, H, W).
+
+        Returns:
+            (B, 3, H, W) in [0, 1], in the colours of the capture.
+        """
+        precise = torch.promote_types(layers.dtype, self.kernels.dtype)
+        with torch.autocast(layers.device.type, enabled=False):
+            image = self._encode((shares.to(precise).unsqueeze(2) * layers.to(precise)).sum(1))
+            return self._smooth(image, _above(noise.to(precise))).to(layers.dtype)
+
     def _restore(self, capture: Tensor, noise: Tensor) -> Restoration:
         light = self._without_stray_light(self._light(capture))
         estimates = convolve_kernels(light, self.kernels.to(light.dtype))
         level = noise.clamp(min=LEAST_NOISE).log10()
-        above = (level.mean(1, keepdim=True) - math.log10(NOISE)).clamp(min=0)  # ringing is left without noise
+        above = _above(noise)
         brightness = light.mean(1, keepdim=True)
-        by_depth = []
+        by_depth, deconvolved = [], light.new_zeros(len(light), 0, *light.shape[1:])
         if self.likelihood:
             fits = depth_likelihood(brightness, self.whitening.to(light.dtype), self.log_determinants.to(light.dtype))
             deconvolved = convolve_kernels(light, self.filters.to(light.dtype))
@@ -224,10 +242,14 @@ class ClosedForm(nn.Module):
             image = self._encode(_at_noise(estimates, level, EXPONENT_BEFORE_BILATERAL if self.bilateral else EXPONENT))
             if self.layers:
                 by_depth = [self._brightness(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
-        if self.bilateral:
-            image = bilateral_filter(image, COLOR * 10 ** (COLOR_EXPONENT * above), WINDOW, SPACE)
+        image = self._smooth(image, above)
         maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
-        return Restoration(image, torch.cat(maps, 1))
+        return Restoration(image, torch.cat(maps, 1), deconvolved)
+
+    def _smooth(self, image: Tensor, above: Tensor) -> Tensor:
+        if not self.bilateral:
+            return image
+        return bilateral_filter(image, COLOR * 10 ** (COLOR_EXPONENT * above), WINDOW, SPACE)
 
     def _brightness(self, light: Tensor) -> Tensor:
         """Encode one map for each depth, (B, D, H, W)."""
@@ -294,6 +316,11 @@ def untold_closed_forms(head: nn.Module) -> list[ClosedForm]:
     """
     parts = [module for module in head.modules() if isinstance(module, ClosedForm)]
     return [part for part in parts if part.has_stray_light and part.mean_light is None]
+
+
+def _above(noise: Tensor) -> Tensor:
+    """Return by how much the logarithm of the noise, mean over colours, exceeds that of 0.002: ringing is left then."""
+    return (noise.clamp(min=LEAST_NOISE).log10().mean(1, keepdim=True) - math.log10(NOISE)).clamp(min=0)
 
 
 def _at_noise(estimates: Tensor, level: Tensor, exponent: float) -> Tensor:

@@ -9,17 +9,17 @@ from torch import Tensor, nn
 
 from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
-from kornia_tidy.reconstruction.depth_distribution import interpolated_classes
+from kornia_tidy.reconstruction.depth_distribution import interpolated_classes, layer_weights
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
 
 
 class JointClosedFormHead(ClosedFormHead):
     r"""Estimates image and distribution of depth by one network that refines the closed forms of both.
 
-    The network takes what :class:`ClosedFormHead` gives it, and the likelihood of each of L depths. Its last three maps
-    are added to the restored image, which is deconvolved for each depth and blended by this likelihood; all others to
-    the logarithm of the likelihood, interpolated to D classes of depth. The last convolution is initialised with zeros:
-    before training both are the closed forms.
+    The network takes what :class:`ClosedFormHead` gives it, and the likelihood of each of L depths. All its maps but
+    the last three are added to the logarithm of the likelihood, interpolated to D classes of depth. The image is that
+    deconvolved for each depth, blended by the probability of the depth and smoothed by the bilateral filter; the last
+    three maps are added to it. The last convolution is initialised with zeros: before training both are closed forms.
 
     Args:
         network: takes :func:`~kornia_tidy.reconstruction.closed_form.closed_form_channels` maps with the likelihood,
@@ -35,6 +35,7 @@ class JointClosedFormHead(ClosedFormHead):
         ValueError: as :class:`ClosedFormHead`, or if the network has no two classes.
 
     Convention:
+        - The blend is by logits without temperature, and no gradient of the image reaches the logits through it.
         - In eval mode logits are divided by ``temperature``, a number in the state that is fitted after training (see
           :func:`~kornia_tidy.reconstruction.depth_distribution.fit_temperature`).
         - PSFs and noise of the camera are part of the state, as for :class:`ClosedFormHead`.
@@ -65,13 +66,16 @@ class JointClosedFormHead(ClosedFormHead):
     def predict(self, image: Tensor) -> Tensor:
         """Return the logits of the classes and the image, from the capture and the map of its noise, (B, 6, H, W)."""
         assert self.network is not None
-        restored = self.closed_form(*image.split(3, 1))
+        capture, noise = image.split(3, 1)
+        restored = self.closed_form(capture, noise)
         residual = self.network(restored.maps)
-        logits, image = residual.split([residual.shape[1] - 3, 3], 1)
+        logits, residual = residual.split([residual.shape[1] - 3, 3], 1)
         logits = logits + self._initial_logits(restored.maps)
+        shares = layer_weights(logits.detach(), self.closed_form.layers)
+        blend = self.closed_form.blend(restored.layers, shares, noise)
         if not self.training:
             logits = logits / self.temperature.to(logits.dtype)
-        return torch.cat([logits, image + restored.image], 1)
+        return torch.cat([logits, residual + blend], 1)
 
     def closed_form_logits(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
         """Return the logits of the classes by the likelihood in closed form alone, (B, D, H, W)."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -31,6 +33,8 @@ class NAFNet(ReconstructionHead):
         in_channels: channels of the image.
         out_channels: maps to estimate.
         width: channels of the first level. 16 gives 1.7 million parameters; their number grows as its square.
+        repeats: factor of the number of blocks of each level above the coarsest. A block is the identity at first, so
+            that a trained network may be made deeper, see :func:`deepened`.
 
     Shape:
         - image: (B, in_channels, H, W), any size.
@@ -54,16 +58,17 @@ class NAFNet(ReconstructionHead):
 
     stride = 2 ** len(ENCODER)
 
-    def __init__(self, in_channels: int = 3, out_channels: int = 3, width: int = 16) -> None:
+    def __init__(self, in_channels: int = 3, out_channels: int = 3, width: int = 16, repeats: int = 1) -> None:
         super().__init__(in_channels, out_channels)
         check_count("width", width)
+        check_count("repeats", repeats)
         widths = [width << level for level in range(len(ENCODER))]
         self.first = nn.Conv2d(in_channels, width, 3, padding=1)
-        self.encoder = nn.ModuleList(_blocks(c, count) for c, count in zip(widths, ENCODER, strict=True))
+        self.encoder = nn.ModuleList(_blocks(c, repeats * count) for c, count in zip(widths, ENCODER, strict=True))
         self.down = nn.ModuleList(nn.Conv2d(c, 2 * c, 2, stride=2) for c in widths)
         self.middle = _blocks(2 * widths[-1], MIDDLE, attention=True)
         self.up = nn.ModuleList(nn.Conv2d(2 * c, 4 * c, 1, bias=False) for c in widths)
-        self.decoder = nn.ModuleList(_blocks(c, count) for c, count in zip(widths, DECODER, strict=True))
+        self.decoder = nn.ModuleList(_blocks(c, repeats * count) for c, count in zip(widths, DECODER, strict=True))
         self.last = nn.Conv2d(width, out_channels, 3, padding=1)
         self.reset_parameters()
 
@@ -85,6 +90,29 @@ class NAFNet(ReconstructionHead):
         for module in self.modules():
             if isinstance(module, _Block):
                 module.reset_parameters()
+
+
+def deepened(weights: Mapping[str, Tensor], head: nn.Module) -> dict[str, Tensor]:
+    """Return the weights of a network with those of the blocks that it lacks, which leave its result as it is.
+
+    Args:
+        weights: state of a network with a :class:`NAFNet` of fewer blocks than the one in ``head``.
+        head: whose own blocks, with factors of zero, are added; it is not changed.
+
+    Example:
+        >>> small, large = NAFNet(width=4), NAFNet(width=4, repeats=2)
+        >>> large.load_state_dict(deepened(small.state_dict(), large))
+        <All keys matched successfully>
+        >>> image = torch.rand(1, 3, 32, 32)
+        >>> torch.equal(small.eval()(image), large.eval()(image))
+        True
+    """
+    found = dict(weights)
+    for name, module in head.named_modules():
+        if isinstance(module, _Block) and not any(key.startswith(f"{name}.") for key in weights):
+            block = {f"{name}.{key}": value.clone() for key, value in module.state_dict().items()}
+            found |= {k: torch.zeros_like(v) if k.endswith((".beta", ".gamma")) else v for k, v in block.items()}
+    return found
 
 
 def _blocks(channels: int, count: int, *, attention: bool = False) -> nn.Sequential:
@@ -109,8 +137,8 @@ class _Block(nn.Module):
         if self.attention is not None:
             around = functional.avg_pool2d(mixed, ATTENTION, 1, ATTENTION // 2, count_include_pad=False)
             mixed = mixed * self.attention(around)
-        features = features + self.beta * self.project1(mixed)
-        return features + self.gamma * self.project2(_gate(self.expand2(self.norm2(features))))
+        features = features + _scaled(self.project1, self.beta, mixed)
+        return features + _scaled(self.project2, self.gamma, _gate(self.expand2(self.norm2(features))))
 
     def reset_parameters(self) -> None:
         for scale in (self.beta, self.gamma):
@@ -124,6 +152,12 @@ class _ChannelNorm(nn.LayerNorm):
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 (torch calls it so)
         return super().forward(input.movedim(1, -1)).movedim(-1, 1)
+
+
+def _scaled(convolution: nn.Conv2d, scale: Tensor, features: Tensor) -> Tensor:
+    """Return the scale (1, C, 1, 1) times a 1x1 convolution; its weights are scaled, as they are fewer than pixels."""
+    assert convolution.bias is not None
+    return functional.conv2d(features, convolution.weight * scale.transpose(0, 1), convolution.bias * scale.flatten())
 
 
 def _gate(features: Tensor) -> Tensor:

@@ -16,13 +16,14 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from kornia_tidy.files import only_here
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, widened_for_depth
+from kornia_tidy.reconstruction.nafnet import deepened
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
@@ -171,13 +172,16 @@ def _train(
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
-    """Load the initial weights of a network; those of one for the image alone are widened for depth."""
+    """Load the initial weights of a network; those of one for the image alone, or of fewer blocks, are widened."""
     state = read_state(path)
     weights = below(state["state_dict"], head_prefix(state["state_dict"]))
     if isinstance(head, JointClosedFormHead) and "temperature" not in weights:
-        widened = widened_for_depth(weights, head)
-        state = {**state, "state_dict": {f"head.{name}": value for name, value in widened.items()}}
-    load_weights(state, head=head, name=str(path))
+        weights = widened_for_depth(weights, head)
+    load_weights({**state, "state_dict": _as_head(deepened(weights, head))}, head=head, name=str(path))
+
+
+def _as_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {f"head.{name}": value for name, value in weights.items()}
 
 
 def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path) -> NoisyCrops:

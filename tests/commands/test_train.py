@@ -74,9 +74,23 @@ class TestTrain(BaseTester):
         assert main(["train", *SMALL, *joint, "-o", str(tmp_path / "joint")]) == 0
         assert load_trained(tmp_path / "joint" / "best.safetensors").head.out_channels == 5 + 3
 
+    def test_feature_a_deeper_network_begins_as_one_that_was_trained(self, tmp_path):
+        """Before its first epoch ends it is scored on what the shallow one was: a rate of 1e-12 leaves it as it is."""
+        options = [*SMALL, "--head", "nafnet", "--width", "2", "--learn", "network", "--epochs", "1", "--ema", "0"]
+        options += ["--fidelity", "draft", "--precision", "32-true"]
+        assert main(["train", *options, "-o", str(tmp_path / "shallow")]) == 0
+        begun = ["--repeats", "2", "--head-from", str(tmp_path / "shallow" / "best.safetensors"), "--lr", "1e-12"]
+        assert main(["train", *options, *begun, "-o", str(tmp_path / "deep")]) == 0
+        shallow, deep = (load_trained(tmp_path / name / "best.safetensors") for name in ("shallow", "deep"))
+        assert len(deep.head.network.encoder[0]) == 2 * len(shallow.head.network.encoder[0])
+        capture = torch.rand(1, 3, 32, 32)
+        with torch.no_grad():
+            self.assert_close(deep.head(capture), shallow.head(capture), atol=1e-6, rtol=0)
+
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
+            (["--repeats", "2"], "repeats are for the head nafnet, got 2 for 'plain'"),
             (["--captures", "x"], "--captures is for --learn network, got --learn both"),
             (["--masks", "1000000"], "masks must be 1024 or fewer, got 1000000"),
             (["--refocus", "1000000"], "refocus must be 1024 or fewer, got 1000000"),

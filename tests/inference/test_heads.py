@@ -74,6 +74,7 @@ class TestMakeHead(BaseTester):
             (f"{HERE}:not_a_class", {}, "must be a class of torch.nn.Module, got <function"),
             ("os:getcwd", {}, "must be a class of torch.nn.Module, got <built-in"),
             (f"{HERE}:Shrinking", {"width": 3}, r"Shrinking\(3, 1, width=3\) cannot be made: .*width"),
+            ("plain", {"repeats": 2}, "repeats are for the head nafnet, got 2 for 'plain'"),
             ("midas-small", {"width": 3}, "'midas-small' takes 3 channels and no width, got 3 and width=3"),
             ("midas-small", {"in_channels": 19}, "takes 3 channels and no width, got 19 and width=None"),
         ],

@@ -22,8 +22,18 @@ from kornia_tidy.reconstruction import (
     receptive_field,
     reconstruct_tiled,
 )
-from kornia_tidy.reconstruction.closed_form import BLEND_WEIGHT, LEAST, LIKELIHOOD_WINDOW, SHARPNESS, ClosedForm
-from kornia_tidy.reconstruction.depth_distribution import depth_moments
+from kornia_tidy.reconstruction.bilateral import bilateral_filter
+from kornia_tidy.reconstruction.closed_form import (
+    BLEND_WEIGHT,
+    COLOR,
+    LEAST,
+    LIKELIHOOD_WINDOW,
+    SHARPNESS,
+    SPACE,
+    WINDOW,
+    ClosedForm,
+)
+from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.joint_closed_form import widened_for_depth
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
@@ -49,15 +59,22 @@ def joint(psfs=None, layers=LAYERS, dtype=torch.float32, *, trained=False, kind=
     return head
 
 
+def blended(head, capture, noise):
+    """Return the deconvolved depths blended by the likelihood of the classes in closed form, and smoothed."""
+    layers = head.closed_form(capture, noise).layers
+    shares = layer_weights(head.closed_form_logits(capture, noise), LAYERS)
+    return head.closed_form.blend(layers, shares, torch.full_like(capture, noise))
+
+
 class TestJointClosedFormHead(BaseTester):
     def test_smoke_begins_as_the_closed_forms(self):
         head, capture = joint(), photo(20, 33, dtype=torch.float32)
         with torch.no_grad():
             output = head(capture, 0.01)
-            restored = head.closed_form(functional.pad(capture, (7, 8, 6, 6), "reflect"), 0.01)
-            likelihood = head.closed_form_logits(functional.pad(capture, (7, 8, 6, 6), "reflect"), 0.01)
+            padded = functional.pad(capture, (7, 8, 6, 6), "reflect")
+            image, likelihood = blended(head, padded, 0.01), head.closed_form_logits(padded, 0.01)
         assert output.shape == (2, CLASSES + 3, 20, 33)
-        assert torch.equal(output[:, -3:], restored.image[..., 6:26, 7:40])
+        assert torch.equal(output[:, -3:], image[..., 6:26, 7:40])
         assert torch.equal(output[:, :CLASSES], likelihood[..., 6:26, 7:40])
 
     def test_feature_the_last_maps_are_the_likelihood_of_each_depth(self):
@@ -81,6 +98,24 @@ class TestJointClosedFormHead(BaseTester):
             blended = ((fits / temperature).softmax(1).unsqueeze(2) * single).sum(1)
             expected = linear_rgb_to_rgb(blended.clamp(0, 1))
             self.assert_close(restore(capture, noise).image, expected, atol=1e-9, rtol=0)
+
+    def test_feature_the_image_is_deconvolved_for_the_depth_that_the_network_finds(self):
+        """Sure of one depth, it is that depth's deconvolution, smoothed."""
+        head, capture = joint(dtype=torch.float64), photo(32, 48)
+        with torch.no_grad():
+            head.network.last.bias[2] = 1e4  # class 2 of 7 is the second of four layers
+            image = head(capture, 0.002)[:, -3:]
+            kernels = tikhonov_kernels(bank(LAYERS).psfs[1], (BLEND_WEIGHT,))
+            single = convolve_kernels(rgb_to_linear_rgb(capture), kernels)
+            expected = bilateral_filter(linear_rgb_to_rgb(single[:, 0].clamp(0, 1)), COLOR, WINDOW, SPACE)
+        self.assert_close(image, expected, atol=1e-9, rtol=0)
+
+    def test_feature_no_gradient_of_the_image_reaches_the_depth(self):
+        head = joint(trained=True).train()
+        logits = head.network.last.bias
+        head(photo(16, 16, dtype=torch.float32), 0.01)[:, -3:].square().sum().backward()
+        assert not logits.grad[:CLASSES].any()
+        assert logits.grad[CLASSES:].all()
 
     def test_feature_finds_on_which_side_of_an_edge_a_texture_is_near(self):
         _, depth, capture = scene()
@@ -197,7 +232,7 @@ class TestJointClosedFormHead(BaseTester):
         self.assert_close(begun[:, : trained.shape[1]], trained)
         assert not begun[:, trained.shape[1] :].any()
         with torch.no_grad():
-            self.assert_close(head(capture, 0.01)[:, -3:], head.closed_form(capture, 0.01).image)
+            self.assert_close(head(capture, 0.01)[:, -3:], blended(head, capture, 0.01))
             self.assert_close(head(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
 
     def test_exception(self):

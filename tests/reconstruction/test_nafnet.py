@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import nn
 from torch.nn import functional
 
 from kornia_tidy.reconstruction import NAFNet, receptive_field
+from kornia_tidy.reconstruction.nafnet import deepened
 from tests.base import BaseTester
 from tests.reconstruction.test_head import trained
 
@@ -53,6 +55,29 @@ class TestNAFNet(BaseTester):
     def test_feature_blocks_are_the_identity_at_first(self):
         features = torch.rand(1, 4, 6, 6)
         assert torch.equal(NAFNet(width=2).encoder[1](features), features)
+
+    def test_feature_repeats_blocks_of_each_level_but_the_coarsest(self):
+        once, twice = (NAFNet(width=4, repeats=repeats) for repeats in (1, 2))
+        for part in ("encoder", "decoder"):
+            counts = [[len(blocks) for blocks in getattr(network, part)] for network in (once, twice)]
+            assert counts[1] == [2 * count for count in counts[0]]
+        assert len(once.middle) == len(twice.middle)
+
+    @pytest.mark.parametrize("repeats", [1, 3])
+    def test_feature_a_deeper_network_begins_as_the_one_it_is_made_from(self, repeats):
+        """Also if its own new blocks are no longer the identity; those that it has in common are taken."""
+        small, large = (NAFNet(width=4, repeats=count).eval() for count in (1, repeats))
+        for network in (small, large):
+            for parameter in network.parameters():
+                nn.init.normal_(parameter, std=0.2)
+        large.load_state_dict(deepened(small.state_dict(), large))
+        image = torch.rand(1, 3, 32, 48)
+        with torch.no_grad():
+            assert torch.equal(large(image), small(image))
+
+    def test_exception_repeats(self):
+        with pytest.raises(ValueError, match="repeats must be a whole number of at least 1, got 0"):
+            NAFNet(width=4, repeats=0)
 
     def test_smoke_any_number_of_channels(self):
         head = NAFNet(19, 4, width=2)
