@@ -177,25 +177,24 @@ class TestNoisyCrops(BaseTester):
         assert 1e-3 <= min(told) < 3.3e-3
         assert 9e-3 < max(told) <= 0.03
 
-    def test_feature_the_noise_is_told_wrongly_in_half_of_the_training_samples(self, grey, monkeypatch):
-        """By a factor of two at most, in both directions; 40 samples of read noise alone, so that it is one number."""
+    def test_feature_the_noise_is_told_wrongly_in_training(self, grey, monkeypatch):
+        """By a factor of 2.5 at most, in both directions; 40 samples of read noise alone, so that it is one number."""
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 0.0)
         captures, optics = grey
         crops, factors = NoisyCrops(captures, optics, noise_range=(0.01, 0.01)), []
         for seed in range(40):
             torch.manual_seed(seed)
             factors.append(float(crops[seed]["noise"].mean()) / 0.01)
-        right = sum(abs(factor - 1) < 1e-4 for factor in factors)
-        assert 6 <= right <= 34  # less likely than 1e-5 otherwise
-        assert 0.5 <= min(factors) < 0.8
-        assert 1.25 < max(factors) <= 2.0 + 1e-6
+        assert 0.4 - 1e-6 <= min(factors) < 0.8  # less likely than 1e-8 otherwise
+        assert 1.25 < max(factors) <= 2.5 + 1e-6
+        assert min(abs(factor - 1) for factor in factors) < 0.25
 
     def test_feature_shot_noise_is_told_by_the_light_of_each_pixel(self, leaves, monkeypatch):
         """It is the root of read noise and of the noisy capture's own light, both in parts of the full well."""
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 1.0)
         captures, _ = leaves
         linear = TiDyOptics(sensor=None, fidelity="draft", color_space="linear")
-        sample = NoisyCrops(captures, linear, electrons=(200.0, 200.0))[0]
+        sample = NoisyCrops(captures, linear, electrons=(200.0, 200.0), gain=False)[0]
         expected = ((2.4 / 200) ** 2 + sample["coded"] / 200).sqrt()
         self.assert_close(sample["noise"], expected, rtol=1e-5, atol=1e-7)
         assert sample["noise"].std() > 1e-3
