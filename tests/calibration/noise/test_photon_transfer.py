@@ -113,15 +113,19 @@ class TestPhotonTransfer(BaseTester):
         pattern=st.sampled_from(["RGGB", "GBRG", None]),
         seed=st.integers(0, 2**32 - 1),
     )
-    def test_feature_gain_and_read_noise_come_back_to_3_percent(self, gain, read_noise, bits, pattern, seed):
-        """Read noise is at least half a count here, because rounding hides less."""
-        read_noise = max(read_noise, 0.5 * gain)
+    def test_feature_gain_and_read_noise_come_back(self, gain, read_noise, bits, pattern, seed):
+        """To 3 and 4 percent: their standard deviations over seeds are .3 and .6 percent.
+
+        Read noise is at least 0.7 counts. Rounding adds a variance of 1/12 count up to 4 s^2 exp(-2 pi^2 s^2), which is
+        a hundredth of a percent there, but at half a count 3 percent of the variance.
+        """
+        read_noise = max(read_noise, 0.7 * gain)
         stack = flats(
             np.random.default_rng(seed), gain, read_noise, black=2**bits // 16, white=2**bits - 1, pattern=pattern
         )
         result = photon_transfer(stack)
         assert result.line.gain == pytest.approx(gain, rel=0.03)
-        assert result.line.read_noise == pytest.approx(read_noise, rel=0.03)
+        assert result.line.read_noise == pytest.approx(read_noise, rel=0.04)
         assert result.read_noise_resolved
         assert result.line.r_squared > 0.99
 
