@@ -117,7 +117,7 @@ class TestPhotonTransfer(BaseTester):
         """To 3 and 4 percent: their standard deviations over seeds are .3 and .6 percent.
 
         Read noise is at least 0.7 counts. Rounding adds a variance of 1/12 count up to 4 s^2 exp(-2 pi^2 s^2), which is
-        a hundredth of a percent there, but at half a count 3 percent of the variance.
+        .03 percent of the variance there, but 3 percent at half a count.
         """
         read_noise = max(read_noise, 0.7 * gain)
         stack = flats(
