@@ -15,7 +15,7 @@ def formula(latex: str, display: str) -> str:
     r"""Return a formula as MathML; rows (``\\``) and columns (``&``) are aligned."""
     latex = latex.replace(r"\arg", r"\mathrm{arg}")  # a command that the converter does not know
     if r"\begin" not in latex and (r"\\" in latex or "&" in latex):
-        latex = rf"\begin{{aligned}}{latex}\end{{aligned}}"
+        latex = rf"\begin{{split}}{latex}\end{{split}}"  # aligned is written without its rows
     written = convert(latex, display=display)
     if unknown := re.findall(r">\s*(\\\w+)", written):
         raise ValueError(f"{unknown[0]} cannot be written as MathML, in {latex}")
