@@ -14,10 +14,11 @@ from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.figures.learning_curve import draw_learning_curve
-from kornia_tidy.inference.heads import HEADS
+from kornia_tidy.inference.heads import CLOSED_FORMS, HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT
+from kornia_tidy.reconstruction.closed_form import INVERSES
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.design_folder import designed_camera, designed_settings
@@ -133,36 +134,7 @@ def add_parser(subparsers: Any) -> None:
         help="heights of the masks at first; Fisher suits depth, sweep edof; flat, with --masks 1: a lens alone",
     )
     _setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
-    _setting(
-        system,
-        "head",
-        metavar="NAME",
-        help=f"{', '.join(HEADS)}: networks (without a GPU take nafnet, plain or a small --width: the paper's "
-        f"attention-unet has 34.9 million weights); tikhonov, tikhonov-bilateral: no network, only masks are learnt; "
-        f"or module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
-    )
-    _setting(
-        system, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
-    )
-    _setting(system, "repeats", type=int, metavar="N", help="factor of the number of blocks of nafnet; default: 1")
-    _setting(
-        system, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
-    )
-    _setting(
-        system,
-        "closed_form",
-        action=argparse.BooleanOptionalAction,
-        help="the network takes deconvolved captures and the level of the noise, and adds to the best of them",
-    )
-    _setting(system, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
-    _setting(
-        system,
-        "depth_classes",
-        type=int,
-        metavar="D",
-        help="joint: depth as a distribution over D classes, with its uncertainty, from --refocus depths; with "
-        "--closed-form the default is 21 classes from 9 depths; without, 32 and 11 do; 0: one depth a pixel",
-    )
+    _add_network_settings(system)
     _setting(
         system,
         "loss",
@@ -216,6 +188,47 @@ def add_parser(subparsers: Any) -> None:
     )
 
 
+def _add_network_settings(group: Any) -> None:
+    """Add the options of the network, and of what it is given."""
+    _setting(
+        group,
+        "head",
+        metavar="NAME",
+        help=f"{', '.join(HEADS)}: networks (without a GPU take nafnet, plain or a small --width: the paper's "
+        f"attention-unet has 34.9 million weights); {', '.join(CLOSED_FORMS)}: no network, only masks are learnt; "
+        f"or module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
+    )
+    _setting(
+        group, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
+    )
+    _setting(group, "repeats", type=int, metavar="N", help="factor of the number of blocks of nafnet; default: 1")
+    _setting(
+        group, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
+    )
+    _setting(
+        group,
+        "closed_form",
+        action=argparse.BooleanOptionalAction,
+        help="the network takes deconvolved captures and the level of the noise, and adds to the best of them",
+    )
+    _setting(
+        group,
+        "inverse",
+        choices=INVERSES,
+        help="filter of the deconvolved captures of --closed-form: wiener knows the spectrum of photographs and how "
+        "PSFs differ between depths; default: wiener",
+    )
+    _setting(group, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
+    _setting(
+        group,
+        "depth_classes",
+        type=int,
+        metavar="D",
+        help="joint: depth as a distribution over D classes, with its uncertainty, from --refocus depths; with "
+        "--closed-form the default is 21 classes from 9 depths; without, 32 and 11 do; 0: one depth a pixel",
+    )
+
+
 def _add_noise_settings(group: Any) -> None:
     """Add the options of the noise in training of the network alone."""
     _setting(
@@ -225,6 +238,14 @@ def _add_noise_settings(group: Any) -> None:
         nargs=2,
         metavar=("LEAST", "LARGEST"),
         help="read noise, of full scale, drawn for half of the captures; --learn network only",
+    )
+    _setting(
+        group,
+        "noise_error",
+        type=float,
+        metavar="X",
+        help="largest factor by which the noise told to the network is wrong; default: 2.5; 1 for a camera whose noise "
+        "is known; --learn network only",
     )
     _setting(
         group,

@@ -21,7 +21,7 @@ HEADS = {
     "plain": "kornia_tidy.inference.heads:PlainHead",
     "zoedepth": "kornia_tidy.inference.baselines:zoedepth",
 }
-CLOSED_FORMS = ("tikhonov", "tikhonov-bilateral")
+CLOSED_FORMS = ("tikhonov", "tikhonov-bilateral", "wiener", "wiener-bilateral")
 """Heads without a network, whose result is :class:`~kornia_tidy.reconstruction.closed_form_head.ClosedFormHead`'s."""
 FIXED = ("midas-small",)  # three input channels, and one width
 DEEPENED = ("nafnet",)  # take the number of their blocks, as repeats
@@ -35,8 +35,8 @@ def check_head(name: str) -> None:
         Traceback (most recent call last):
         ...
         ValueError: head must be one of 'attention-unet', 'depth-anything-v2', 'nafnet', 'phasecam3d', 'midas-small', \
-'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', or the path of a class such as my_package.networks:Network, \
-got 'nafnett'
+'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', 'wiener', 'wiener-bilateral', or the path of a class such as \
+my_package.networks:Network, got 'nafnett'
     """
     known = (*HEADS, *CLOSED_FORMS)
     module, colon, attribute = name.partition(":")

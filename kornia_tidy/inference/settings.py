@@ -18,6 +18,7 @@ from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT
+from kornia_tidy.reconstruction.closed_form import INVERSES
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
@@ -52,13 +53,15 @@ class SystemSettings:
         color_space: as for :class:`~kornia_tidy.TiDyOptics`. None: its default.
         border: as for :class:`~kornia_tidy.TiDyOptics`.
         head: name of the network, see :data:`kornia_tidy.inference.heads.HEADS`; of a closed form alone,
-            ``"tikhonov"`` or ``"tikhonov-bilateral"``; or the import path of a class, ``module:Class``.
+            one of :data:`~kornia_tidy.inference.heads.CLOSED_FORMS`; or the import path of a class, ``module:Class``.
         width: channels of the network's first level. None: its default; the paper's attention U-Net has 64.
         repeats: factor of the number of blocks of the head ``"nafnet"``, see
             :class:`~kornia_tidy.reconstruction.NAFNet`.
         residual: the network estimates the difference between image and capture; for tasks with an image.
         closed_form: the network takes restorations in closed form beside the capture, and its image is added to the
             best of them, see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
+        inverse: filter of these restorations, ``"tikhonov"`` or ``"wiener"``, see
+            :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         refocus: number of depths that the capture is refocused to before it enters the network, see
             :class:`~kornia_tidy.reconstruction.Refocused`. 0: none.
         depth_classes: classes of a distribution of depth, for the task ``"joint"``. It begins as the likelihood of
@@ -96,6 +99,7 @@ class SystemSettings:
     repeats: int = 1
     residual: bool = False
     closed_form: bool = False
+    inverse: str = "tikhonov"
     refocus: int = 0
     depth_classes: int = 0
     seed: int = 0
@@ -128,6 +132,9 @@ class SystemSettings:
             raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
         if self.residual and (self.closed_form or self.head in CLOSED_FORMS):
             raise ValueError("residual adds the capture and closed_form its restoration: choose one of them")
+        check_choice("inverse", self.inverse, INVERSES)
+        if self.inverse != INVERSES[0] and not self.closed_form:
+            raise ValueError(f"inverse {self.inverse!r} is the filter of closed_form, which is not asked for")
         if self.depth_classes:
             self._check_distribution()
         if self.depth_range is not None:

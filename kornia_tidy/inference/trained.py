@@ -86,10 +86,11 @@ def fix_window(optics: TiDyOptics) -> TiDyOptics:
 def build_head(settings: SystemSettings) -> nn.Module:
     """Return the network that settings describe, with weights drawn from the global generator."""
     if settings.head in CLOSED_FORMS:
-        return ClosedFormHead(bilateral=settings.head == "tikhonov-bilateral", encoded=settings.encoded)
+        inverse, _, bilateral = settings.head.partition("-")
+        return ClosedFormHead(bilateral=bool(bilateral), encoded=settings.encoded, inverse=inverse)
     if settings.depth_classes and settings.closed_form:
         head = _network(settings, settings.depth_classes + 3, closed_form_channels(settings.refocus, likelihood=True))
-        return JointClosedFormHead(head, settings.refocus, encoded=settings.encoded)
+        return JointClosedFormHead(head, settings.refocus, encoded=settings.encoded, inverse=settings.inverse)
     if settings.depth_classes:
         return LayeredJointHead(
             _network(settings, settings.depth_classes, 3 + 2 * settings.refocus),
@@ -100,7 +101,7 @@ def build_head(settings: SystemSettings) -> nn.Module:
     channels = closed_form_channels(settings.refocus) if settings.closed_form else 3 + settings.refocus
     head = _network(settings, channels_of(settings.task), channels)
     if settings.closed_form:
-        return ClosedFormHead(head, settings.refocus, encoded=settings.encoded)
+        return ClosedFormHead(head, settings.refocus, encoded=settings.encoded, inverse=settings.inverse)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head

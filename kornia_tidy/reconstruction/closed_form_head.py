@@ -25,6 +25,7 @@ class ClosedFormHead(ReconstructionHead):
         bilateral: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         likelihood: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
+        inverse: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
 
     Shape:
         - image: (B, 3, H, W), captures of the camera, of any size.
@@ -64,9 +65,12 @@ class ClosedFormHead(ReconstructionHead):
         bilateral: bool = True,
         encoded: bool = True,
         likelihood: bool = False,
+        inverse: str = "tikhonov",
     ) -> None:
         super().__init__(3, 3 if network is None else network.out_channels)
-        self.closed_form = ClosedForm(layers, bilateral=bilateral, encoded=encoded, likelihood=likelihood)
+        self.closed_form = ClosedForm(
+            layers, bilateral=bilateral, encoded=encoded, likelihood=likelihood, inverse=inverse
+        )
         self.network = network
         self.stride = 1 if network is None else network.stride
         if network is not None:

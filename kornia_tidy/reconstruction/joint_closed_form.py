@@ -26,6 +26,8 @@ class JointClosedFormHead(ClosedFormHead):
             returns D + 3, and ends in a convolution. The classes are evenly spaced over normalised inverse depth.
         layers: number L of depths, at least 2.
         encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
+        inverse: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`: of estimates that the network
+            takes, not of those for each depth.
 
     Shape:
         - image, noise: as for :class:`ClosedFormHead`.
@@ -58,9 +60,11 @@ class JointClosedFormHead(ClosedFormHead):
 
     temperature: Tensor
 
-    def __init__(self, network: ReconstructionHead, layers: int = 9, *, encoded: bool = True) -> None:
+    def __init__(
+        self, network: ReconstructionHead, layers: int = 9, *, encoded: bool = True, inverse: str = "tikhonov"
+    ) -> None:
         check_count("the number of classes of network", network.out_channels - 3, 2)
-        super().__init__(network, layers, encoded=encoded, likelihood=True)
+        super().__init__(network, layers, encoded=encoded, likelihood=True, inverse=inverse)
         self.register_buffer("temperature", torch.ones(()))
 
     def predict(self, image: Tensor) -> Tensor:

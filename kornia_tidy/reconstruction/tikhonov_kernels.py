@@ -53,10 +53,20 @@ def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:
     centred = torch.fft.rfft2(_point(psf), s=(size, size))  # of a PSF that is a point at its centre
     energy = psf.sum((-2, -1))[:, None, None]
     gammas = psf.new_tensor(weights)[:, None, None, None]
-    # PSFs begin at the corner of the plane, so their inverses end there.
     inverse = torch.fft.irfft2((transfer.conj() + gammas * centred.conj() / energy) / (power + gammas), s=(size, size))
+    return centred_window(inverse, window, psf.sum((-2, -1)))
+
+
+def centred_window(inverse: Tensor, window: int, energy: Tensor) -> Tensor:
+    """Return the kernels in planes of inverse PSFs, with a constant added so that white becomes white.
+
+    Args:
+        inverse: (D, C, N, N); PSFs begin at the corner of the plane, so their inverses end there.
+        window: side of the kernels in pixels, larger than that of the PSFs by twice ``MARGIN``.
+        energy: of the PSFs, (C,), the reciprocal of the sum of a kernel.
+    """
     kernels = inverse.roll((window - 1 - MARGIN, window - 1 - MARGIN), (-2, -1))[..., :window, :window]
-    return kernels + (1 / energy - kernels.sum((-2, -1), keepdim=True)) / window**2
+    return kernels + (1 / energy[:, None, None] - kernels.sum((-2, -1), keepdim=True)) / window**2
 
 
 def _point(psf: Tensor) -> Tensor:

@@ -47,9 +47,11 @@ class NoisyCrops(Dataset):
         electrons: least and largest full well of the captures with shot noise, see :func:`electrons_of`.
         gain: draw gains, and errors of the noise that is told. False: the gain is one and the noise the true one, as
             for validation.
+        noise_error: largest factor by which the noise that is told is wrong, at least 1.
 
     Raises:
-        ValueError: if a range is not 0 < least <= largest, or a capture is smaller than the crop.
+        ValueError: if a range is not 0 < least <= largest, the factor is below 1, or a capture is smaller than the
+            crop.
 
     Convention:
         Items are mappings of
@@ -73,12 +75,14 @@ class NoisyCrops(Dataset):
         electrons: tuple[float, float] = FULL_WELL,
         *,
         gain: bool = True,
+        noise_error: float = TOLD_ERROR,
     ) -> None:
         check_noise_range(noise_range)
         check_electrons(electrons)
+        check_noise_error(noise_error)
         check_part("captures", captures, NoiseFreeCaptures, "NoiseFreeCaptures")
         self.captures, self.encode, self.crop, self.gain = captures, optics.encode, crop, gain
-        self.noise_range, self.electrons = noise_range, electrons
+        self.noise_range, self.electrons, self.noise_error = noise_range, electrons, noise_error
 
     def __len__(self) -> int:
         """Return the number of captures."""
@@ -101,7 +105,7 @@ class NoisyCrops(Dataset):
             "image": self.encode(image[None])[0],
             "inverse_depth": inverse_depth,
             "mask": mask,
-            "noise": told * random_error() if self.gain else told,
+            "noise": told * random_error(self.noise_error) if self.gain else told,
         }
 
 
@@ -117,6 +121,12 @@ def check_electrons(electrons: tuple[float, float]) -> None:
     least, largest = electrons
     if not 0 < least <= largest < math.inf:
         raise ValueError(f"electrons must be 0 < least <= largest, got {least} and {largest}")
+
+
+def check_noise_error(factor: float) -> None:
+    """Raise ``ValueError`` unless a factor of the noise is finite and at least 1."""
+    if not 1 <= factor < math.inf:
+        raise ValueError(f"noise_error must be a factor of at least 1, got {factor}")
 
 
 def electrons_of(
@@ -170,8 +180,8 @@ def random_gain(peak: Tensor) -> Tensor:
     return torch.minimum(gain, 1 / peak.clamp(min=1e-6))[:, None, None]
 
 
-def random_error() -> float:
-    """Return a factor between 0.4 and 2.5, uniform in its logarithm, by torch's global generator.
+def random_error(largest: float = TOLD_ERROR) -> float:
+    """Return a factor between one over the largest and the largest, uniform in its logarithm, by the global generator.
 
     A network that is told a wrong noise learns to look at the capture, too: a user seldom knows the noise of a
     photograph to better than a factor.
@@ -181,7 +191,7 @@ def random_error() -> float:
         >>> 0.4 <= min(factors) < 0.7 and 1.4 < max(factors) <= 2.5
         True
     """
-    return TOLD_ERROR ** (2 * float(torch.rand(())) - 1)
+    return largest ** (2 * float(torch.rand(())) - 1)
 
 
 def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, float] = FULL_WELL) -> SensorNoise:

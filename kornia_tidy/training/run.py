@@ -172,9 +172,13 @@ def _train(
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
-    """Load the initial weights of a network; those of one for the image alone, or of fewer blocks, are widened."""
+    """Load the initial weights of a network; those of one for the image alone, or of fewer blocks, are widened.
+
+    PSFs and noise of its closed form stay those of this camera.
+    """
     state = read_state(path)
-    weights = below(state["state_dict"], head_prefix(state["state_dict"]))
+    own = {name: value for name, value in head.state_dict().items() if name.startswith("closed_form.")}
+    weights = {**below(state["state_dict"], head_prefix(state["state_dict"])), **own}
     if isinstance(head, JointClosedFormHead) and "temperature" not in weights:
         weights = widened_for_depth(weights, head)
     load_weights({**state, "state_dict": _as_head(deepened(weights, head))}, head=head, name=str(path))
@@ -195,7 +199,15 @@ def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path)
     training = split == "train"
     electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
     crop = settings.crop if training else None
-    return NoisyCrops(captures, module.optics, crop, settings.noise_range, electrons, gain=training)
+    return NoisyCrops(
+        captures,
+        module.optics,
+        crop,
+        settings.noise_range,
+        electrons,
+        gain=training,
+        noise_error=settings.noise_error,
+    )
 
 
 def _is_first_process() -> bool:

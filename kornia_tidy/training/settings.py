@@ -11,7 +11,7 @@ from kornia_tidy.inference.heads import CLOSED_FORMS, FIXED
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.head import check_count
-from kornia_tidy.training.noisy_crops import check_electrons, check_noise_range
+from kornia_tidy.training.noisy_crops import TOLD_ERROR, check_electrons, check_noise_error, check_noise_range
 from kornia_tidy.training.task_loss import LOSSES
 
 SCHEDULES = ("constant", "cosine")
@@ -48,6 +48,8 @@ class TrainingSettings(SystemSettings):
         crop: side of the crops of the captures in pixels, for ``learn="network"``. None: whole captures.
         noise_range: least and largest standard deviation of read noise, in units of full scale, for
             ``learn="network"``; the sensor's own noise is that of scores afterwards.
+        noise_error: largest factor by which the noise told to the network is wrong, for ``learn="network"``: how well
+            the noise of later captures will be known. 1: exactly.
         electrons: least and largest number of electrons of a white pixel at the reference f-number, for the captures
             with shot noise of ``learn="network"``. A smaller aperture gets fewer in the same exposure time. None: 500
             to 60,000 at every f-number.
@@ -88,6 +90,7 @@ class TrainingSettings(SystemSettings):
     size: int = 278
     crop: int | None = None
     noise_range: tuple[float, float] = (1e-3, 0.03)
+    noise_error: float = TOLD_ERROR
     electrons: tuple[float, float] | None = None
     reference_f_number: float = 17.6
     scenes: int = 5077
@@ -126,6 +129,7 @@ class TrainingSettings(SystemSettings):
             raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
         object.__setattr__(self, "noise_range", tuple(self.noise_range))  # JSON has no tuples
         check_noise_range(self.noise_range)
+        check_noise_error(self.noise_error)
         if self.electrons is not None:
             object.__setattr__(self, "electrons", tuple(self.electrons))
             check_electrons(self.electrons)
@@ -153,8 +157,8 @@ def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the defaults of a training run that differ from those of :class:`TrainingSettings`.
 
     Where only the network learns they are those of :data:`NETWORK_RUN`, without the closed form where the head cannot
-    have it or does without: networks of three channels, heads without a network, and ``residual``. Runs for image and
-    depth with the closed form have those of :data:`JOINT_RUN` too.
+    have it or does without: networks of three channels, heads without a network, and ``residual``. The closed form is
+    Wiener's; runs for image and depth with it have the defaults of :data:`JOINT_RUN` too.
 
     Args:
         given: settings that the user chose, by name.
@@ -162,8 +166,8 @@ def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
     Example:
         >>> usual_settings({"learn": "network"})["width"], usual_settings({"learn": "both"})
         (16, {})
-        >>> usual_settings({"task": "joint", "closed_form": True})["depth_classes"]
-        21
+        >>> usual_settings({"task": "joint", "closed_form": True})
+        {'inverse': 'wiener', 'depth_classes': 21, 'refocus': 9, 'depth_weight': 0.03}
     """
     usual = dict(NETWORK_RUN) if given.get("learn") == "network" else {}
     if given.get("head") in (*FIXED, *CLOSED_FORMS):
@@ -171,8 +175,10 @@ def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
         usual.pop("width", None)
     elif given.get("residual"):
         usual.pop("closed_form", None)
-    if given.get("task") == "joint" and {**usual, **given}.get("closed_form"):
-        usual |= JOINT_RUN
+    if {**usual, **given}.get("closed_form"):
+        usual["inverse"] = "wiener"
+        if given.get("task") == "joint":
+            usual |= JOINT_RUN
     return usual
 
 

@@ -13,6 +13,7 @@ from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_head, build_optics, load_trained, update_psfs
 from kornia_tidy.reconstruction import ReconstructionHead, receptive_field
+from kornia_tidy.reconstruction.closed_form import INVERSES
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
 
@@ -104,6 +105,12 @@ class TestBuildHead(BaseTester):
             alone = build_head(settings).eval()  # without a camera
             alone.load_state_dict(head.state_dict())
             assert torch.equal(alone(capture), head(capture))
+
+    @pytest.mark.parametrize("settings", [{"refocus": 3}, {"refocus": 3, "task": "joint", "depth_classes": 4}])
+    def test_feature_the_filter_of_the_closed_form_is_that_of_the_settings(self, settings):
+        for inverse in INVERSES:
+            head = build_head(SETTINGS.replace(head="plain", closed_form=True, inverse=inverse, **settings))
+            assert head.closed_form.inverse == inverse
 
     def test_feature_it_is_that_of_the_camera(self):
         """The PSFs of all colours, evenly spaced over depth, its noise and its encoding."""

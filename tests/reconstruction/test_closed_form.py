@@ -11,9 +11,18 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from kornia_tidy import SensorNoise
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.closed_form import LAYER_WEIGHT, NOISE, WEIGHTS, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form import (
+    LAYER_WEIGHT,
+    NODES,
+    NOISE,
+    WEIGHTS,
+    WIENER_NOISES,
+    ClosedForm,
+    closed_form_channels,
+)
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
+from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
 from tests.base import BaseTester
 
 
@@ -27,7 +36,8 @@ def bank(depths=4, side=5, dtype=torch.float64):
 
 def closed_form(dtype=torch.float64, **options):
     restore = ClosedForm(**options).to(dtype)
-    restore.set_psfs(bank(options.get("layers", 4) or 4, dtype=dtype))
+    nodes = NODES if options.get("inverse") == "wiener" else 4
+    restore.set_psfs(bank(options.get("layers", nodes) or nodes, dtype=dtype))
     return restore
 
 
@@ -59,10 +69,11 @@ def bilateral(image, window=7, color=0.2, space=2.0):
 
 
 class TestClosedForm(BaseTester):
+    @pytest.mark.parametrize("inverse", ["tikhonov", "wiener"])
     @pytest.mark.parametrize("layers", [0, 4])
-    def test_smoke(self, layers, device, dtype):
-        restore = ClosedForm(layers).to(device, dtype)
-        restore.set_psfs(bank(dtype=torch.float32))
+    def test_smoke(self, layers, inverse, device, dtype):
+        restore = ClosedForm(layers, inverse=inverse).to(device, dtype)
+        restore.set_psfs(bank(layers or NODES, dtype=torch.float32))
         restored = restore.to(device)(photo(12, 17, dtype=dtype).to(device))
         assert restored.image.dtype == restored.maps.dtype == dtype
         assert restored.image.shape == (2, 3, 12, 17)
@@ -99,6 +110,36 @@ class TestClosedForm(BaseTester):
             difference = (image - exact.clamp(0, 1)).square().mean().sqrt()
             assert difference < 0.166 * (exact - capture.mean()).square().mean().sqrt()
             assert difference < 0.5 * (image - other.clamp(0, 1)).square().mean().sqrt()
+
+    @pytest.mark.parametrize("layers", [0, 3])
+    @pytest.mark.parametrize("bilateral", [False, True])
+    def test_feature_wiener_estimates_are_those_of_its_kernels(self, bilateral, layers):
+        """At noises for which the filter takes one of its four: five times the variance, or half of it and more."""
+        restore = closed_form(inverse="wiener", bilateral=bilateral, layers=layers, encoded=False)
+        kernels = wiener_kernels(bank(layers or NODES).psfs, WIENER_NOISES)
+        capture = photo(20, 24)
+        for index, taken in enumerate(WIENER_NOISES):
+            expected = convolve_kernels(capture, kernels[index : index + 1])[:, 0].clamp(0, 1)
+            noise = taken / math.sqrt(0.5 if bilateral else 5.0)
+            if bilateral and noise > 0.002:  # 0.5 noise^2 (noise / 0.002)^0.3 is what it takes
+                noise = (taken**2 / 0.5 * 0.002**0.3) ** (1 / 2.3)
+            image, maps, _ = restore(capture, noise)
+            self.assert_close(maps[:, 3 + 3 * index :][:, :3], expected)
+            if not bilateral:
+                self.assert_close(image, expected)
+            else:
+                smooth = restore._smooth(expected, torch.full((1, 1, 1, 1), max(0.0, math.log10(noise / 0.002))))
+                self.assert_close(image, smooth, atol=1e-6, rtol=0)
+
+    @pytest.mark.parametrize("layers", [0, 3])
+    def test_feature_a_state_of_the_wiener_filter(self, layers):
+        restore, loaded, capture = (
+            closed_form(layers=layers, inverse="wiener"),
+            ClosedForm(layers, inverse="wiener"),
+            photo(9, 9),
+        )
+        loaded.double().load_state_dict(restore.state_dict())
+        assert torch.equal(loaded(capture).maps, restore(capture).maps)
 
     @pytest.mark.parametrize("noise", [0.002, 0.008])
     def test_feature_the_bilateral_is_that_of_the_definition(self, noise):
@@ -202,8 +243,9 @@ class TestClosedForm(BaseTester):
         exact = restore(capture.bfloat16().float()).image
         assert (found.float() - exact).abs().max() <= 2**-9  # half a unit in the last place below 1
 
-    def test_gradcheck(self, device):
-        restore = closed_form().to(device)
+    @pytest.mark.parametrize("inverse", ["tikhonov", "wiener"])
+    def test_gradcheck(self, inverse, device):
+        restore = closed_form(inverse=inverse).to(device)
         self.gradcheck(lambda capture: restore(capture, 0.01).maps, (photo(8, 8)[:1].to(device),))
 
     def test_dynamo(self, device):
@@ -229,3 +271,7 @@ class TestClosedForm(BaseTester):
             closed_form()(photo(8, 8), torch.ones(8))
         with pytest.raises(ValueError, match="layers must be a whole number of at least 0, got -1"):
             ClosedForm(-1)
+        with pytest.raises(ValueError, match="inverse must be one of 'tikhonov', 'wiener', got 'inverse'"):
+            ClosedForm(inverse="inverse")
+        with pytest.raises(ValueError, match=r"needs PSFs of shape \(11, 3, P, P\), got \(4, 3, 5, 5\)"):
+            ClosedForm(inverse="wiener").set_psfs(bank())

@@ -188,6 +188,10 @@ class TestNoisyCrops(BaseTester):
         assert 0.4 - 1e-6 <= min(factors) < 0.8  # less likely than 1e-8 otherwise
         assert 1.25 < max(factors) <= 2.5 + 1e-6
         assert min(abs(factor - 1) for factor in factors) < 0.25
+        exact = NoisyCrops(captures, optics, noise_range=(0.01, 0.01), noise_error=1.0)
+        for seed in range(5):
+            torch.manual_seed(seed)
+            assert float(exact[seed]["noise"].mean()) == pytest.approx(0.01, rel=1e-5)
 
     def test_feature_shot_noise_is_told_by_the_light_of_each_pixel(self, leaves, monkeypatch):
         """It is the root of read noise and of the noisy capture's own light, both in parts of the full well."""
@@ -268,5 +272,7 @@ class TestNoisyCrops(BaseTester):
             NoisyCrops(captures, optics, 8, (0, 0.1))
         with pytest.raises(ValueError, match="electrons must be 0 < least <= largest, got 9 and 2"):
             NoisyCrops(captures, optics, 8, electrons=(9, 2))
+        with pytest.raises(ValueError, match="noise_error must be a factor of at least 1, got nan"):
+            NoisyCrops(captures, optics, 8, noise_error=float("nan"))
         with pytest.raises(ValueError, match="the crop must not exceed the captures of 32 x 32 pixels, got 33"):
             NoisyCrops(captures, optics, 33)[0]

@@ -205,20 +205,23 @@ class TestSettings(BaseTester):
             ({"learn": "network"}, set()),
             ({"learn": "network", "head": "midas-small"}, {"closed_form", "width"}),
             ({"learn": "network", "residual": True}, {"closed_form"}),
+            ({"learn": "network", "inverse": "tikhonov"}, set()),
         ],
     )
     def test_feature_defaults_of_the_network_alone_fit_what_is_given(self, given, changes):
         usual = usual_settings(given)
-        assert TrainingSettings(**{**usual, **given}).learn == given["learn"]
+        settings = TrainingSettings(**{**usual, **given})
+        assert settings.learn == given["learn"]
+        assert usual.pop("inverse", None) == ("wiener" if settings.closed_form else None)
         assert set(usual) == (set() if changes is None else set(NETWORK_RUN) - changes)
 
     def test_feature_image_and_depth_with_the_closed_form_have_a_distribution_of_depth(self):
         alone = usual_settings({"learn": "network", "task": "joint"})
-        assert set(alone) == set(NETWORK_RUN) | set(JOINT_RUN)
+        assert set(alone) == set(NETWORK_RUN) | set(JOINT_RUN) | {"inverse"}
         given = {"task": "joint", "closed_form": True, "refocus": 5}
         settings = TrainingSettings(**{**usual_settings(given), **given})
         assert (settings.depth_classes, settings.refocus) == (JOINT_RUN["depth_classes"], 5)
-        assert usual_settings({"task": "edof", "closed_form": True}) == {}
+        assert usual_settings({"task": "edof", "closed_form": True}) == {"inverse": "wiener"}
 
     def test_feature_settings_stored_before_there_was_a_choice_of_loss_are_read(self):
         values = TrainingSettings(head="plain").as_dict()
@@ -242,6 +245,9 @@ class TestSettings(BaseTester):
             ({"head": "nafnett"}, "head must be one of .*, got 'nafnett'"),
             ({"head": "tikhonov", "task": "depth"}, "head 'tikhonov' restores images, .* 'edof' only, got 'depth'"),
             ({"residual": True, "closed_form": True}, "residual adds the capture and closed_form its restoration"),
+            ({"inverse": "wiener"}, "inverse 'wiener' is the filter of closed_form, which is not asked for"),
+            ({"inverse": "best", "closed_form": True}, "inverse must be one of 'tikhonov', 'wiener', got 'best'"),
+            ({"noise_error": 0.5}, "noise_error must be a factor of at least 1, got 0.5"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
             ({"learn": "masks"}, "learn must be one of 'both', 'network', got 'masks'"),
