@@ -69,7 +69,9 @@ class TestTrain(BaseTester):
         assert read_image(run / "learning_curve.png").shape[-1] == 1575
         assert load_trained(run / "best.safetensors").step in (2, 4)
         both = ["--closed-form", "--head-from", str(run / "best.safetensors"), "--epochs", "1", "--fidelity", "draft"]
-        assert main(["train", *SMALL, *both, "-o", str(tmp_path / "both")]) == 0
+        assert load_trained(run / "best.safetensors").head.closed_form.inverse == "wiener"
+        other = [*both, "--inverse", "tikhonov"]  # holds other PSFs, which are its camera's own
+        assert main(["train", *SMALL, *other, "-o", str(tmp_path / "both")]) == 0
         joint = ["--task", "joint", "--depth-classes", "5", "--refocus", "2", *both]
         assert main(["train", *SMALL, *joint, "-o", str(tmp_path / "joint")]) == 0
         assert load_trained(tmp_path / "joint" / "best.safetensors").head.out_channels == 5 + 3
