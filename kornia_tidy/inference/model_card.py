@@ -158,9 +158,16 @@ def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
         ("PSFs", f"fidelity {settings.fidelity!r}, window {settings.window} pixels"),
         ("compositing", settings.compositing),
         ("network", f"{settings.head}, width {settings.width or 'by default'}"),
-        ("estimates the difference to the capture", "yes" if settings.residual else "no"),
+        ("begins from", _beginning(settings)),
         ("depths refocused to before the network", str(settings.refocus)),
     ]
+
+
+def _beginning(settings: SystemSettings) -> str:
+    """Return what the network's image is added to."""
+    if settings.closed_form:
+        return f"the closed form, with the filter {settings.inverse!r}"
+    return "the capture" if settings.residual else "nothing"
 
 
 def _distance(metres: float) -> str:

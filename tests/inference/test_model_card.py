@@ -47,6 +47,17 @@ class TestModelCard(BaseTester):
         assert rows["other"] == ["2", "5"]
         assert rows["score"] == [r"desk \| lamp", "b"]
 
+    @pytest.mark.parametrize(
+        ("settings", "words"),
+        [
+            ({}, "nothing"),
+            ({"residual": True}, "the capture"),
+            ({"closed_form": True, "inverse": "wiener"}, "the closed form, with the filter 'wiener'"),
+        ],
+    )
+    def test_feature_what_the_network_begins_from(self, settings, words):
+        assert f"| begins from | {words} |" in model_card(untrained(**settings), "t")
+
     def test_feature_what_is_not_recorded_is_said_to_be_unknown(self):
         card = model_card(untrained(), "t")
         assert "Which data it was trained on is unknown" in card
