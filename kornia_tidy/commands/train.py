@@ -173,7 +173,7 @@ def add_parser(subparsers: Any) -> None:
         "precision",
         choices=PRECISIONS,
         help="of the network; optics stay in float32. bf16-mixed is faster on processors that compute in bfloat16 "
-        "(AMX or AVX-512 BF16: see lscpu), and ten times as slow on others; default: 32-true",
+        "(AMX or AVX-512 BF16: see lscpu), and far slower on others; default: 32-true",
     )
     _setting(
         learning,
