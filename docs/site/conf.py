@@ -85,7 +85,7 @@ def shorten_factories(
 
 
 def setup(app: Any) -> None:
-    """Register what is resolved here."""
+    """Register the functions of this file with Sphinx."""
     import drawn_in_page  # noqa: PLC0415
 
     app.connect("source-read", link_examples_to_the_gallery)

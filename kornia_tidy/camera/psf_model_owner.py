@@ -1,4 +1,4 @@
-"""A module with a PSF model, whose parts and PSFs are attributes and methods of the module too."""
+"""A module that owns a PSF model, and offers the model's parts and PSFs as its own attributes and methods."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def cropped(tensor: Tensor, margin: int) -> Tensor:
 
 
 def zero_of(*tensors: Tensor) -> Tensor:
-    """Return a number that depends on tensors: an empty capture, to which it is added, has their gradients, of zero."""
+    """Return zero, computed from the tensors: added to an empty capture, it gives each of them a gradient of zero."""
     return cast("Tensor", sum(tensor.sum() for tensor in tensors)) * 0
 
 

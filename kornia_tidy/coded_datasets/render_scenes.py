@@ -121,7 +121,7 @@ def render_scenes(
         counted = None if each is None else partial(_counted, each=each, found=found, total=total)
         _photograph(items, folder, missing, jobs, counted)
         if take_over:
-            # From the end of the shares of others: those who still work on them come from the start.
+            # The shares of other processes, from their ends: a process that still works on its own goes forward.
             others = [part for step in range(1, world) for part in parts[(rank + step) % world :: world][::-1]]
             for start in range(0, len(others), jobs):
                 missing = _missing(folder, others[start : start + jobs])

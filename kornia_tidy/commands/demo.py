@@ -155,7 +155,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _explained(camera: Camera, scene: Scene, result: Result, noise: int) -> bytes:
-    """Return the page on how the capture comes about, as PNG."""
+    """Return the picture that explains how a capture is made, as PNG."""
     optics = camera.optics
     small = TiDyOptics(optics.masks, optics.camera, optics.modulator, optics.sensor)  # its PSFs fill their pictures
     times = DwellTimes([1.0] + [0.0] * (len(optics.masks.phase) - 1))

@@ -44,7 +44,7 @@ class Camera(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a camera sees of a scene, and what is made of it; maps are (C, H, W)."""
+    """The capture of a scene by one camera, and its restorations; maps are (C, H, W)."""
 
     capture: Tensor
     closed_form: Tensor

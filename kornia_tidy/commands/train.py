@@ -195,7 +195,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _add_network_settings(group: Any) -> None:
-    """Add the options of the network, and of what it is given."""
+    """Add the options of the network and of its inputs."""
     _setting(
         group,
         "head",

@@ -164,7 +164,7 @@ def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
 
 
 def _beginning(settings: SystemSettings) -> str:
-    """Return what the network's image is added to."""
+    """Return the name of the image to which the network adds its result."""
     if settings.closed_form:
         return f"the closed form, with the filter {settings.inverse!r}"
     return "the capture" if settings.residual else "nothing"

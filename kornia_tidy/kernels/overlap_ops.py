@@ -141,7 +141,7 @@ def overlap_psf_gradient(
 
 
 def size_step(dtype: torch.dtype) -> int:
-    """Return what the side of a window is a multiple of, in samples.
+    """Return the number of samples of which the side of every window is a multiple.
 
     Example:
         >>> size_step(torch.float32), size_step(torch.float64)

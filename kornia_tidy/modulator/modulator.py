@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_part, described
 
-READS = 100  # of masks that another thread changes all the time; what is read last is taken
+READS = 100  # attempts to read masks while another thread changes them; then the last reading is taken
 
 
 class Timeline(NamedTuple):

@@ -66,7 +66,7 @@ def _gauss_legendre(order: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple((nodes / 2).tolist()), tuple((weights / 2).tolist())
 
 
-@lru_cache(maxsize=64)  # a search asks for all orders up to its own, some of which take milliseconds
+@lru_cache(maxsize=64)  # a search tries one order after the other, and a large one takes milliseconds
 def _leggauss(order: int) -> tuple[np.ndarray, np.ndarray]:
     return np.polynomial.legendre.leggauss(order)
 

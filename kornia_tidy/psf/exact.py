@@ -146,7 +146,7 @@ def exact_psf_bank(
 def _matrices_of(
     kernels_of: Callable[..., Tensor], defocus: tuple[float, ...], constants: tuple[Hashable, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Return what :func:`batched_energies` multiplies with, made once for each depth, on the CPU, and remembered."""
+    """Return the matrices of :func:`batched_energies` for each depth, computed once, on the CPU, and remembered."""
     keys = [(psi, constants) for psi in defocus]
     missing = [key for key in keys if key not in _MATRICES]
     if missing:

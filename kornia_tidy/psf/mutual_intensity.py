@@ -153,7 +153,7 @@ def _intensity(rows: Tensor, others: Tensor) -> Tensor:
 
 
 def _blocks(plain: Tensor, left: Tensor) -> Iterator[slice]:
-    """Yield slices of depths, in order, whose waves and mutual intensities are _BLOCK_NUMBERS or one depth."""
+    """Yield slices of depths, in order: as many as _BLOCK_NUMBERS waves and mutual intensities allow, or one."""
     depths, window, order, cells = left.shape
     numbers = window * (2 * order * plain.shape[-1] + (cells // 2) ** 2)
     together = max(1, _BLOCK_NUMBERS // numbers)

@@ -116,7 +116,7 @@ class PSFModel(ScenePSFs):
         return self.replace(fidelity=Fidelity.of(fidelity))
 
     def without_memory(self) -> Self:
-        """Return this model without remembered PSFs: those that it computes go when it does. The parts are shared.
+        """Return this model without remembered PSFs; those that the copy computes are freed with it. Parts are shared.
 
         Example:
             >>> PSFModel().without_memory().psf_bank(defocus=[0.0]).psfs.shape[:2]

@@ -108,7 +108,7 @@ def _waves(first: Tensor, left: Tensor, second: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _blocks(states: int, shape: Sequence[int]) -> Iterator[tuple[slice, slice]]:
-    """Yield slices of depths and of pixel rows, in order, whose waves are of _BLOCK_SAMPLES if they can."""
+    """Yield slices of depths and of pixel rows, in order: as many as _BLOCK_SAMPLES samples allow, or one row."""
     depths, window, order, _ = shape
     row = order * states * 2 * window * order
     height = min(window, max(1, _BLOCK_SAMPLES // row))

@@ -240,7 +240,7 @@ class ClosedForm(nn.Module):
         return Restoration(*(part.to(capture.dtype) for part in restored))
 
     def blend(self, layers: Tensor, shares: Tensor, noise: Tensor) -> Tensor:
-        """Return the image whose pixels are means of the light deconvolved for each depth, smoothed.
+        """Return the light deconvolved for each depth, averaged pixel by pixel with the shares of depths, and smoothed.
 
         Args:
             layers: of the :class:`Restoration`.
@@ -349,7 +349,7 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
 
 
 def untold_closed_forms(head: nn.Module) -> list[ClosedForm]:
-    """Return the closed forms in a network that take away stray light by the mean light of what they see.
+    """Return the closed forms in a network that estimate stray light from the mean light of their own input.
 
     Example:
         >>> untold_closed_forms(nn.Conv2d(3, 3, 1))

@@ -20,7 +20,7 @@ EXPONENT, KNEE = 2.9, 1 / 256  # of the power spectrum of real scenes in linear 
 # Its integral over the circle of half a cycle a pixel; over a plane of a few PSFs it would not be resolved.
 VARIANCE = math.pi / (EXPONENT / 2 - 1) * (KNEE ** (2 - EXPONENT) - (0.25 + KNEE**2) ** (1 - EXPONENT / 2))
 PATCH = 2.5  # pixels, standard deviation of the Gaussian window of a patch
-LARGEST = 25.0  # of the energy of a sample, whose mean is 1: an edge that no depth explains does not decide alone
+LARGEST = 25.0  # limit of a sample's energy, on average 1: an edge that no depth explains must not decide alone
 MEAN = 0.3  # light of a scene, of full scale
 _SPARE = 0.5  # of the samples of a patch that count, as its pixels are not independent after truncation
 

@@ -14,7 +14,7 @@ from kornia_tidy.reconstruction.tile_place import TilePlace
 
 FARTHEST = 8192  # px; a larger receptive field is taken for the whole image
 _STRIP = 32  # px; least width of the strip in which the field is measured lengthwise
-_ENDLESS = 2**20  # strides; side of an image, at the ends of which interpolation is shifted most
+_ENDLESS = 2**20  # strides; side of an image so large that interpolation at its ends is shifted as far as it can be
 
 _found: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
 

@@ -16,7 +16,7 @@ from kornia_tidy.render.cost_profile import CostProfile, Rates
 
 # Bytes of a tile's planes in one channel, beyond which they leave the cache, or are fetched from the system each time.
 TILE_CACHE, OCCLUSION_CACHE = 16 << 20, (64 << 20) // 3
-WINDOW_CACHE = 1 << 20  # the same for one plane of a window whose transforms are in C
+WINDOW_CACHE = 1 << 20  # the same for one plane of a window that is transformed in C
 
 
 class Work(Protocol):

@@ -35,7 +35,7 @@ BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an
 TRITON = TritonBackend()
 NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED, TRITON.name: TRITON}
 METHODS = ("auto", *NAMED)
-LARGEST_PLANE = 32 << 20  # bytes of all channels of an image, up to which "auto" may take dense
+LARGEST_PLANE = 32 << 20  # bytes of an image with all channels; "auto" does not take dense for larger ones
 REMEMBERED = 256  # choices, each of some 500 bytes and a grid
 
 _choices: dict[tuple[Hashable, ...], tuple[Backend, dict[Any, Any]]] = {}

@@ -257,7 +257,7 @@ def scene_of_layers(
     compositing: str,
     dtype: torch.dtype,
 ) -> LayeredScene:
-    """Return a scene whose layers are known. Nothing is checked.
+    """Return a scene with layers that the caller knows already. Nothing is checked.
 
     Args:
         image: this and the other arguments are those of :class:`LayeredScene`.

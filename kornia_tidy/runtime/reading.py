@@ -20,7 +20,7 @@ _thread = _Thread()
 
 @contextmanager
 def values_unread(device: torch.device) -> Generator[None]:
-    """Leave the values of an accelerator's tensors unread in this thread; whoever enters has checked them or will not.
+    """Skip checks that read values of an accelerator's tensors, in this thread: the caller has made them or needs none.
 
     Nothing changes for tensors of the CPU and where torch traces the computation.
 

@@ -44,7 +44,7 @@ def is_transformed() -> bool:
         (tensor(1.), False)
     """
     functorch = torch._C._functorch
-    # While compiling, the empty stack is an object that stands for None: it is not None, and not an interpreter.
+    # While compiling, the empty stack is a proxy of None, so a comparison with None would fail.
     return forward_ad._current_level >= 0 or isinstance(functorch.peek_interpreter_stack(), functorch.CInterpreter)
 
 

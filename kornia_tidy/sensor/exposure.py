@@ -1,4 +1,4 @@
-"""Exposure: the light that an aperture admits in a given exposure time, as a sensor whose full scale is white."""
+"""Exposure: the light that an aperture admits in a given time, as a sensor that a white pixel just saturates."""
 
 from __future__ import annotations
 

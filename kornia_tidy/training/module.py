@@ -26,7 +26,7 @@ from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
-HELD_OUT_STEP = 4  # pixels between two to which the temperature is fitted, in a row and in a column
+HELD_OUT_STEP = 4  # the temperature is fitted to every fourth pixel of every fourth row
 
 
 class BatchResult(NamedTuple):

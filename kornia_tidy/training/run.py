@@ -123,6 +123,8 @@ def _train(
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
     module = TidyTraining.from_settings(settings, design=checkpoint is None and masks_from is None, progress=progress)
     assert module.settings is not None
+    if settings.data in PAINTED:
+        module.optics.notes.first_time("depth")  # painted in metres: a far scene is no sign of another unit
     if masks_from is not None and checkpoint is None:
         load_masks(masks_from, module.optics)
         module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)

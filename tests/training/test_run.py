@@ -29,6 +29,16 @@ SETTINGS = TrainingSettings(
 )  # fmt: skip
 
 NETWORK = {"task": "edof", "learn": "network", "crop": 24, "fidelity": "draft", "loss": "charbonnier"}
+# Scenes of its seed lie wholly at 80 m and more, where this lens has the focus of infinity.
+FAR = SETTINGS.replace(
+    **{**NETWORK, "crop": None},
+    data="dead-leaves",
+    depth_range=(0.3, 100.0),
+    f_number=40.0,
+    size=16,
+    scenes=24,
+    epochs=1,
+)
 
 
 def rows(path):
@@ -56,6 +66,9 @@ class TestTrain(BaseTester):
                 with pytest.raises(ValueError, match=r"a training is at work in .* already: wait for it to end"):
                     train(SETTINGS, tmp_path, resume=resume)
             assert os.listdir(tmp_path) == []
+
+    def test_feature_far_painted_scenes_are_not_taken_for_another_unit(self, tmp_path):
+        train(FAR, tmp_path)  # a warning would be an error
 
     def test_feature_learning_lowers_the_loss(self, tmp_path):
         train(SETTINGS.replace(size=64, validation_scenes=2, epochs=12, augment=False, ema=0.0), tmp_path)

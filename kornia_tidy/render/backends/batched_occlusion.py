@@ -31,7 +31,7 @@ EPSILON_FLOAT32 = 1e-3  # as in the source: on devices without float64 round-off
 
 
 class _Layers(NamedTuple):
-    """What is blurred: light (B, D, C, H', W'), and alpha and cumulative alpha of the layers, (B, D, 2, H', W')."""
+    """Inputs of the blur: light (B, D, C, H', W'), and alpha and cumulative alpha of the layers, (B, D, 2, H', W')."""
 
     light: Tensor
     alphas: Tensor

@@ -63,7 +63,7 @@ class OverlapBackend:
         plane, psfs, size = tensors[0].detach(), scene.psfs.detach(), window_size(scene)
         index, weight = labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
-        # What is labelled: for gather the gradient's pixels, for scatter the light, seen from a padded gradient.
+        # Labels of depth belong to the gradient's pixels for gather, and to those of the light for scatter.
         scatters, lost = scene.compositing == "scatter", psfs.shape[-1] - 1
         window, pixels = (pad(gradient, (lost,) * 4), plane) if scatters else (plane, gradient)
         if wants_gradient(tensors[0]) and scatters:
