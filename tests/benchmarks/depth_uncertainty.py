@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import statistics
 from pathlib import Path
 
 import torch
@@ -25,6 +24,7 @@ from tests.benchmarks.results.restorations import takes_noise
 from tests.benchmarks.results.scenes import BenchScene, real_scenes
 from tests.benchmarks.results.scores import depth_scores
 from tests.benchmarks.results.systems import System, available, from_checkpoint
+from tests.benchmarks.standard_error import mean_and_error
 
 SHIPPED = "joint-uncertain"
 SURE = 0.7  # part of a scene's known pixels, the surest
@@ -65,11 +65,6 @@ def row(system: System, noise: str) -> str:
     words = [mean_and_error([value for value in values if math.isfinite(value)]) for values in errors.values()]
     words += [f"{float(surest):.3f}", f"{100 * curve.calibration_error():.0f} %"]
     return f"| {system.name} | {noise} | {' | '.join(words)} |"
-
-
-def mean_and_error(values: list[float]) -> str:
-    """Return the mean of values and its standard error."""
-    return f"{statistics.fmean(values):.3f} ± {statistics.stdev(values) / math.sqrt(len(values)):.3f}"
 
 
 def main() -> None:

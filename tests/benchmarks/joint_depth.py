@@ -46,6 +46,7 @@ from kornia_tidy.reconstruction.reliability import reliability_curve, sparsifica
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.module import cosine_rate
 from tests.benchmarks.heads import RealScenes
+from tests.benchmarks.standard_error import standard_error
 
 TRAINED, HELD_OUT, SIZE, CROP, BATCH, RATE = 120, 12, 192, 128, 4, 2e-3
 SURE = 0.7  # part of the pixels, the surest
@@ -225,8 +226,7 @@ def score(path: Path, count: int | None) -> None:
     lines = [f"| mean of {len(rows)} real scenes | value | standard error |", "|---|---|---|"]
     for name in rows[0]:
         values = [row[name] for row in rows if row[name] == row[name]]
-        error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
-        lines.append(f"| {name} | {statistics.fmean(values):.3f} | {error:.3f} |")
+        lines.append(f"| {name} | {statistics.fmean(values):.3f} | {standard_error(values):.3f} |")
     for name, each in curves.items():
         lines.append(f"| calibration error, {name} | {each.curve.calibration_error():.2f} | |")
         lines.append(f"| surest 70 % of all pixels, {name} | {each.errors[SHARES.index(SURE)]:.3f} | |")

@@ -10,7 +10,6 @@ design is kept in FOLDER as ``kornia-tidy design`` writes it; the same command g
 from __future__ import annotations
 
 import argparse
-import math
 import statistics
 from itertools import product
 from pathlib import Path
@@ -23,6 +22,7 @@ from kornia_tidy.mask_design.candidates import Candidate, search_lens
 from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design, planned_work
 from kornia_tidy.mask_design.design_report import design_files
 from kornia_tidy.mask_design.design_task import DesignTask, mask_of
+from tests.benchmarks.standard_error import mean_and_error
 from tests.benchmarks.when_coding_pays import scenes_for
 
 SEEDS, COUNTS = (0, 1, 2), (1, 5)
@@ -40,11 +40,6 @@ def designed(folder: Path, depth_weight: float, masks: int, seed: int) -> CoDesi
     for name, data in design_files(found).items():
         write_bytes(place / name, data)
     return found
-
-
-def mean_and_error(values: list[float]) -> str:
-    """Return the mean of values and its standard error."""
-    return f"{statistics.fmean(values):+.3f} ± {statistics.stdev(values) / math.sqrt(len(values)):.3f}"
 
 
 def main() -> None:
@@ -66,8 +61,8 @@ def main() -> None:
             f"{flat.depth:.3f}, f/{flat.candidate.f_number:.3g} |"
         )
     gains = [_gains(found[1, seed], found[5, seed]) for seed in SEEDS]
-    seeds = mean_and_error([statistics.fmean(gain) for gain in gains])
-    scenes = mean_and_error([statistics.fmean(scene) for scene in zip(*gains, strict=True)])
+    seeds = mean_and_error([statistics.fmean(gain) for gain in gains], "+")
+    scenes = mean_and_error([statistics.fmean(scene) for scene in zip(*gains, strict=True)], "+")
     print(f"\nfive masks over one, dB: {seeds} over seeds, {scenes} over the {len(gains[0])} scenes of half B")
 
 

@@ -12,6 +12,7 @@ from tests.benchmarks.results.measure import NO_CAMERA, is_whole
 from tests.benchmarks.results.restorations import NETWORK
 from tests.benchmarks.results.scenes import SceneSet
 from tests.benchmarks.results.store import Measured, SystemRow
+from tests.benchmarks.standard_error import standard_error
 
 ByScene = dict[str, dict[str, float]]
 
@@ -56,9 +57,8 @@ def paired(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Difference
     differences = [value for value in differences if math.isfinite(value)]
     if not differences:
         return Difference(math.nan, math.nan, 0, 0)
-    count = len(differences)
-    error = statistics.stdev(differences) / math.sqrt(count) if count > 1 else math.nan
-    return Difference(statistics.fmean(differences), error, sum(value > 0 for value in differences), count)
+    ahead = sum(value > 0 for value in differences)
+    return Difference(statistics.fmean(differences), standard_error(differences), ahead, len(differences))
 
 
 class Results:
