@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes, layer_weights
+from kornia_tidy.reconstruction.guided_classes import smoothed_classes
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
 
 
@@ -38,7 +39,9 @@ class JointClosedFormHead(ClosedFormHead):
 
     Convention:
         - The blend is by logits without temperature, and no gradient of the image reaches the logits through it.
-        - In eval mode logits are divided by ``temperature``, a number in the state that is fitted after training (see
+        - In eval mode probabilities of classes are averaged over neighbours of like colour, see
+          :func:`~kornia_tidy.reconstruction.guided_classes.smoothed_classes`. Their logits are divided by
+          ``temperature``, a number in the state that is fitted after training (see
           :func:`~kornia_tidy.reconstruction.depth_distribution.fit_temperature`).
         - PSFs and noise of the camera are part of the state, as for :class:`ClosedFormHead`.
 
@@ -77,9 +80,10 @@ class JointClosedFormHead(ClosedFormHead):
         logits = logits + self._initial_logits(restored.maps)
         shares = layer_weights(logits.detach(), self.closed_form.layers)
         blend = self.closed_form.blend(restored.layers, shares, noise)
+        image = residual + blend
         if not self.training:
-            logits = logits / self.temperature.to(logits.dtype)
-        return torch.cat([logits, residual + blend], 1)
+            logits = smoothed_classes(logits, image) / self.temperature.to(logits.dtype)
+        return torch.cat([logits, image], 1)
 
     def closed_form_logits(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
         """Return the logits of the classes by the likelihood in closed form alone, (B, D, H, W)."""

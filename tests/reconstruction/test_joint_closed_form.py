@@ -35,6 +35,7 @@ from kornia_tidy.reconstruction.closed_form import (
 )
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
+from kornia_tidy.reconstruction.guided_classes import smoothed_classes
 from kornia_tidy.reconstruction.joint_closed_form import widened_for_depth
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
@@ -75,7 +76,7 @@ class TestJointClosedFormHead(BaseTester):
             image, likelihood = blended(head, padded, 0.01), head.closed_form_logits(padded, 0.01)
         assert output.shape == (2, CLASSES + 3, 20, 33)
         assert torch.equal(output[:, -3:], image[..., 6:26, 7:40])
-        assert torch.equal(output[:, :CLASSES], likelihood[..., 6:26, 7:40])
+        assert torch.equal(output[:, :CLASSES], smoothed_classes(likelihood, image)[..., 6:26, 7:40])
 
     def test_feature_the_last_maps_are_the_likelihood_of_each_depth(self):
         """Of the light's brightness; every other class is one of the layers."""
@@ -84,7 +85,7 @@ class TestJointClosedFormHead(BaseTester):
         fits = depth_likelihood(light, *likelihood_filters(bank(LAYERS).psfs.mean(1)))
         expected = (fits / SHARPNESS).clamp(min=LEAST)
         self.assert_close(head.closed_form(capture).maps[:, -LAYERS:], 1 - expected / LEAST)
-        self.assert_close(head(capture)[:, :CLASSES:2], expected)
+        self.assert_close(head.train()(capture)[:, :CLASSES:2], expected)
 
     def test_feature_blends_the_depths_by_their_likelihood(self):
         """Each is a deconvolution with its own PSF; the noisier the capture, the wider the likelihood."""
@@ -122,7 +123,7 @@ class TestJointClosedFormHead(BaseTester):
         head = joint(box_bank(), 3, encoded=False)
         with torch.no_grad():
             found = JointHead(head)(capture).depth
-        assert found[depth == 1].mean() > found[depth == 0].mean() + 0.2
+        assert found[depth == 1].mean() > found[depth == 0].mean() + 0.1  # averaged over the edge: no colour tells it
 
     def test_feature_stray_light_is_taken_away_first(self):
         """A bank with stray light and a capture with it give the depth that both have without it."""
@@ -161,7 +162,8 @@ class TestJointClosedFormHead(BaseTester):
             after, in_training = head(capture), head.train()(capture)
         self.assert_close(after[:, :CLASSES], before[:, :CLASSES] / 2)
         assert torch.equal(after[:, CLASSES:], before[:, CLASSES:])
-        assert torch.equal(in_training, before)
+        assert torch.equal(in_training[:, CLASSES:], before[:, CLASSES:])
+        self.assert_close(smoothed_classes(*in_training.split([CLASSES, 3], 1)), before[:, :CLASSES])
         assert "temperature" in head.state_dict()
 
     def test_feature_learns_image_and_depth_from_zero(self):
@@ -233,7 +235,7 @@ class TestJointClosedFormHead(BaseTester):
         assert not begun[:, trained.shape[1] :].any()
         with torch.no_grad():
             self.assert_close(head(capture, 0.01)[:, -3:], blended(head, capture, 0.01))
-            self.assert_close(head(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
+            self.assert_close(head.train()(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
 
     def test_exception(self):
         with pytest.raises(ValueError, match="number of classes of network must be a whole number of at least 2"):

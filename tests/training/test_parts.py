@@ -301,4 +301,5 @@ class TestPlainHead(BaseTester):
             make_head("plane", 3)
 
     def test_smoke_copies(self):
-        copy.deepcopy(make_head("plain", 3))
+        head, image = make_head("plain", 3).eval(), torch.rand(1, 3, 40, 50)
+        assert torch.equal(copy.deepcopy(head)(image), head(image))

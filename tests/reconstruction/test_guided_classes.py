@@ -1,0 +1,87 @@
+"""Classes of depth averaged over neighbours of like colour."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kornia.filters import guided_blur
+from torch.nn import functional
+
+from kornia_tidy.reconstruction.guided_classes import EDGE, RADIUS, REDUCTION, VOTE, linear_fit, smoothed_classes
+from tests.base import BaseTester
+
+
+def maps(height=48, width=64, classes=5, dtype=torch.float64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    logits = 3 * torch.randn(2, classes, height, width, generator=generator, dtype=torch.float64)
+    return logits.to(dtype), torch.rand(2, 3, height, width, generator=generator, dtype=torch.float64).to(dtype)
+
+
+class TestSmoothedClasses(BaseTester):
+    def test_smoke_any_size_on_the_grid(self):
+        for height, width in ((4, 4), (4, 80), (32, 16)):
+            logits, guide = maps(height, width)
+            smooth = smoothed_classes(logits, guide)
+            assert smooth.shape == logits.shape
+            self.assert_close((smooth / VOTE).exp().sum(1), torch.ones(2, height, width, dtype=torch.float64))
+
+    def test_feature_the_fit_is_that_of_kornias_guided_filter(self):
+        """Away from the border, where kornia reflects."""
+        logits, guide = maps(40, 44)
+        probability, side = logits.softmax(1), 2 * RADIUS + 1
+        slopes, offset = linear_fit(probability, guide)
+        found = offset + sum(slope * colour for slope, colour in zip(slopes, guide.split(1, 1), strict=True))
+        inner = (..., slice(side, -side), slice(side, -side))
+        self.assert_close(found[inner], guided_blur(guide, probability, side, EDGE)[inner], rtol=1e-9, atol=1e-12)
+
+    def test_feature_within_one_colour_probabilities_are_averaged(self):
+        logits, guide = maps(80, 80)
+        guide = torch.full_like(guide, 0.4)
+        probability = functional.avg_pool2d((logits / VOTE).softmax(1), REDUCTION)
+        for _ in range(2):
+            probability = functional.avg_pool2d(probability, 2 * RADIUS + 1, 1, RADIUS, count_include_pad=False)
+        found = functional.avg_pool2d((smoothed_classes(logits, guide) / VOTE).exp(), REDUCTION)
+        self.assert_close(found[..., 2:-2, 2:-2], probability[..., 2:-2, 2:-2], atol=2e-3, rtol=0)
+
+    @pytest.mark.parametrize("angle", [0, 1])
+    def test_feature_classes_do_not_cross_an_edge_of_colour(self, angle):
+        logits, guide = torch.zeros(1, 2, 64, 64), torch.full((1, 3, 64, 64), 0.3)
+        logits[:, 0, :, :32] = logits[:, 1, :, 32:] = 4.0
+        guide[:, 0, :, 32:] = 0.6  # red alone tells
+        logits, guide = logits.rot90(angle, (2, 3)), guide.rot90(angle, (2, 3))
+        smooth = smoothed_classes(logits, guide)
+        assert torch.equal(smooth.argmax(1), logits.argmax(1))
+        assert (smooth / VOTE).softmax(1).amax(1).min() > 0.85  # 0.92 before
+
+    def test_feature_one_sure_pixel_does_not_outvote_its_neighbours(self):
+        logits, guide = torch.zeros(1, 2, 64, 64), torch.full((1, 3, 64, 64), 0.3)
+        logits[:, 0] = 1.0
+        logits[:, 1, 32, 32] = 60.0
+        assert not smoothed_classes(logits, guide).argmax(1).any()
+
+    def test_feature_extreme_values_stay_finite(self):
+        logits, guide = maps(32, 32, dtype=torch.float32)
+        for scale in (0.0, 1e-6, 1e4):
+            assert smoothed_classes(1e4 * logits, scale * guide).isfinite().all()
+
+    def test_feature_float32_agrees_with_float64(self):
+        """Grey guides are worst: their covariance of three colours has one eigenvalue, and the edge the others."""
+        logits, guide = maps(64, 64)
+        guide = guide[:, :1].expand(-1, 3, -1, -1)
+        single = smoothed_classes(logits.float(), guide.float())
+        self.assert_close((single / VOTE).exp(), (smoothed_classes(logits, guide) / VOTE).exp(), atol=1e-3, rtol=0)
+
+    @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+    def test_feature_half_precision_is_rounded_once(self, half):
+        logits, guide = (part.to(half) for part in maps(32, 32))
+        exact = smoothed_classes(logits.float(), guide.float())
+        assert torch.equal(smoothed_classes(logits, guide), exact.to(half))
+
+    def test_gradcheck(self):
+        logits, guide = maps(12, 16, classes=2)
+        self.gradcheck(smoothed_classes, (logits[:1].requires_grad_(), (0.2 + 0.5 * guide[:1]).requires_grad_()))
+
+    def test_dynamo(self):
+        logits, guide = maps(16, 32, dtype=torch.float32)
+        compiled = torch.compile(smoothed_classes, fullgraph=True, backend="eager")
+        self.assert_close(compiled(logits, guide), smoothed_classes(logits, guide))
