@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes, layer_weights
-from kornia_tidy.reconstruction.guided_classes import smoothed_classes
+from kornia_tidy.reconstruction.guided_classes import REDUCTION, smoothed_classes
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
 
 
@@ -68,6 +69,7 @@ class JointClosedFormHead(ClosedFormHead):
     ) -> None:
         check_count("the number of classes of network", network.out_channels - 3, 2)
         super().__init__(network, layers, encoded=encoded, likelihood=True, inverse=inverse)
+        self.stride = math.lcm(network.stride, REDUCTION)
         self.register_buffer("temperature", torch.ones(()))
 
     def predict(self, image: Tensor) -> Tensor:

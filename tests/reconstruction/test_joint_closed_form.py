@@ -193,8 +193,10 @@ class TestJointClosedFormHead(BaseTester):
         assert type(head) is (JointClosedFormHead if closed_form else LayeredJointHead)
         assert head.out_channels == 5 + 3
 
-    def test_feature_tiles_are_the_whole(self):
-        head = JointHead(joint(trained=True, dtype=torch.float64)).eval()
+    @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
+    def test_feature_tiles_are_the_whole(self, kind):
+        """Classes are averaged on a grid of 4 pixels, also behind a network without a grid of its own."""
+        head = JointHead(joint(trained=True, dtype=torch.float64, kind=kind)).eval()
         margin = receptive_field(head)
         image = photo(40, 2 * margin + 80)[:1]
         with torch.no_grad():
