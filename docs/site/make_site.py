@@ -10,6 +10,7 @@ Every warning is an error: a link, an anchor or a reference that leads nowhere e
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ from gallery import write_gallery  # noqa: E402
 from sphinx.cmd.build import main as sphinx  # noqa: E402
 
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
-LINKED = ("CITATION.cff", "LICENSE", "constraints.txt", "kornia_tidy/fidelity.py")  # files that pages link to
+LINK = re.compile(r"\]\(([^)#:\s]+)\)")  # target of a link of Markdown inside the repository
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -53,11 +54,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def copy_pages(source: Path) -> list[Path]:
-    """Copy the pages and pictures of the repository, so that their links hold, and drop what is gone from it."""
-    listed = [ROOT / name for name in PAGES + LINKED] + [
+    """Copy pages, pictures and files that pages link to, so that links hold, and drop what is gone from the repository."""
+    listed = [ROOT / name for name in PAGES] + [
         path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".jpg", ".svg"}
     ]
-    copied = {source / path.relative_to(ROOT): path for path in listed}
+    pages = [path for path in listed if path.suffix == ".md"]
+    linked = {(page.parent / target).resolve() for page in pages for target in LINK.findall(page.read_text())}
+    inside = {path for path in linked if path.is_file() and path.is_relative_to(ROOT)}
+    copied = {source / path.relative_to(ROOT): path for path in {*listed, *inside}}
     copied[source / "index.rst"] = SITE / "index.rst"
     for old in [*source.glob("*"), *(source / "docs").rglob("*")]:
         if old.is_file() and old not in copied:
@@ -66,7 +70,7 @@ def copy_pages(source: Path) -> list[Path]:
         new.parent.mkdir(parents=True, exist_ok=True)
         if not new.exists() or new.read_bytes() != path.read_bytes():
             shutil.copyfile(path, new)
-    return [path for path in listed if path.suffix == ".md"]
+    return pages
 
 
 if __name__ == "__main__":
