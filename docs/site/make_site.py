@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def copy_pages(source: Path) -> list[Path]:
-    """Copy pages, pictures and files that pages link to, so that links hold, and drop what is gone from the repository."""
+    """Copy pages and what they link to in the repository, so that links hold, and drop what is gone from it."""
     listed = [ROOT / name for name in PAGES] + [
         path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".jpg", ".svg"}
     ]

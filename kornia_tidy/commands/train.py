@@ -110,6 +110,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--resume", action="store_true", help="go on with the run in FOLDER, if there is one")
     parser.add_argument("--head-from", metavar="CHECKPOINT", help="begin with the network of another run")
     parser.add_argument(
+        "--refiner-from", metavar="CHECKPOINT", help="begin --refined with the network of a run for the image alone"
+    )
+    parser.add_argument(
         "--masks-from", metavar="FILE", help="begin with the masks of another run, or of a camera that was saved"
     )
     parser.add_argument(
@@ -233,6 +236,12 @@ def _add_network_settings(group: Any) -> None:
         help="joint: depth as a distribution over D classes, with its uncertainty, from --refocus depths; with "
         "--closed-form the default is 21 classes from 9 depths; without, 32 and 11 do; 0: one depth a pixel",
     )
+    _setting(
+        group,
+        "refined",
+        action=argparse.BooleanOptionalAction,
+        help="a second network of the same kind refines the image; for a distribution of depth with --closed-form",
+    )
 
 
 def _add_noise_settings(group: Any) -> None:
@@ -345,6 +354,7 @@ def run(args: argparse.Namespace) -> None:
             folder,
             resume=args.resume,
             head_from=args.head_from,
+            refiner_from=args.refiner_from,
             masks_from=masks_from,
             captures=args.captures,
             save_every=args.save_every,

@@ -69,6 +69,8 @@ class SystemSettings:
             :class:`~kornia_tidy.reconstruction.JointClosedFormHead`, or without it as the capture deconvolved for each
             of these depths, blended by the distribution, see :class:`~kornia_tidy.reconstruction.LayeredJointHead`.
             0: one depth a pixel without uncertainty.
+        refined: a second network of the same kind refines the image, where ``depth_classes`` and ``closed_form`` are
+            given, see :class:`~kornia_tidy.reconstruction.JointClosedFormHead`.
         seed: of the initial masks, and of everything random in a run.
 
     Raises:
@@ -102,6 +104,7 @@ class SystemSettings:
     inverse: str = "tikhonov"
     refocus: int = 0
     depth_classes: int = 0
+    refined: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -135,7 +138,7 @@ class SystemSettings:
         check_choice("inverse", self.inverse, INVERSES)
         if self.inverse != INVERSES[0] and not self.closed_form:
             raise ValueError(f"inverse {self.inverse!r} is the filter of closed_form, which is not asked for")
-        if self.depth_classes:
+        if self.depth_classes or self.refined:
             self._check_distribution()
         if self.depth_range is not None:
             object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
@@ -149,6 +152,8 @@ class SystemSettings:
             )
 
     def _check_distribution(self) -> None:
+        if self.refined and not (self.depth_classes and self.closed_form):
+            raise ValueError("refined is for depth_classes with closed_form, which are not both asked for")
         if self.task != "joint" or self.residual:
             kind = f"task {self.task!r}" + (" with residual" if self.residual else "")
             raise ValueError(f"depth_classes are for the task 'joint' without residual, got the {kind}")

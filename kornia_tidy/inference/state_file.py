@@ -14,12 +14,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from kornia_tidy.files import parse_json, replacing
+from kornia_tidy.inference.eight_bits import EightBits
 from kornia_tidy.tensor_files import read_tensors
 
 FORMAT = "kornia_tidy state 1"
 WHAT = "checkpoint of kornia_tidy"
 _PLAIN = (str, bool, int, float, type(None))
 _TENSOR, _TUPLE, _PAIRS = "$tensor", "$tuple", "$pairs"  # markers of types that JSON lacks
+_SCALE = "$scale"  # of a tensor in eight bits
 
 
 def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
@@ -27,7 +29,8 @@ def write_state(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
 
     Args:
         path: of the file; an existing one is replaced.
-        state: nested dictionaries, lists and tuples of tensors, numbers, strings, booleans and None.
+        state: nested dictionaries, lists and tuples of tensors, numbers, strings, booleans and None. A tensor may be
+            :class:`~kornia_tidy.inference.eight_bits.EightBits`; it is read as float32.
 
     Raises:
         OSError: if it cannot be written, for example because the disk is full.
@@ -80,6 +83,9 @@ def _encode(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
         return {_TENSOR: name}
     if type(value) in _PLAIN:
         return value
+    if isinstance(value, EightBits):
+        scale = _encode(value.scale, f"{place}/{_SCALE}", tensors)
+        return {**_encode(value.values, place, tensors), _SCALE: scale[_TENSOR]}
     if isinstance(value, Mapping):
         items = {key: _encode(entry, f"{place}/{key}", tensors) for key, entry in value.items()}
         if all(isinstance(key, str) and not key.startswith("$") for key in items):
@@ -96,6 +102,8 @@ def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
         return [_decode(entry, tensors) for entry in value]
     if not isinstance(value, dict):
         return value
+    if _SCALE in value:
+        return EightBits(tensors[value[_TENSOR]], tensors[value[_SCALE]]).weight()
     if _TENSOR in value:
         return tensors[value[_TENSOR]]
     if _TUPLE in value:

@@ -90,7 +90,8 @@ def build_head(settings: SystemSettings) -> nn.Module:
         return ClosedFormHead(bilateral=bool(bilateral), encoded=settings.encoded, inverse=inverse)
     if settings.depth_classes and settings.closed_form:
         head = _network(settings, settings.depth_classes + 3, closed_form_channels(settings.refocus, likelihood=True))
-        return JointClosedFormHead(head, settings.refocus, encoded=settings.encoded, inverse=settings.inverse)
+        refiner = _network(settings, 3, closed_form_channels(settings.refocus)) if settings.refined else None
+        return JointClosedFormHead(head, settings.refocus, refiner, encoded=settings.encoded, inverse=settings.inverse)
     if settings.depth_classes:
         return LayeredJointHead(
             _network(settings, settings.depth_classes, 3 + 2 * settings.refocus),

@@ -58,6 +58,18 @@ def closed_form_channels(layers: int = 0, *, likelihood: bool = False) -> int:
     return 3 * (2 + len(WEIGHTS)) + 1 + layers * (1 + likelihood)
 
 
+def with_image(maps: Tensor, image: Tensor) -> Tensor:
+    """Return the maps of :class:`ClosedForm` with an image (B, 3, H, W) in place of the restored one.
+
+    Example:
+        >>> maps = with_image(torch.zeros(1, closed_form_channels(), 2, 2), torch.ones(1, 3, 2, 2))
+        >>> maps[0, :, 0, 0].nonzero().flatten()
+        tensor([15, 16, 17])
+    """
+    place = 3 * (1 + len(WEIGHTS))
+    return torch.cat([maps[:, :place], image, maps[:, place + 3 :]], 1)
+
+
 class Restoration(NamedTuple):
     """A restored image and the maps that a network takes."""
 

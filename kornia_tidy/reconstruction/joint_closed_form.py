@@ -8,11 +8,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels
+from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels, with_image
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes, layer_weights
 from kornia_tidy.reconstruction.guided_classes import REDUCTION, smoothed_classes
 from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.reconstruction.residual import zero_last_convolution
 
 
 class JointClosedFormHead(ClosedFormHead):
@@ -23,10 +24,15 @@ class JointClosedFormHead(ClosedFormHead):
     deconvolved for each depth, blended by the probability of the depth and smoothed by the bilateral filter; the last
     three maps are added to it. The last convolution is initialised with zeros: before training both are closed forms.
 
+    The network does not see the image, which depends on its depth. A second one may, and adds what is still missing.
+
     Args:
         network: takes :func:`~kornia_tidy.reconstruction.closed_form.closed_form_channels` maps with the likelihood,
             returns D + 3, and ends in a convolution. The classes are evenly spaced over normalised inverse depth.
         layers: number L of depths, at least 2.
+        refiner: takes what a :class:`ClosedFormHead` with these layers gives its network, with the image in place of
+            the restored one; returns three maps, which are added to the image, and ends in a convolution, which is
+            initialised with zeros, too. None: the image is as above.
         encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         inverse: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`: of estimates that the network
             takes, not of those for each depth.
@@ -36,7 +42,7 @@ class JointClosedFormHead(ClosedFormHead):
         - output: (B, D + 3, H, W): the logits of the classes, then the image.
 
     Raises:
-        ValueError: as :class:`ClosedFormHead`, or if the network has no two classes.
+        ValueError: as :class:`ClosedFormHead`, or if the network has no two classes or the refiner other channels.
 
     Convention:
         - The blend is by logits without temperature, and no gradient of the image reaches the logits through it.
@@ -65,11 +71,28 @@ class JointClosedFormHead(ClosedFormHead):
     temperature: Tensor
 
     def __init__(
-        self, network: ReconstructionHead, layers: int = 9, *, encoded: bool = True, inverse: str = "tikhonov"
+        self,
+        network: ReconstructionHead,
+        layers: int = 9,
+        refiner: ReconstructionHead | None = None,
+        *,
+        encoded: bool = True,
+        inverse: str = "tikhonov",
     ) -> None:
         check_count("the number of classes of network", network.out_channels - 3, 2)
         super().__init__(network, layers, encoded=encoded, likelihood=True, inverse=inverse)
         self.stride = math.lcm(network.stride, REDUCTION)
+        if refiner is not None:
+            wanted = closed_form_channels(layers), 3
+            if (refiner.in_channels, refiner.out_channels) != wanted:
+                raise ValueError(
+                    f"refiner must have {wanted[0]} input and {wanted[1]} output channels, got {refiner.in_channels} "
+                    f"and {refiner.out_channels}"
+                )
+            zero_last_convolution(refiner, 3, "refiner")
+            refiner.looked = True  # no check of the range, as refocused maps leave [0, 1]
+            self.stride = math.lcm(self.stride, refiner.stride)
+        self.refiner = refiner
         self.register_buffer("temperature", torch.ones(()))
 
     def predict(self, image: Tensor) -> Tensor:
@@ -81,8 +104,9 @@ class JointClosedFormHead(ClosedFormHead):
         logits, residual = residual.split([residual.shape[1] - 3, 3], 1)
         logits = logits + self._initial_logits(restored.maps)
         shares = layer_weights(logits.detach(), self.closed_form.layers)
-        blend = self.closed_form.blend(restored.layers, shares, noise)
-        image = residual + blend
+        image = residual + self.closed_form.blend(restored.layers, shares, noise)
+        if self.refiner is not None:
+            image = image + self.refiner(with_image(restored.maps[:, : self.refiner.in_channels], image))
         if not self.training:
             logits = smoothed_classes(logits, image) / self.temperature.to(logits.dtype)
         return torch.cat([logits, image], 1)
@@ -109,21 +133,51 @@ def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) 
 
     Args:
         weights: state of a :class:`ClosedFormHead` whose network has the kind and width of that in ``head``.
-        head: whose PSFs, noise, temperature and last convolution are taken; it is not changed.
+        head: whose PSFs, noise, temperature, refiner and last convolution are taken; it is not changed.
 
     Returns:
         A state for ``head``; weights of another kind of network stay as they are.
     """
     assert head.network is not None
-    convolutions = [name for name, part in head.named_modules() if isinstance(part, nn.Conv2d)]
+    named = head.network.named_modules(prefix="network")
+    convolutions = [name for name, part in named if isinstance(part, nn.Conv2d)]
     first, last = f"{convolutions[0]}.weight", convolutions[-1]
     found, own = dict(weights), head.state_dict()
-    found |= {name: own[name] for name in own if name.startswith(("closed_form.", f"{last}.")) or name == "temperature"}
-    common, layers = closed_form_channels(), head.closed_form.layers
-    if first in weights and weights[first].shape[1] >= common:
-        shared, by_depth = weights[first][:, :common], weights[first][:, common:]
-        zeros = shared.new_zeros(len(shared), layers, *shared.shape[2:])
-        given = by_depth.shape[1]
-        stretched = interpolated_classes(by_depth, layers) * given / layers if given else zeros
-        found[first] = torch.cat([shared, stretched, zeros], 1)
+    kept = ("closed_form.", "refiner.", "temperature", f"{last}.")
+    found |= {name: own[name] for name in own if name.startswith(kept)}
+    if first in weights and weights[first].shape[1] >= closed_form_channels():
+        stretched = _stretched(weights[first], head.closed_form.layers)
+        zeros = stretched[:, closed_form_channels() :] * 0
+        found[first] = torch.cat([stretched, zeros], 1)
     return found
+
+
+def as_refiner(weights: Mapping[str, Tensor], head: JointClosedFormHead) -> dict[str, Tensor]:
+    """Return the weights of a network for the image as those of the refiner of a head.
+
+    Over the depths, whose number may differ, the weights of the first convolution are interpolated.
+
+    Args:
+        weights: state of a :class:`ClosedFormHead` whose network has the kind and width of the refiner.
+        head: it is not changed.
+
+    Returns:
+        A part of the state of ``head``, with the names that weights of the refiner have there; weights of another kind
+        of network stay as they are.
+    """
+    assert head.refiner is not None
+    place = "network."
+    found = {key.removeprefix(place): value for key, value in weights.items() if key.startswith(place)}
+    first = next(name for name, part in head.refiner.named_modules() if isinstance(part, nn.Conv2d)) + ".weight"
+    if first in found and found[first].shape[1] >= closed_form_channels():
+        found[first] = _stretched(found[first], head.closed_form.layers)
+    return {f"refiner.{name}": value for name, value in found.items()}
+
+
+def _stretched(weight: Tensor, layers: int) -> Tensor:
+    """Return the weights of a convolution of a network for the image for another number of depths, interpolated."""
+    shared, by_depth = weight.tensor_split([closed_form_channels()], 1)
+    given = by_depth.shape[1]
+    if not given:
+        return torch.cat([shared, shared.new_zeros(len(shared), layers, *shared.shape[2:])], 1)
+    return torch.cat([shared, interpolated_classes(by_depth, layers) * given / layers], 1)

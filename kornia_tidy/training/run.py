@@ -22,7 +22,7 @@ from torch.utils.data import Dataset
 from kornia_tidy.files import only_here
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights
-from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, widened_for_depth
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.nafnet import deepened
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
@@ -45,6 +45,7 @@ def train(
     *,
     resume: bool = False,
     head_from: str | os.PathLike[str] | None = None,
+    refiner_from: str | os.PathLike[str] | None = None,
     masks_from: str | os.PathLike[str] | None = None,
     captures: str | os.PathLike[str] | None = None,
     save_every: int = 100,
@@ -63,6 +64,7 @@ def train(
         head_from: checkpoint with the network's initial weights, such as one trained with a fixed Fresnel lens. That of
             a network for the image may begin one for image and depth, see
             :func:`~kornia_tidy.reconstruction.joint_closed_form.widened_for_depth`.
+        refiner_from: checkpoint with a network for the image, with whose weights the refiner of ``refined`` begins.
         masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
             as ``camera.safetensors`` of ``kornia-tidy design``.
         captures: folder of the noise-free captures, for ``learn="network"``. Runs with the same camera and scenes may
@@ -87,8 +89,8 @@ def train(
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
         stored = folder / "captures" if captures is None else Path(captures)
         return _train(
-            settings, folder, scenes, validation, resume, head_from, masks_from, stored, save_every, workers,
-            progress, trainer_options,
+            settings, folder, scenes, validation, resume, head_from, refiner_from, masks_from, stored, save_every,
+            workers, progress, trainer_options,
         )  # fmt: skip
 
 
@@ -99,6 +101,7 @@ def _train(
     validation: Dataset[Any],
     resume: bool,
     head_from: str | os.PathLike[str] | None,
+    refiner_from: str | os.PathLike[str] | None,
     masks_from: str | os.PathLike[str] | None,
     captures: Path,
     save_every: int,
@@ -112,12 +115,13 @@ def _train(
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
         stage: dict[str, Any] = {
             "head_from": head_from,
+            "refiner_from": refiner_from,
             "save_every": save_every,
             "workers": workers,
             "progress": progress,
         }
         train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
-        head_from = folder / "pretrain" / LAST
+        head_from, refiner_from = folder / "pretrain" / LAST, None
     if checkpoint is not None:  # the window was measured on the masks before training
         settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
@@ -129,8 +133,13 @@ def _train(
         load_masks(masks_from, module.optics)
         module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)
         module.settings = module.settings.replace(window=fix_window(module.optics).window)
-    if head_from is not None and checkpoint is None:
-        _begin_network(head_from, module.head)
+    if refiner_from is not None and not settings.refined:
+        raise ValueError("a network begins the refiner of refined, which is not asked for")
+    if (head_from is not None or refiner_from is not None) and checkpoint is None:
+        if head_from is not None:
+            _begin_network(head_from, module.head)
+        if refiner_from is not None:
+            _begin_refiner(refiner_from, module.head)
         if module.average is not None:
             module.average.network.load_state_dict(module.head.state_dict())
     module.settings.write(folder / SETTINGS)
@@ -176,14 +185,24 @@ def _train(
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
     """Load the initial weights of a network; those of one for the image alone, or of fewer blocks, are widened.
 
-    PSFs and noise of its closed form stay those of this camera.
+    PSFs and noise of its closed form stay those of this camera, and so does a refiner where the other has none.
     """
     state = read_state(path)
-    own = {name: value for name, value in head.state_dict().items() if name.startswith("closed_form.")}
-    weights = {**below(state["state_dict"], head_prefix(state["state_dict"])), **own}
+    weights = below(state["state_dict"], head_prefix(state["state_dict"]))
+    kept = ("closed_form.",) if any(name.startswith("refiner.") for name in weights) else ("closed_form.", "refiner.")
+    weights |= {name: value for name, value in head.state_dict().items() if name.startswith(kept)}
     if isinstance(head, JointClosedFormHead) and "temperature" not in weights:
         weights = widened_for_depth(weights, head)
     load_weights({**state, "state_dict": _as_head(deepened(weights, head))}, head=head, name=str(path))
+
+
+def _begin_refiner(path: str | os.PathLike[str], head: nn.Module) -> None:
+    """Load the initial weights of the refiner of a network, from a network for the image of as many blocks or fewer."""
+    assert isinstance(head, JointClosedFormHead)
+    state = read_state(path)
+    weights = as_refiner(below(state["state_dict"], head_prefix(state["state_dict"])), head)
+    weights = {**{name: value for name, value in head.state_dict().items() if name not in weights}, **weights}
+    load_weights({**state, "state_dict": _as_head(weights)}, head=head, name=str(path))
 
 
 def _as_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -75,6 +75,10 @@ class TestTrain(BaseTester):
         joint = ["--task", "joint", "--depth-classes", "5", "--refocus", "2", *both]
         assert main(["train", *SMALL, *joint, "-o", str(tmp_path / "joint")]) == 0
         assert load_trained(tmp_path / "joint" / "best.safetensors").head.out_channels == 5 + 3
+        refined = [*joint, "--refined", "--head-from", str(tmp_path / "joint" / "best.safetensors")]
+        refined += ["--refiner-from", str(run / "best.safetensors")]
+        assert main(["train", *SMALL, *refined, "-o", str(tmp_path / "refined")]) == 0
+        assert load_trained(tmp_path / "refined" / "best.safetensors").head.refiner.out_channels == 3
 
     def test_feature_a_deeper_network_begins_as_one_that_was_trained(self, tmp_path):
         """A rate of 1e-12 leaves it as it begins."""
@@ -93,6 +97,8 @@ class TestTrain(BaseTester):
         ("options", "sentence"),
         [
             (["--repeats", "2"], "repeats are for the head nafnet, got 2 for 'plain'"),
+            (["--refined"], "refined is for depth_classes with closed_form, which are not both asked for"),
+            (["--refiner-from", "x"], "a network begins the refiner of refined, which is not asked for"),
             (["--captures", "x"], "--captures is for --learn network, got --learn both"),
             (["--masks", "1000000"], "masks must be 1024 or fewer, got 1000000"),
             (["--refocus", "1000000"], "refocus must be 1024 or fewer, got 1000000"),

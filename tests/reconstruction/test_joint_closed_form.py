@@ -36,7 +36,7 @@ from kornia_tidy.reconstruction.closed_form import (
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.guided_classes import smoothed_classes
-from kornia_tidy.reconstruction.joint_closed_form import widened_for_depth
+from kornia_tidy.reconstruction.joint_closed_form import as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from tests.base import BaseTester
@@ -47,10 +47,11 @@ from tests.reconstruction.test_layered_joint import box_bank, scene
 LAYERS, CLASSES = 4, 7
 
 
-def joint(psfs=None, layers=LAYERS, dtype=torch.float32, *, trained=False, kind=NAFNet, **options):
+def joint(psfs=None, layers=LAYERS, dtype=torch.float32, *, trained=False, kind=NAFNet, refined=False, **options):
     torch.manual_seed(0)
     network = kind(closed_form_channels(layers, likelihood=True), CLASSES + 3, width=2)
-    head = JointClosedFormHead(network, layers, **options).eval().to(dtype)
+    refiner = kind(closed_form_channels(layers), 3, width=2) if refined else None
+    head = JointClosedFormHead(network, layers, refiner, **options).eval().to(dtype)
     head.closed_form.set_psfs(bank(layers, dtype=dtype) if psfs is None else psfs)
     if trained:
         generator = torch.Generator().manual_seed(1)
@@ -68,8 +69,9 @@ def blended(head, capture, noise):
 
 
 class TestJointClosedFormHead(BaseTester):
-    def test_smoke_begins_as_the_closed_forms(self):
-        head, capture = joint(), photo(20, 33, dtype=torch.float32)
+    @pytest.mark.parametrize("refined", [False, True])
+    def test_smoke_begins_as_the_closed_forms(self, refined):
+        head, capture = joint(refined=refined), photo(20, 33, dtype=torch.float32)
         with torch.no_grad():
             output = head(capture, 0.01)
             padded = functional.pad(capture, (7, 8, 6, 6), "reflect")
@@ -111,8 +113,26 @@ class TestJointClosedFormHead(BaseTester):
             expected = bilateral_filter(linear_rgb_to_rgb(single[:, 0].clamp(0, 1)), COLOR, WINDOW, SPACE)
         self.assert_close(image, expected, atol=1e-9, rtol=0)
 
-    def test_feature_no_gradient_of_the_image_reaches_the_depth(self):
-        head = joint(trained=True).train()
+    def test_feature_the_refiner_sees_the_image_in_place_of_the_restored_one(self):
+        """It adds to the image of the head without it, and leaves depth before the averages as it is."""
+        head, capture = joint(trained=True, refined=True).train(), photo(16, 16, dtype=torch.float32)
+        seen = []
+        head.refiner.register_forward_hook(lambda _, inputs, output: seen.append((*inputs, output)))
+        with torch.no_grad():
+            found = head(capture, 0.01)
+            refiner, head.refiner = head.refiner, None
+            image, restored = head(capture, 0.01), head.closed_form(capture, 0.01)
+        maps, added = seen[0]
+        assert torch.equal(found[:, :CLASSES], image[:, :CLASSES])
+        assert torch.equal(found[:, CLASSES:], image[:, CLASSES:] + added)
+        assert torch.equal(maps[:, 15:18], image[:, CLASSES:])
+        assert torch.equal(maps[:, :15], restored.maps[:, :15])
+        assert torch.equal(maps[:, 18:], restored.maps[:, 18 : refiner.in_channels])
+        assert added.any()
+
+    @pytest.mark.parametrize("refined", [False, True])
+    def test_feature_no_gradient_of_the_image_reaches_the_depth(self, refined):
+        head = joint(trained=True, refined=refined).train()
         logits = head.network.last.bias
         head(photo(16, 16, dtype=torch.float32), 0.01)[:, -3:].square().sum().backward()
         assert not logits.grad[:CLASSES].any()
@@ -166,8 +186,9 @@ class TestJointClosedFormHead(BaseTester):
         self.assert_close(smoothed_classes(*in_training.split([CLASSES, 3], 1)), before[:, :CLASSES])
         assert "temperature" in head.state_dict()
 
-    def test_feature_learns_image_and_depth_from_zero(self):
-        head = joint().train()
+    @pytest.mark.parametrize("refined", [False, True])
+    def test_feature_learns_image_and_depth_from_zero(self, refined):
+        head = joint(refined=refined).train()
         optimizer = torch.optim.Adam(head.parameters(), 1e-3)
         capture = photo(32, 32, dtype=torch.float32)
         for _ in range(3):
@@ -193,10 +214,10 @@ class TestJointClosedFormHead(BaseTester):
         assert type(head) is (JointClosedFormHead if closed_form else LayeredJointHead)
         assert head.out_channels == 5 + 3
 
-    @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
-    def test_feature_tiles_are_the_whole(self, kind):
+    @pytest.mark.parametrize(("kind", "refined"), [(NAFNet, False), (PlainHead, False), (PlainHead, True)])
+    def test_feature_tiles_are_the_whole(self, kind, refined):
         """Classes are averaged on a grid of 4 pixels, also behind a network without a grid of its own."""
-        head = JointHead(joint(trained=True, dtype=torch.float64, kind=kind)).eval()
+        head = JointHead(joint(trained=True, dtype=torch.float64, kind=kind, refined=refined)).eval()
         margin = receptive_field(head)
         image = photo(40, 2 * margin + 80)[:1]
         with torch.no_grad():
@@ -208,7 +229,8 @@ class TestJointClosedFormHead(BaseTester):
     @pytest.mark.slow
     def test_feature_onnx(self):
         capture = photo(18, 21, dtype=torch.float32)
-        assert len(check_onnx(JointHead(joint(layers=2, trained=True, kind=PlainHead)), capture, capture.flip(-1))) == 3
+        head = JointHead(joint(layers=2, trained=True, kind=PlainHead, refined=True))
+        assert len(check_onnx(head, capture, capture.flip(-1))) == 3
 
     def test_feature_half_precision_autocast_is_near(self):
         """Depth differs by a few roundings of 2^-9 of its logits."""
@@ -227,7 +249,7 @@ class TestJointClosedFormHead(BaseTester):
         image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
         for parameter in image.parameters():
             torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
-        head, capture = joint(kind=kind), photo(16, 16, dtype=torch.float32)
+        head, capture = joint(kind=kind, refined=True), photo(16, 16, dtype=torch.float32)
         head.load_state_dict(widened_for_depth(image.state_dict(), head))
         (_, begun), (_, trained) = (
             next(iter(head.network.named_parameters())),
@@ -239,6 +261,18 @@ class TestJointClosedFormHead(BaseTester):
             self.assert_close(head(capture, 0.01)[:, -3:], blended(head, capture, 0.01))
             self.assert_close(head.train()(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
 
+    @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
+    @pytest.mark.parametrize("layers", [0, LAYERS])
+    def test_feature_the_refiner_begins_as_a_network_for_the_image(self, kind, layers):
+        image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
+        for parameter in image.parameters():
+            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
+        head = joint(kind=kind, refined=True)
+        head.load_state_dict(head.state_dict() | as_refiner(image.state_dict(), head))
+        maps = torch.rand(1, closed_form_channels(LAYERS), 16, 16)
+        with torch.no_grad():
+            self.assert_close(head.refiner(maps), image.network(maps[:, : closed_form_channels(layers)]))
+
     def test_exception(self):
         with pytest.raises(ValueError, match="number of classes of network must be a whole number of at least 2"):
             JointClosedFormHead(NAFNet(closed_form_channels(2, likelihood=True), 4, width=2), 2)
@@ -246,3 +280,6 @@ class TestJointClosedFormHead(BaseTester):
             JointClosedFormHead(NAFNet(21, 8, width=2), 1)
         with pytest.raises(ValueError, match="the network must take 23 channels, got in_channels=3"):
             JointClosedFormHead(NAFNet(3, 8, width=2), 2)
+        network = NAFNet(closed_form_channels(2, likelihood=True), 8, width=2)
+        with pytest.raises(ValueError, match="refiner must have 21 input and 3 output channels, got 3 and 3"):
+            JointClosedFormHead(network, 2, NAFNet(3, 3, width=2))

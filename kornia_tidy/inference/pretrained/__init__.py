@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.inference.half_precision import halved
+from kornia_tidy.inference.eight_bits import in_eight_bits
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
@@ -83,8 +83,8 @@ def pretrained_record(name: str) -> dict[str, Any]:
     return {**{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}, **about["systems"][name]}
 
 
-def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, half: bool = True) -> None:
-    """Write a checkpoint for shipping: without the state of the run, the network's weights in half precision.
+def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, short: bool = True) -> None:
+    """Write a checkpoint for shipping: without the state of the run, the network's weights in eight bits.
 
     PSFs of a closed form are left out: :func:`~kornia_tidy.inference.trained.load_trained` computes them anew. So is
     the folder of the data, a place on one machine.
@@ -92,20 +92,20 @@ def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, ha
     Args:
         checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
         path: of the new file.
-        half: write the network's weights as float16, see :func:`~kornia_tidy.inference.half_precision.halved`. They
+        short: write the network's weights as :func:`~kornia_tidy.inference.eight_bits.in_eight_bits` rounds them. They
             are loaded as float32. False: they stay as they are.
 
     Raises:
-        ValueError: if it is no checkpoint, has no moving average, or a weight is beyond the range of float16.
+        ValueError: if it is no checkpoint, has no moving average, or a weight is not finite or too large.
     """
     state = read_state(checkpoint)
     wanted = ("optics.", "average.network.")
     weights = {name: value for name, value in state["state_dict"].items() if name.startswith(wanted)}
     if not any(name.startswith(wanted[1]) for name in weights):
         raise ValueError(f"{checkpoint} holds no moving average of its network: train it with ema above 0")
-    if half:
+    if short:
         parameters = load_trained(checkpoint).head.named_parameters()
-        weights = halved(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
+        weights = in_eight_bits(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
     weights |= {name: value[..., :0, :0] for name, value in weights.items() if name.endswith("closed_form.psfs")}
     settings = {name: None if name == "root" else value for name, value in state["settings"].items()}
     write_state(path, {"settings": settings, "global_step": state["global_step"], "state_dict": weights})
