@@ -30,11 +30,11 @@ from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
 from tests.benchmarks.results.report import page
 from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK, bilateral, restorations_for
 from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
-from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, perceptual_distance, ramp
+from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, perceptual_distance, ramp, score
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
 from tests.benchmarks.results.systems import WINDOW, System, available, from_checkpoint, of_trained
 from tests.benchmarks.results.table import Key, Results, paired
-from tests.benchmarks.results.verdicts import FIVE, ONE, REAL, recommendations, verdicts
+from tests.benchmarks.results.verdicts import FIVE, JOINT, ONE, REAL, recommendations, verdicts
 from tests.scenes import halves
 
 HERE = Provenance("2026-11-22", "0000000", "a test")
@@ -255,6 +255,18 @@ class TestScores(BaseTester):
         whole = blank * scores["depth_textureless"] ** 2 + (1 - blank) * scores["depth_textured"] ** 2
         assert scores["depth"] == pytest.approx(math.sqrt(whole))
 
+    def test_feature_the_surest_are_those_of_least_deviation(self):
+        """Three of ten columns are unsure and wrong; unknown pixels do not count."""
+        depth, deviation = torch.zeros(1, 1, 8, 10), torch.full((1, 1, 8, 10), 0.1)
+        estimate, known = depth + 0.05, torch.ones_like(depth, dtype=torch.bool)
+        estimate[..., 7:], deviation[..., 7:] = 0.9, 0.3
+        estimate[..., :2, :], known[..., :2, :] = 0.5, False
+        scene = self.scene(depth, known=known)
+        maps = {"image": scene.image, "depth": estimate, "deviation": deviation}
+        assert score(scene, maps)["depth_surest"] == pytest.approx(0.05, rel=1e-5)
+        del maps["deviation"]
+        assert "depth_surest" not in score(scene, maps)
+
     def test_feature_a_ramp_is_found_behind_holes(self):
         rows = torch.linspace(0, 1, 30)[:, None].expand(30, 20)
         known = torch.rand(1, 1, 30, 20) > 0.5
@@ -331,7 +343,13 @@ class TestResults(BaseTester):
                 (noise, FLAT, NETWORK): scored(scenes, 26.0),
                 (noise, FIVE, NETWORK): scored(scenes, 26.0 + gain),
             }
+        sure = scored(scenes, 26.0)
+        for name in scenes.names:
+            sure[name] |= {"depth_textured": 0.12, "depth_surest": 0.104}
+        scores[(FIXED[0], JOINT, NETWORK)] = sure
         found = {row.claim: row for row in verdicts(synthetic(scores, [scenes]))}
+        surest = found[f"{JOINT}, noise 0.002: depth RMSE over the 70 % of each scene that it is surest of"]
+        assert (surest.measured, surest.met) == ("0.104", False)
         met = {claim: row.met for claim, row in found.items()}
         assert [met[f"{FIVE}, noise {noise}: network over {TIKHONOV}"] for noise in FIXED] == [True, True, False]
         assert found[f"{FIVE}: network ahead of its best closed form"].measured == "9 of 9 scenes and noises"

@@ -22,12 +22,11 @@ from kornia_tidy.reconstruction.reliability import reliability_curve, sparsifica
 from tests.benchmarks.results.captures import FIXED, capture, irradiance
 from tests.benchmarks.results.restorations import takes_noise
 from tests.benchmarks.results.scenes import BenchScene, real_scenes
-from tests.benchmarks.results.scores import depth_scores
+from tests.benchmarks.results.scores import SURE, depth_scores, surest_error
 from tests.benchmarks.results.systems import System, available, from_checkpoint
 from tests.benchmarks.standard_error import mean_and_error
 
 SHIPPED = "joint-uncertain"
-SURE = 0.7  # part of a scene's known pixels, the surest
 
 
 @torch.no_grad()
@@ -55,8 +54,8 @@ def row(system: System, noise: str) -> str:
         scene = scenes.load(name)
         depth, deviation = estimate(system, scene, noise)
         scores = depth_scores(scene, depth)
-        surest = sparsification_curve(depth, deviation, scene.inverse_depth, scene.known, shares=(SURE,))
-        for key, value in zip(errors, (scores["depth_textured"], scores["depth"], float(surest)), strict=True):
+        surest = surest_error(scene, depth, deviation)
+        for key, value in zip(errors, (scores["depth_textured"], scores["depth"], surest), strict=True):
             errors[key].append(value)
         for part, maps in zip(parts, (depth, deviation, scene.inverse_depth), strict=True):
             part.append(maps[scene.known].view(1, 1, 1, -1))

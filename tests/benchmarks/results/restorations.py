@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.inference.tasks import MAPS, split_maps
+from kornia_tidy.inference.tasks import MAPS, depth_logits, split_maps
 from kornia_tidy.reconstruction import head
+from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.tikhonov import tikhonov
 from kornia_tidy.reconstruction.wiener import Wiener
 from tests.benchmarks.results.captures import Capture, encode
@@ -29,7 +30,8 @@ NETWORK = "network"
 
 @dataclass(frozen=True)
 class Restoration:
-    """From a capture to maps by name, ``"image"`` (sRGB in [0, 1]) and ``"depth"`` (normalised inverse depth)."""
+    """From a capture to maps by name, ``"image"`` (sRGB in [0, 1]) and ``"depth"`` (normalised inverse depth); of networks that tell how sure
+    they are of it its standard deviation, ``"deviation"``."""
 
     restore: Callable[[Capture, Settings], Mapping[str, Tensor]]
     grid: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -153,7 +155,10 @@ def _estimate(capture: Capture, factor: float) -> dict[str, Tensor]:
     assert system.task is not None
     if (NETWORK, factor) not in capture.estimates:
         told = {"noise": factor * capture.noise} if takes_noise(system) else {}
-        maps = split_maps(system.task, system.head(capture.image, **told).float())
+        output = system.head(capture.image, **told).float()
+        maps = split_maps(system.task, output)
+        if (logits := depth_logits(system.task, output)) is not None:
+            maps["deviation"] = depth_moments(logits)[1]
         capture.estimates[NETWORK, factor] = {name: value.clamp(0, 1) for name, value in maps.items()}
     return capture.estimates[NETWORK, factor]
 

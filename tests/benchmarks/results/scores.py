@@ -13,10 +13,12 @@ from kornia.filters import box_blur
 from torch import Tensor
 
 from kornia_tidy.reconstruction.metrics import chroma_psnr, psnr, rmse, ssim
+from kornia_tidy.reconstruction.reliability import sparsification_curve
 from tests.benchmarks.results.scenes import BenchScene
 
 CONTRAST, NEIGHBOURHOOD = 0.01, 9  # standard deviation of the luma above which a pixel is textured; side in pixels
 PERCEPTUAL_WEIGHTS = "alexnet-owt-7be5be79.pth"  # which torchvision would download
+SURE = 0.7  # part of a scene's known pixels, the surest
 Scores = dict[str, float]
 
 
@@ -27,6 +29,8 @@ def score(scene: BenchScene, maps: Mapping[str, Tensor]) -> Scores:
         scores |= image_scores(scene, maps["image"])
     if "depth" in maps:
         scores |= depth_scores(scene, maps["depth"])
+    if "deviation" in maps:
+        scores["depth_surest"] = surest_error(scene, maps["depth"], maps["deviation"])
     return scores
 
 
@@ -48,6 +52,11 @@ def depth_scores(scene: BenchScene, inverse_depth: Tensor) -> Scores:
     blank = parts["_textureless"]
     bias = (inverse_depth - scene.inverse_depth)[blank].mean()  # NaN where nothing is textureless
     return {**scores, "depth_bias_textureless": float(bias)}
+
+
+def surest_error(scene: BenchScene, inverse_depth: Tensor, deviation: Tensor) -> float:
+    """Return the RMSE of depth, in parts of the range, over the 70 % of known pixels of least deviation."""
+    return float(sparsification_curve(inverse_depth, deviation, scene.inverse_depth, scene.known, shares=(SURE,)))
 
 
 def local_contrast(image: Tensor) -> Tensor:

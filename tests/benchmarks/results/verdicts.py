@@ -14,6 +14,7 @@ from kornia_tidy.sensor.exposure import electrons_at
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, REFERENCE_F_NUMBER
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
 from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK
+from tests.benchmarks.results.scores import SURE
 from tests.benchmarks.results.table import Difference, Key, Results
 
 REAL = "real"
@@ -24,6 +25,7 @@ SSIM_GAIN, CHROMA_GAIN, MASKS_GAIN = 0.04, 1.5, 1.2
 WRONG_NOISE_LOSS = 0.3  # dB
 CODED_GAINS = {"57000e": 1.5, "10000e": 0.5}  # dB of coded over flat, both with networks
 TEXTURED_GAIN = 0.35  # of the RMSE of the best ramp
+SUREST_ERROR = 0.10  # of the range
 LAYERED_GAIN = 2.0  # dB of the joint network over the inversion by its own depth
 
 
@@ -177,6 +179,14 @@ def _joint(results: Results) -> Iterator[Verdict]:
         f"{100 * below:.0f} % ({error:.3f}, {of_ramp:.3f})" if known else "not measured",
         f"at least {100 * TEXTURED_GAIN:.0f} %",
         below >= TEXTURED_GAIN if known else None,
+    )
+    surest = results.mean(ours, "depth_surest")
+    known = math.isfinite(surest)
+    yield Verdict(
+        f"{JOINT}, noise {FIXED[0]}: depth RMSE over the {100 * SURE:.0f} % of each scene that it is surest of",
+        f"{surest:.3f}" if known else "not measured",
+        f"at most {SUREST_ERROR:.2f}",
+        surest <= SUREST_ERROR if known else None,
     )
 
 
