@@ -256,10 +256,10 @@ class TestScores(BaseTester):
         assert scores["depth"] == pytest.approx(math.sqrt(whole))
 
     def test_feature_the_surest_are_those_of_least_deviation(self):
-        """Three of ten columns are unsure and wrong; unknown pixels do not count."""
-        depth, deviation = torch.zeros(1, 1, 8, 10), torch.full((1, 1, 8, 10), 0.1)
+        """Six of twenty columns are unsure and wrong; unknown pixels do not count."""
+        depth, deviation = torch.zeros(1, 1, 12, 20), torch.full((1, 1, 12, 20), 0.1)
         estimate, known = depth + 0.05, torch.ones_like(depth, dtype=torch.bool)
-        estimate[..., 7:], deviation[..., 7:] = 0.9, 0.3
+        estimate[..., 14:], deviation[..., 14:] = 0.9, 0.3
         estimate[..., :2, :], known[..., :2, :] = 0.5, False
         scene = self.scene(depth, known=known)
         maps = {"image": scene.image, "depth": estimate, "deviation": deviation}

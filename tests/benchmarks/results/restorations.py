@@ -30,8 +30,8 @@ NETWORK = "network"
 
 @dataclass(frozen=True)
 class Restoration:
-    """From a capture to maps by name, ``"image"`` (sRGB in [0, 1]) and ``"depth"`` (normalised inverse depth); of networks that tell how sure
-    they are of it its standard deviation, ``"deviation"``."""
+    """From a capture to maps by name: ``"image"``, sRGB in [0, 1]; ``"depth"``, normalised inverse depth; and, of a
+    network that tells how sure it is of depth, its standard deviation ``"deviation"``."""
 
     restore: Callable[[Capture, Settings], Mapping[str, Tensor]]
     grid: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
