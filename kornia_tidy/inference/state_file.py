@@ -103,7 +103,7 @@ def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     if not isinstance(value, dict):
         return value
     if _SCALE in value:
-        return EightBits(tensors[value[_TENSOR]], tensors[value[_SCALE]]).weight()
+        return _weight(EightBits(tensors[value[_TENSOR]], tensors[value[_SCALE]]))
     if _TENSOR in value:
         return tensors[value[_TENSOR]]
     if _TUPLE in value:
@@ -111,3 +111,12 @@ def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     if _PAIRS in value:
         return {key: _decode(entry, tensors) for key, entry in value[_PAIRS]}
     return {key: _decode(entry, tensors) for key, entry in value.items()}
+
+
+def _weight(stored: EightBits) -> Tensor:
+    shape = tuple(stored.values.shape)
+    if tuple(stored.scale.shape) != (*shape[:1], *[1] * (len(shape) - 1)):
+        raise ValueError(f"a scale of {tuple(stored.scale.shape)} does not fit a weight of {shape}")
+    if (stored.values.dtype, stored.scale.dtype) != (torch.int8, torch.float32):
+        raise ValueError(f"a weight in eight bits is {stored.values.dtype} with a scale of {stored.scale.dtype}")
+    return stored.weight()

@@ -81,6 +81,8 @@ def train(
         ValueError: if the folder holds another run, one is at work in it, or a checkpoint or the data cannot be used.
         OSError: if the disk is full; the last checkpoint is then intact.
     """
+    if refiner_from is not None and not settings.refined:
+        raise ValueError("a network begins the refiner of refined, which is not asked for")
     folder = Path(folder)
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
     if folder.exists() and not folder.is_dir():
@@ -133,8 +135,6 @@ def _train(
         load_masks(masks_from, module.optics)
         module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)
         module.settings = module.settings.replace(window=fix_window(module.optics).window)
-    if refiner_from is not None and not settings.refined:
-        raise ValueError("a network begins the refiner of refined, which is not asked for")
     if (head_from is not None or refiner_from is not None) and checkpoint is None:
         if head_from is not None:
             _begin_network(head_from, module.head)

@@ -50,6 +50,21 @@ class TestEightBits(BaseTester):
         assert found.dtype == torch.float32
         assert torch.equal(found, rounded["a"].weight())
 
+    @pytest.mark.parametrize(
+        ("values", "scale", "sentence"),
+        [
+            (torch.zeros(4, 1, 1, 1, dtype=torch.int8), torch.ones(5, 1, 1, 1), "does not fit a weight of"),
+            (torch.zeros(1, 9, 1, 1, dtype=torch.int8), torch.ones(9, 1, 1, 1), "does not fit a weight of"),
+            (torch.zeros(4, 1, 1, 1, dtype=torch.int8), torch.ones(4), "does not fit a weight of"),
+            (torch.zeros(4, 1, 1, 1), torch.ones(4, 1, 1, 1), "eight bits is torch.float32"),
+        ],
+    )
+    def test_exception_a_damaged_file(self, values, scale, sentence, tmp_path):
+        """None is spread over a larger weight than the file holds."""
+        write_state(tmp_path / "a", {"a": EightBits(values, scale)})
+        with pytest.raises(ValueError, match=sentence):
+            read_state(tmp_path / "a")
+
     @pytest.mark.parametrize("value", [torch.nan, torch.inf])
     def test_exception_not_finite(self, value):
         with pytest.raises(ValueError, match="first is not finite"):
