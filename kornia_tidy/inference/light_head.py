@@ -18,7 +18,8 @@ from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.closed_form import ClosedForm, whole_picture
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
-from kornia_tidy.reconstruction.tiled import reconstruct_tiled, shared_copy
+from kornia_tidy.reconstruction.receptive_field import receptive_field
+from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, reconstruct_tiled, shared_copy
 from kornia_tidy.sensor.noise import SensorNoise
 
 
@@ -116,6 +117,7 @@ def reconstruct_light(
     light: Tensor,
     *,
     memory_budget: int = 512 << 20,
+    overlap: int | None = OVERLAP,
     progress: Callable[[int, int], object] | None = None,
 ) -> Reconstruction | UncertainReconstruction:
     """Reconstruct image and depth from a capture of any size, and the uncertainty of depth if the network tells it.
@@ -124,7 +126,10 @@ def reconstruct_light(
         head: a trained network.
         light: (3, H, W) or (1, H, W), linear light of the camera that the network was trained for, in the orientation
             of the sensor and of the PSFs; black is 0, saturation 1.
-        memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
+        memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`. A capture that fits is one tile.
+        overlap: pixels of a tile that are discarded at each cut, if the receptive field reaches farther. With 128,
+            tiles of the shipped networks are within 1e-3 of full scale of the whole; these reach as far as 450 pixels.
+            None: the receptive field, for an exact result, which takes many times as long within little memory.
         progress: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
 
     Raises:
@@ -136,7 +141,10 @@ def reconstruct_light(
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
     colours = light.expand(3, -1, -1)[None]
     with whole_picture(head, colours):
-        maps: Any = reconstruct_tiled(head, colours, memory_budget=memory_budget, progress=progress)
+        check_seamless(head)  # which does not know of stray light
+        reach = receptive_field(head)
+        cut = None if overlap is None or overlap >= reach else overlap
+        maps: Any = reconstruct_tiled(head, colours, overlap=cut, memory_budget=memory_budget, progress=progress)
     names = [*MAPS[head.task], *(["deviation"] if head.uncertain else [])]
     named = {name: part[0].float() for name, part in zip(names, maps, strict=True)}
     image, near = named.get("image"), named.get("depth")

@@ -24,6 +24,9 @@ from kornia_tidy.reconstruction.receptive_field import (
 from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
 
+OVERLAP = (
+    128  # px at each cut of shipped networks, whose receptive fields reach 220 to 450 px: within 1e-3 of full scale
+)
 SEAM = 1e-4  # largest difference, relative to the largest output
 _COUNTED_ON = 128  # px; sides of the tile on which memory is counted
 
@@ -102,7 +105,7 @@ def _in_tiles(
     progress: Callable[[int, int], object] | None,
 ) -> Any:
     if overlap is None:
-        _check_seamless(head)
+        check_seamless(head)
         overlap = receptive_field(head)
     grid = TileGrid((image.shape[-2], image.shape[-1]), total_stride(head), overlap)
     like = next(head.parameters(), image)
@@ -190,11 +193,12 @@ def _sides_that_fit(head: nn.Module, grid: TileGrid, like: Tensor, memory_budget
     return sides
 
 
-def _check_seamless(head: nn.Module) -> None:
+def check_seamless(head: nn.Module) -> None:
     """Raise ``ValueError`` unless tiles of a noise image give the result of the whole image.
 
-    Its sides are no multiples of the stride. This finds dependence on position and other paddings, which the receptive
-    field does not show. It is computed in float64: networks that decide between depths round to 3e-4 in float32.
+    It is done once for a network. The sides of the image are no multiples of the stride. This finds dependence on
+    position and other paddings, which the receptive field does not show. It is computed in float64: networks that
+    decide between depths round to 3e-4 in float32.
     """
     if head in _seamless:
         return

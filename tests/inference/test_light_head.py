@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from kornia.color import linear_rgb_to_rgb
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import nn
 
+from kornia_tidy.data import DeadLeaves
 from kornia_tidy.inference.light_head import (
     LightHead,
     UncertainReconstruction,
@@ -19,6 +20,7 @@ from kornia_tidy.inference.light_head import (
     reconstruct_opencv,
     with_noise_of,
 )
+from kornia_tidy.inference.pretrained import load_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.tasks import channels_of
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics, update_psfs
@@ -132,6 +134,42 @@ class TestReconstructLight(BaseTester):
         self.assert_close(found.image, whole, atol=12.92 * 5 * 10 * 2**-24, rtol=0)
         dark = head(optics.encode(light[None, ..., :60]))[0]
         assert (dark - whole[..., :60])[..., :30].abs().max() > 0.01
+
+    def test_feature_an_overlap_below_the_receptive_field_is_not_exact(self):
+        settings = SystemSettings(task="edof", masks=1, window=9, head="nafnet", width=2)
+        optics, head = build_optics(settings), build_head(settings)
+        for parameter in head.parameters():
+            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
+        light_head = LightHead(TrainedSystem(optics, head, settings, 0))
+        reach, light = receptive_field(light_head), torch.rand(3, 40, 900)
+
+        def image(overlap, budget):
+            seen = []
+            options = {"memory_budget": budget, "progress": lambda *counts: seen.append(counts)}
+            return reconstruct_light(light_head, light, overlap=overlap, **options).image, len(seen)
+
+        whole, count = image(None, 1 << 30)
+        assert count == 1
+        small = 4 << 20
+        (exact, many), (also, _), (near, few) = image(None, small), image(reach, small), image(16, small)
+        assert min(many, few) > 1
+        assert torch.equal(also, exact)
+        self.assert_close(exact, whole)
+        assert not torch.allclose(near, whole, atol=1e-6)
+        self.assert_close(near[..., :16], whole[..., :16])
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", ["edof-5", "joint-uncertain"])
+    def test_feature_tiles_of_shipped_networks_are_near_the_whole(self, name):
+        system = load_pretrained(name)
+        head, (image, depth, _) = LightHead(system), DeadLeaves(1, 900, 600, seed=1).read(0)
+        with torch.no_grad():
+            capture = rgb_to_linear_rgb(system.optics(image[None], depth[None]))[0]
+        seen = []
+        found = reconstruct_light(head, capture, progress=lambda *counts: seen.append(counts))
+        whole = reconstruct_light(head, capture, memory_budget=4 << 30)
+        assert len(seen) > 1
+        assert (found.image - whole.image).abs().max() < 1e-3
 
     def test_feature_pictures_at_the_same_time_have_copies_with_their_own_noise_and_stray_light(self, monkeypatch):
         settings = SystemSettings(masks=1, window=9, stray_light="veil", head="tikhonov-bilateral")
