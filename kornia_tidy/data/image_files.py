@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
@@ -34,7 +35,8 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is no image, cut short or damaged, or has other channels, types or floats outside [0, 1].
+        ValueError: if it is no image, cut short or damaged, has other channels, types or floats outside [0, 1],
+            or needs more memory than there is.
 
     Convention:
         Alpha is dropped. The orientation in EXIF is ignored: a depth map of the same camera has none, and calibrations
@@ -47,7 +49,14 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ...     read_image(f"{folder}/grey.png")
         tensor([[[0.0000, 0.2000, 1.0000]]])
     """
-    stored = read_stored(path)
+    try:
+        return _as_image(read_stored(path), path)
+    except MemoryError as error:  # of the floats, which take up to four times the memory of the stored pixels
+        raise ValueError(f"cannot read {path}: it needs more memory than there is") from error
+
+
+def _as_image(stored: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
+    """Return stored pixels (H, W, C) as floats in [0, 1], (C, H, W)."""
     channels = stored.shape[2]
     if channels not in {1, 3}:
         raise ValueError(f"cannot read {path}: an image has 1, 3 or 4 channels, this has {channels}")

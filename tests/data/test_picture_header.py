@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kornia_tidy.data import image_files
 from kornia_tidy.data.image_files import read_image
 from kornia_tidy.data.picture_header import LARGEST, VARIABLE, check_header, check_pixels
 from tests.base import BaseTester
@@ -144,3 +145,15 @@ class TestCheckPixels(BaseTester):
                 read_image(tmp_path / "bomb.png")
 
         assert wait(fork(child)) == 0
+
+    def test_exception_floats_that_do_not_fit_the_memory(self, tmp_path, monkeypatch):
+        """The stored pixels may, and the four times larger floats not."""
+
+        def full(*_):
+            raise MemoryError
+
+        (tmp_path / "a.png").write_bytes(png_of(2, 2, zlib.compress(bytes(6))))
+        assert read_image(tmp_path / "a.png").shape[1:] == (2, 2)
+        monkeypatch.setattr(image_files, "_as_image", full)
+        with pytest.raises(ValueError, match=r"a\.png: it needs more memory than there is"):
+            read_image(tmp_path / "a.png")
