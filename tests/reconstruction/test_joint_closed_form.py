@@ -61,6 +61,14 @@ def joint(psfs=None, layers=LAYERS, dtype=torch.float32, *, trained=False, kind=
     return head
 
 
+def image_head(kind, layers):
+    """Return a network for the image with weights other than zero."""
+    head = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
+    for parameter in head.parameters():
+        torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
+    return head
+
+
 def blended(head, capture, noise):
     """Return the deconvolved depths blended by the likelihood of the classes in closed form, and smoothed."""
     layers = head.closed_form(capture, noise).layers
@@ -246,9 +254,7 @@ class TestJointClosedFormHead(BaseTester):
     @pytest.mark.parametrize("layers", [0, LAYERS])
     def test_feature_begins_as_a_network_for_the_image(self, kind, layers):
         """With as many depths it sees the same in its first convolution; image and depth are the closed forms'."""
-        image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
-        for parameter in image.parameters():
-            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
+        image = image_head(kind, layers)
         head, capture = joint(kind=kind, refined=True), photo(16, 16, dtype=torch.float32)
         head.load_state_dict(widened_for_depth(image.state_dict(), head))
         (_, begun), (_, trained) = (
@@ -264,9 +270,7 @@ class TestJointClosedFormHead(BaseTester):
     @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
     @pytest.mark.parametrize("layers", [0, LAYERS])
     def test_feature_the_refiner_begins_as_a_network_for_the_image(self, kind, layers):
-        image = ClosedFormHead(kind(closed_form_channels(layers), 3, width=2), layers).eval()
-        for parameter in image.parameters():
-            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(2))
+        image = image_head(kind, layers)
         head = joint(kind=kind, refined=True)
         head.load_state_dict(head.state_dict() | as_refiner(image.state_dict(), head))
         maps = torch.rand(1, closed_form_channels(LAYERS), 16, 16)
