@@ -142,7 +142,8 @@ def add_parser(subparsers: Any) -> None:
         system,
         "loss",
         choices=tuple(LOSSES),
-        help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes; charbonnier: smooth l1",
+        help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes; charbonnier: smooth l1; "
+        "psnr-ssim: decibels of the error and of SSIM, for images",
     )
     _setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
     _setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import kornia
 from torch import Tensor
 
 from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
+from kornia_tidy.reconstruction.metrics import SSIM_WINDOW
 from kornia_tidy.reconstruction.validity import valid_maps
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 """From prediction (B, C, H, W), target (B, C, H, W) and validity mask, bool (B, 1, H, W) or None, to a scalar."""
 
 CHARBONNIER_EPSILON = 1e-3
+LEAST_MSE = 1e-5  # 50 dB: above it blank images gain little
+SSIM_WEIGHT = 20.0  # dB of PSNR that weigh as much as a unit of SSIM
 
 
 def charbonnier_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -44,13 +48,45 @@ def charbonnier_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = N
     return (error * mask).sum() / mask.sum().clamp(min=1)
 
 
-# That of TiDy-PSFs, of Ikoma et al. for depth, of PhaseCam3D for depth, and of restoration networks; each is applied to
-# every map of a task.
+def psnr_ssim_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""Return what restored images are judged by, as a loss: the negative PSNR, and structural dissimilarity.
+
+    .. math:: L = 10 \log_{10}(\mathrm{MSE} + 10^{-5}) + 20 \, (1 - \mathrm{SSIM})
+
+    An absolute or squared error is that of the few images with most of it; this is a mean over images of decibels, in
+    which a smooth image counts as much as a textured one.
+
+    Args:
+        prediction: (B, C, H, W), in [0, 1], at least 11 pixels a side.
+        target: (B, C, H, W); anything, NaN included, where the mask is False.
+        mask: bool (B, 1, H, W), True where the target is known. None: everywhere. Both maps are taken for equal where
+            it is not.
+
+    Returns:
+        A scalar, the mean over images.
+
+    Source: Chen et al., Simple Baselines for Image Restoration (ECCV 2022), whose loss is the PSNR; Zhao et al., Loss
+    Functions for Image Restoration With Neural Networks (IEEE TCI 2017), for the SSIM beside it.
+
+    Example:
+        >>> import torch
+        >>> psnr_ssim_loss(torch.full((1, 3, 16, 16), 0.5), torch.full((1, 3, 16, 16), 0.5))
+        tensor(-50.)
+    """
+    prediction, target, mask = valid_maps(prediction, target, mask)
+    squared = ((prediction - target).square() * mask).sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp(min=1)
+    similar = kornia.metrics.ssim(prediction, target, SSIM_WINDOW, eps=0.0, padding="valid").mean((1, 2, 3))
+    return (10 * (squared + LEAST_MSE).log10() + SSIM_WEIGHT * (1 - similar)).mean()
+
+
+# That of TiDy-PSFs, of Ikoma et al. for depth, of PhaseCam3D for depth, and two of restoration networks. Each is
+# applied to every map of a task.
 LOSSES: dict[str, Loss] = {
     "mse": mse_loss,
     "l1": l1_loss,
     "phasecam3d": phasecam3d_loss,
     "charbonnier": charbonnier_loss,
+    "psnr-ssim": psnr_ssim_loss,
 }
 
 

@@ -26,6 +26,7 @@ from kornia_tidy.inference.tasks import (
 )
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.depth_distribution import distribution_loss
+from kornia_tidy.reconstruction.metrics import psnr, ssim
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
 from kornia_tidy.training.settings import JOINT_RUN, NETWORK_RUN, TrainingSettings, usual_settings
@@ -99,9 +100,9 @@ class TestTasks(BaseTester):
 
     @pytest.mark.parametrize("name", LOSSES)
     def test_feature_masked_pixels_have_no_part_in_loss_and_gradient(self, name):
-        prediction = torch.rand(2, 1, 4, 4, requires_grad=True)
-        target = torch.rand(2, 1, 4, 4)
-        mask = torch.rand(2, 1, 4, 4) > 0.3
+        prediction = torch.rand(2, 1, 12, 12, requires_grad=True)
+        target = torch.rand(2, 1, 12, 12)
+        mask = torch.rand(2, 1, 12, 12) > 0.3
         target[~mask] = float("nan")
         loss = task_loss(LOSSES[name], {"depth": prediction}, {"depth": target}, mask, {"depth": 1.0})
         loss.backward()
@@ -112,6 +113,15 @@ class TestTasks(BaseTester):
         assert loss.isfinite()
         assert (prediction.grad[~mask] == 0).all()
         assert (prediction.grad[mask] != 0).any()
+
+    def test_feature_decibels_of_error_and_similarity_count_each_image_alike(self):
+        truth = torch.rand(3, 3, 16, 16, dtype=torch.float64)
+        estimate = truth + torch.tensor([0.3, 0.03, 0.003]).view(3, 1, 1, 1) * torch.randn_like(truth)
+        each = [LOSSES["psnr-ssim"](estimate[i : i + 1], truth[i : i + 1], None) for i in range(3)]
+        self.assert_close(LOSSES["psnr-ssim"](estimate, truth, None), torch.stack(each).mean())
+        expected = -psnr(estimate, truth) + 20 * (1 - ssim(estimate, truth))
+        self.assert_close(torch.stack(each[:2]), expected[:2], atol=0.1, rtol=0)  # 1e-5 is added to the squared error
+        assert each[2] > expected[2]
 
     def test_feature_a_batch_in_a_hole_teaches_nothing_about_depth(self):
         output, truth = torch.rand(1, 4, 2, 2, requires_grad=True), torch.full((1, 1, 2, 2), float("nan"))
@@ -235,7 +245,7 @@ class TestSettings(BaseTester):
             ({"masks": -1}, "masks must be a whole number of at least 0, got -1"),
             ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
             ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
-            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', got 'ssim'"),
+            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', 'psnr-ssim', got 'ssim'"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
