@@ -17,7 +17,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--dtype", default=os.environ.get("KORNIA_TEST_DTYPE", "float32,float64"), help="comma list or all"
     )
-    parser.addoption("--runslow", action="store_true", help="run tests marked slow")
+    parser.addoption("--runslow", action="store_true", help="run tests marked slow or takes_seconds too")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -34,8 +34,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--runslow"):
         for item in items:
-            if "slow" in item.keywords:
-                item.add_marker(pytest.mark.skip(reason="slow: run with --runslow"))
+            for mark in ("slow", "takes_seconds"):
+                if mark in item.keywords:
+                    item.add_marker(pytest.mark.skip(reason=f"{mark}: run with --runslow"))
 
 
 @pytest.fixture(autouse=True)

@@ -267,6 +267,7 @@ def run(factor: Factor, machine: Machine, tests: tuple[str, ...]) -> Outcome:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", f"--junitxml={report}", "-p"]
         command += ["no:cacheprovider", f"--numprocesses={min(8, processes)}", "--dist=loadfile"]
+        command += ["--runslow", "-m", "not slow"]  # those that take seconds too
         # Missing compiled code or threads are intended here and no warning.
         command += ["-W", "ignore:compiled code", "-k", "not onnx", *drop_nested(tests)]  # ONNX has its own runtime
         status = subprocess.run(command, env=environment(factor.environment), cwd=ROOT, check=False).returncode

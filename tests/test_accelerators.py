@@ -211,6 +211,7 @@ class TestChecks(BaseTester):
 class TestCounts:
     """Bounds that hold for any scene; the benchmark prints the counts at full size."""
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(("compositing", "launches"), [("gather", 200), ("scatter", 200), ("occlusion", 300)])
     @pytest.mark.parametrize("fixed", [False, True])
     def test_feature_a_training_step_launches_little_and_waits_once(self, compositing, launches, fixed):

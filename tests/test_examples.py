@@ -60,6 +60,7 @@ class TestStartNotebook(BaseTester):
         notebook = json.loads((EXAMPLES / "start.ipynb").read_text(encoding="utf-8"))
         return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
 
+    @pytest.mark.takes_seconds
     def test_feature_its_cells_run_in_their_order_and_show_what_they_say(self, cells, capsys):
         pyplot = pytest.importorskip("matplotlib.pyplot")
         pyplot.switch_backend("agg")  # draws no window
@@ -122,6 +123,7 @@ class TestDataLoaderTransform(BaseTester):
 
 @pytest.mark.parametrize("example", ["learn_point_psf"], indirect=True)
 class TestLearnPointPSF(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_learnt_masks_beat_a_plain_lens(self, example, tmp_path):
         lens = example.TiDyOptics(example.PixelwiseMask(1, initial="flat"), fidelity=example.FIDELITY)
         plain = float(example.point_error(lens).detach())
@@ -149,6 +151,7 @@ class TestNonconvexPSFs(BaseTester):
 
 @pytest.mark.parametrize("example", ["mask_families"], indirect=True)
 class TestMaskFamilies(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_every_family_learns_both_tasks(self, example, capsys):
         histories = example.main(["--trials", "2", "--iterations", "25"])
         assert len(histories) == 2 * len(example.FAMILIES) >= 12
@@ -167,6 +170,7 @@ class TestMaskFamilies(BaseTester):
 
 @pytest.mark.parametrize("example", ["learn_with_switching"], indirect=True)
 class TestLearnWithSwitching(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("between", ["exponential", "random"])
     def test_feature_masks_that_know_of_switching_lose_less(self, example, between, tmp_path):
         few = ["--masks", "3", "--trials", "1", "--iterations", "60", "--output", str(tmp_path)]
@@ -194,6 +198,7 @@ class TestTimeAverageOrBurst(BaseTester):
 
 @pytest.mark.parametrize("example", ["design_masks"], indirect=True)
 class TestDesignMasks(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_each_design_is_the_best_at_its_task(self, example, tmp_path, monkeypatch):
         monkeypatch.setattr(example, "FIDELITY", example.FIDELITY.replace(layer_spacing=2.0))
         scores = example.main(["--iterations", "60", "--output", str(tmp_path)])
@@ -204,6 +209,7 @@ class TestDesignMasks(BaseTester):
 
 @pytest.mark.parametrize("example", ["motion_blur"], indirect=True)
 class TestMotionBlur(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_only_masks_that_change_tell_right_from_left(self, example, tmp_path):
         few = ["--masks", "3", "--pixels", "8", "--size", "112", "--iterations", "30", "--output", str(tmp_path)]
         one, random, learnt = (apart for apart, _ in example.main(few).values())
@@ -214,6 +220,7 @@ class TestMotionBlur(BaseTester):
 
 @pytest.mark.parametrize("example", ["plain_training_loop"], indirect=True)
 class TestPlainTrainingLoop(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_the_loss_falls_in_under_forty_lines(self, example, capsys):
         losses = example.main(["--steps", "30"])
         assert len(losses) == 30
@@ -226,6 +233,7 @@ class TestPlainTrainingLoop(BaseTester):
 @pytest.mark.filterwarnings("ignore:.*smaller than the logging interval")
 @pytest.mark.parametrize("example", ["lightning_training"], indirect=True)
 class TestLightningTraining(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_a_network_of_ones_own_is_trained_saved_and_used(self, example, tmp_path):
         pytest.importorskip("lightning.pytorch")
         error = example.main(["--epochs", "2", "--scenes", "8", "--size", "48", "--output", str(tmp_path)])
@@ -235,6 +243,7 @@ class TestLightningTraining(BaseTester):
 
 @pytest.mark.parametrize("example", ["train_on_rendered"], indirect=True)
 class TestTrainOnRendered(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_the_loss_falls_and_captures_are_made_once(self, example, tmp_path, capsys):
         few = ["--scenes", "8", "--size", "64", "--epochs", "6", "--output", str(tmp_path)]
         losses = example.main(few)

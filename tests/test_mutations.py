@@ -48,6 +48,7 @@ class TestMutations(BaseTester):
             outcome = run(case, prepare(case, case.source.read_bytes(), folder), folder)
             assert (outcome.status, outcome.faults) == (0, ()), outcome.told
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("kind", KINDS)
     def test_feature_damaged_files_are_read_or_refused_in_one_sentence(self, kind, cases, tmp_path):
         for number in range(3):
@@ -68,6 +69,7 @@ class TestReaders(BaseTester):
                 if kind != "weights":  # those of a network of 21 million numbers are no small file
                     case.command(case.source)
 
+    @pytest.mark.takes_seconds
     def test_feature_damaged_files_are_read_or_refused_in_a_sentence(self, readers, tmp_path):
         quick = [kind for kind in readers if SHARES.get(kind, 1) >= 1]
         for kind, count in shared_out(100, quick).items():

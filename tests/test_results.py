@@ -410,6 +410,7 @@ class TestStore(BaseTester):
 
 
 class TestMeasurement(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_an_interrupted_run_goes_on_to_the_same_results(self, tmp_path, monkeypatch):
         scenes, make = dead_leaves(3, 66), available()[FLAT]
 

@@ -139,6 +139,7 @@ class TestOwnCamera(BaseTester):
 
 @pytest.mark.filterwarnings("ignore:.*beyond the camera's range:UserWarning")
 class TestScript(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("kind", EVERY_KIND)
     def test_feature_it_runs_and_gives_the_same_capture(self, kind, folder):
         result = take_picture(Settings(**{**SMALL, **EVERY_KIND[kind]}))
@@ -163,6 +164,7 @@ class TestScript(BaseTester):
         (folder / "capture.py").write_text(as_python(result), encoding="utf-8")
         assert torch.equal(runpy.run_path("capture.py")["capture"], result.capture)
 
+    @pytest.mark.takes_seconds
     def test_feature_every_setting_changes_the_script_or_is_without_effect(self, folder):
         """Of the own camera and a painted scene; the controls of files are those of the test above."""
         base = Settings(camera="own", start="noise", masks=2, **SMALL)

@@ -162,6 +162,7 @@ class TestReconstruct(BaseTester):
         rgb = kornia_tidy.reconstruct(np.ascontiguousarray(capture[..., ::-1]), head, color="rgb").image
         assert (bgr == rgb[..., ::-1]).all()
 
+    @pytest.mark.takes_seconds
     def test_feature_a_system_without_depth(self):
         image, depth = kornia_tidy.reconstruct(picture("uint8", 32, 48, 3), load_pretrained("edof-1"))
         assert depth is None

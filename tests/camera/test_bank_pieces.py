@@ -115,6 +115,7 @@ class TestPiecesFor(BaseTester):
             assert pieces.remembered == (601 * psfs <= budget // 2)
             assert 2 <= pieces.most_layers <= budget // 2 // (psfs + work)
 
+    @pytest.mark.takes_seconds
     @torch.no_grad()
     def test_feature_a_fast_lens_with_masks_keeps_to_its_budget(self):
         image, budget = torch.rand(1, 1, 48, 64), 24 << 20

@@ -217,6 +217,7 @@ def faults(pairs: list[tuple[Setting, ...]]) -> list[str]:
 
 
 class TestHostilePairs(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_each_extreme_alone_is_exact_or_refused(self):
         assert not faults([(setting,) for setting in SETTINGS])
 

@@ -40,6 +40,7 @@ def images(batches: list[dict[str, Any]], transform: str) -> torch.Tensor:
 
 @pytest.mark.parametrize(("workers", "context"), LOADERS)
 class TestDataLoader(BaseTester):
+    @pytest.mark.takes_seconds
     def test_smoke(self, workers, context):
         batch = load(workers, context)[1]["learnable"]
         assert batch["image"].shape == batch["all_in_focus"].shape == (2, 3, 64, 64)

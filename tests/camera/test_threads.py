@@ -131,6 +131,7 @@ def wrong_captures(count: int, show: Callable[[TiDyOptics, int], None], **option
 
 
 class TestThreads(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("way", WAYS)
     def test_feature_hundreds_of_captures_are_those_of_masks_at_one_moment(self, way):
         assert wrong_captures(160, WAYS[way]) == 0

@@ -56,6 +56,7 @@ class TestRenderScenes(BaseTester):
         assert min(made) > 0
         assert contents(tmp_path) == contents(folder)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("jobs", [1, 2])
     @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
     def test_feature_a_process_takes_over_what_others_have_not_written(self, whole, jobs, tmp_path):

@@ -23,6 +23,7 @@ def small_pages(monkeypatch):
 
 
 class TestDemo(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_writes_the_pictures_again_and_again(self, tmp_path, capsys):
         folder = tmp_path / "new" / "outputs"
         runs = []
@@ -37,6 +38,7 @@ class TestDemo(BaseTester):
         assert runs[0]["coded_capture.png"].shape == (3, 80, 80)
         assert all(torch.equal(runs[0][name], runs[1][name]) for name in NAMES)
 
+    @pytest.mark.takes_seconds
     def test_feature_tells_what_closed_forms_and_networks_gain_at_equal_light(self, tmp_path, capsys):
         assert main(["demo", "-o", str(tmp_path), "--size", "128"]) == 0
         told = {line[:9].strip(): line for line in capsys.readouterr().out.splitlines()}
@@ -53,6 +55,7 @@ class TestDemo(BaseTester):
         assert wide / narrow == pytest.approx((slow / fast) ** 2, rel=0.06)  # of two digits each, 5 % at most
         assert slow > fast
 
+    @pytest.mark.takes_seconds
     def test_feature_a_scene_of_ones_own_is_stretched_over_the_range(self, tmp_path, capsys):
         write_image(tmp_path / "image.png", torch.rand(1, 64, 96))
         write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 64 * 96).view(1, 64, 96))
@@ -64,6 +67,7 @@ class TestDemo(BaseTester):
         assert near.min() == 0
         assert near.max() == 1
 
+    @pytest.mark.takes_seconds
     def test_feature_large_pictures_are_made_smaller(self, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(demo, "LARGEST", 48)
         write_image(tmp_path / "image.png", torch.rand(3, 64, 96))

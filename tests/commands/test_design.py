@@ -28,6 +28,7 @@ def parsed(arguments):
 
 
 class TestDesign(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_writes_all_files_and_says_the_verdict(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setattr(Effort, "quick", lambda: TINY)
         folder = tmp_path / "out"

@@ -99,6 +99,7 @@ class TestRawReconstruct(BaseTester):
         assert record["size"] == [110, 90]
         assert record["depth_png"] == "metres = value * 0.001; 65535 is 65.535 m or farther"
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("closed_form", [True, False])
     def test_feature_uncertainty_is_a_second_map(self, closed_form, tmp_path, capsys):
         options = {"task": "joint", "depth_classes": 6, "refocus": 2, "closed_form": closed_form}
@@ -165,6 +166,7 @@ class TestRawReconstruct(BaseTester):
         assert reconstruct(files, weights, folder.with_name("alone"), "--memory", "1") == 0
         assert contents(folder) == contents(folder.with_name("alone"))
 
+    @pytest.mark.takes_seconds
     def test_feature_interrupted_and_resumed_is_as_if_nothing_had_been(self, batch, monkeypatch, capsys):
         files, weights, folder = batch
         assert reconstruct(files, weights, folder.with_name("whole")) == 0
@@ -210,6 +212,7 @@ class TestRawReconstruct(BaseTester):
         assert ("kept" in capsys.readouterr().out) == (change == "none")
         assert (folder / "a_depth.pfm").exists()
 
+    @pytest.mark.takes_seconds
     def test_feature_a_network_that_comes_with_the_library_needs_no_checkpoint(self, tmp_path, capsys):
         (tmp_path / "a.dng").write_bytes(raw_file())
         assert reconstruct([str(tmp_path / "a.dng")], "edof-0", tmp_path) == 0

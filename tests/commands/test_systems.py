@@ -16,6 +16,7 @@ from tests.base import BaseTester, shared
 
 
 class TestSystems(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_lists_and_draws_those_asked_for_the_same_again(self, tmp_path, capsys):
         path, pictures = tmp_path / "two.png", []
         for _ in range(2):
@@ -28,6 +29,7 @@ class TestSystems(BaseTester):
         assert pictures[0].shape[0] == 3
         assert pictures[0].shape[2] > 2000
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("channels", [1, 3])
     def test_feature_a_scene_of_ones_own_wherever_its_depths_lie(self, channels, tmp_path, capsys):
         write_image(tmp_path / "image.png", torch.rand(channels, 64, 96))

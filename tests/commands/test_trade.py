@@ -34,6 +34,7 @@ def measured(monkeypatch):
 
 
 class TestTrade(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_writes_table_files_and_picture(self, tmp_path, capsys):
         folder = tmp_path / "new" / "trade"
         assert main(["trade", *QUICK, "--knobs", "layers", "--training", "-o", str(folder)]) == 0
@@ -59,6 +60,7 @@ class TestTrade(BaseTester):
         assert len(told) == 1
         assert told[0].startswith("kornia-tidy: warning: the nearest pixel is 1100 m away")
 
+    @pytest.mark.takes_seconds
     def test_feature_an_interrupted_run_goes_on(self, tmp_path, monkeypatch, capsys, measured):
         def interrupted(*args, **kwargs):
             rows = real_sweep(*args, **kwargs)
@@ -89,6 +91,7 @@ class TestTrade(BaseTester):
         knobs = {row.knob for row in read_json(tmp_path / "trade.json").rows}
         assert knobs == {"layers", "layer_spacing"}
 
+    @pytest.mark.takes_seconds
     @pytest.mark.usefixtures("measured")
     def test_feature_plans_are_measured_too_and_windows_fit_the_image(self, tmp_path):
         assert main(["trade", *QUICK, "--knobs", "plan", "window", "-o", str(tmp_path)]) == 0
@@ -123,6 +126,7 @@ class TestTrade(BaseTester):
         assert sentence in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
+    @pytest.mark.takes_seconds
     def test_exception_a_file_that_is_no_sweep_is_not_replaced(self, tmp_path, capsys):
         (tmp_path / "trade.json").write_text("my notes")
         assert main(["trade", *QUICK, "-o", str(tmp_path)]) == 2

@@ -48,6 +48,7 @@ class TestTrain(BaseTester):
         assert main(["train", "-o", str(run)]) == 2
         assert "holds a run already" in capsys.readouterr().err
 
+    @pytest.mark.takes_seconds
     def test_feature_the_network_alone_has_defaults_of_its_own_and_a_learning_curve(self, tmp_path, capsys):
         run = tmp_path / "run"
         options = ["--learn", "network", "--crop", "32", "--epochs", "2", "--fidelity", "draft"]
@@ -80,6 +81,7 @@ class TestTrain(BaseTester):
         assert main(["train", *SMALL, *refined, "-o", str(tmp_path / "refined")]) == 0
         assert load_trained(tmp_path / "refined" / "best.safetensors").head.refiner.out_channels == 3
 
+    @pytest.mark.takes_seconds
     def test_feature_a_deeper_network_begins_as_one_that_was_trained(self, tmp_path):
         """A rate of 1e-12 leaves it as it begins."""
         options = [*SMALL, "--head", "nafnet", "--width", "2", "--learn", "network", "--epochs", "1", "--ema", "0"]
@@ -138,6 +140,7 @@ class TestTrain(BaseTester):
         assert "pip install 'kornia-tidy[train]'" in capsys.readouterr().err
         assert not (tmp_path / "run").exists()
 
+    @pytest.mark.takes_seconds
     def test_feature_the_command_imports_lightning_only_to_train(self, run):
         code = (
             "import sys; from kornia_tidy.cli import main; "

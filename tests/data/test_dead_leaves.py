@@ -64,6 +64,7 @@ class TestDeadLeaves(BaseTester):
         assert (first[0] != second[0]).float().mean() > 0.9
         assert (first[1] != second[1]).float().mean() > 0.9
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("num_leaves", [200, 1000])
     def test_feature_seen_depth_is_a_power_of_what_is_uniform(self, num_leaves):
         """Background exp(-3) = 5 % of the pixels; then u ** g for uniform u, however small the leaves."""

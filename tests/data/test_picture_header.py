@@ -125,6 +125,7 @@ class TestCheckPixels(BaseTester):
         monkeypatch.setenv(VARIABLE, str(1 << 40))
         check_pixels("the scene", 10**6, 10**6)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(
         ("limit", "sentence"), [("", "20000 x 20000 pixels, more than 268435456"), ("9" * 12, "more memory than")]
     )

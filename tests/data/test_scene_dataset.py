@@ -110,6 +110,7 @@ class TestEveryDataSet(BaseTester):
 
 class TestWorkers(BaseTester):
     # Python 3.12 and later: every process that uses torch has threads, and fork says so.
+    @pytest.mark.takes_seconds
     @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
     @pytest.mark.parametrize(("context", "workers"), [("fork", 2), ("spawn", 1)])
     def test_feature_workers_read_the_same_bits(self, data, context, workers):

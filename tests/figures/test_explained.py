@@ -38,6 +38,7 @@ class TestExplain(BaseTester):
             for other, second in boxes[:i]:
                 assert not box.overlaps(second), (text, other)
 
+    @pytest.mark.takes_seconds
     def test_feature_all_five_masks_and_six_rows_of_psfs_are_drawn(self):
         figure = figure_of(TiDyOptics(PixelwiseMask(5), fidelity=QUICK))
         pictures = [axes.images[0].get_array().shape for axes in figure.axes]

@@ -175,11 +175,13 @@ OTHERS = {
 
 
 class TestBombs(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("kind", PICTURES)
     @pytest.mark.parametrize("read", [read_image, read_depth])
     def test_exception_pictures(self, kind, read, tmp_path):
         self.check(written("a.png", PICTURES[kind](), read), tmp_path)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("kind", OTHERS)
     def test_exception_other_files(self, kind, tmp_path):
         self.check(OTHERS[kind](), tmp_path)

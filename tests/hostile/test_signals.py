@@ -84,6 +84,7 @@ def disturb(argv, folder, moments, seed):
 
 
 class TestSignals(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("shards", [(), ("--shard-items", "2")])
     def test_feature_rendering_stopped_by_signals_ends_with_the_same_bytes(self, shards, tmp_path):
         assert disturb((*RENDER, *shards), tmp_path, 2, seed=1) > 0

@@ -47,6 +47,7 @@ class TestPretrained(BaseTester):
         if "depth_rmse" in told:
             assert scores["depth_rmse"] < told["depth_rmse"] + 0.1
 
+    @pytest.mark.takes_seconds
     def test_feature_loading_does_not_import_the_compiler_of_torch(self):
         """Its import takes longer than loading."""
         code = (

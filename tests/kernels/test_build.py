@@ -77,6 +77,7 @@ class TestCompiled(CompiledTester):
         with pytest.raises(pytest.fail.Exception, match="compiled again"):
             compiled(source, torch.float64)
 
+    @pytest.mark.takes_seconds
     def test_feature_the_sources_of_the_package_have_no_warnings(self, monkeypatch):
         monkeypatch.setattr(module, "FLAGS", (*module.FLAGS, "-Wall", "-Wextra", "-Werror"))
         sources = sorted(Path(module.__file__).parent.rglob("*.c"))
@@ -248,6 +249,7 @@ class TestCache(CompiledTester):
         with pytest.warns(CompiledCodeWarning, match="twice.c"):
             assert compiled(source, torch.float64) is None
 
+    @pytest.mark.takes_seconds
     def test_feature_several_processes_at_once_leave_whole_libraries(self, source, folder):
         lines = (
             "from pathlib import Path",

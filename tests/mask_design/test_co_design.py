@@ -38,16 +38,19 @@ def bright():
 
 
 class TestCoDesign(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_in_little_light_nothing_is_coded(self, dim):
         assert dim.recommended.is_flat
         assert "coding gains nothing" in dim.words
         assert f"f/{dim.recommended.f_number:.3g}" in dim.words
 
+    @pytest.mark.takes_seconds
     def test_feature_the_same_seed_the_same_result(self, dim):
         again = co_design(DIM, effort=TINY)
         assert [one.scores for one in again.finalists] == [one.scores for one in dim.finalists]
         assert again.words == dim.words
 
+    @pytest.mark.takes_seconds
     def test_feature_in_bright_light_masks_pay(self, bright):
         design, _ = bright
         assert not design.recommended.is_flat
@@ -75,6 +78,7 @@ class TestCoDesign(BaseTester):
         assert done["search"] == planned["search"]
         assert done["captures"] == len(design.finalists) * TINY.scenes <= planned["captures"]
 
+    @pytest.mark.takes_seconds
     def test_feature_goes_on_where_it_stopped_and_ends_alike(self, tmp_path, monkeypatch):
         """Interrupted at the fifth finalist; then nothing is searched or captured twice."""
         path, calls, captures_left = tmp_path / "progress.json", [], [4]

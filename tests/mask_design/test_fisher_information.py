@@ -90,6 +90,7 @@ def errors_of_maximum_likelihood(camera: SampledCamera, psi: float, trials: int,
 
 
 class TestBoundIsReached(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("psi", [-8.0, 0.0, 8.0])
     def test_feature_maximum_likelihood_scatters_by_the_bound(self, psi):
         """With 1000 images of 3000 photons, the standard deviation is measured to 2 %."""

@@ -64,6 +64,7 @@ class TestDesign(BaseTester):
 
 
 class TestFisherDesign(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_beats_the_published_mask_by_far(self):
         """The mask published with PhaseCam3D has 0.0785 rad in the same setting; half the steps suffice here."""
         _, bound = design_fisher_mask(seed=0, iterations=75)

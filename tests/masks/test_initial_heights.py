@@ -15,6 +15,7 @@ def drawn(start, seed=0):
 
 
 class TestFisherMask(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_is_what_the_design_finds(self):
         """Against the design itself; the constants are rounded to four decimals, which is 1e-11 m of height."""
         mask, bound = design_fisher_mask(seed=3)

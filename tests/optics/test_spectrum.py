@@ -178,9 +178,11 @@ class TestCameraSpectrum(BaseTester):
             error = (np.abs(channels(samples) - channels(600)) / scale).mean()
             assert error == pytest.approx(promised, rel=0.05)
 
+    @pytest.mark.takes_seconds
     def test_feature_colour_is_imported_only_when_a_camera_is_asked_for(self):
         run_python("import sys, kornia_tidy.optics.spectrum; assert 'colour' not in sys.modules")
 
+    @pytest.mark.takes_seconds
     def test_feature_leaves_warnings_and_print_options_as_they_were(self):
         """Without matplotlib too: colour warns of its absence, and warnings are errors here."""
         run_python(

@@ -16,6 +16,7 @@ from tests.planning.planning_rig import Rig
 
 
 class TestAdversarialScenes(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     def test_property_a_textured_patch_in_the_dark_at_another_depth(self, compositing):
         """One spectrum for all depths was off 2.4 times with gather, 5.5 with scatter, 6.9 with occlusion."""
@@ -29,6 +30,7 @@ class TestAdversarialScenes(BaseTester):
             for plan in map(scene.plan, (1e-2, 1e-3, 1e-4, 1e-5)):
                 assert rig.error(light, defocus, plan.fidelity, plan.reference) <= plan.tolerance, plan
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @settings(
         max_examples=10,

@@ -73,6 +73,7 @@ class TestTolerance(BaseTester):
     def test_property_real_scenes_stay_within_the_tolerance_asked(self, rig):
         self.judge(rig, [(name, 64) for name in NAMES[2::14]])
 
+    @pytest.mark.takes_seconds
     @needs_data
     @pytest.mark.usefixtures("narrow")
     def test_property_real_scenes_that_hide_parts_of_themselves_stay_within_the_tolerance_asked(self):
@@ -81,6 +82,7 @@ class TestTolerance(BaseTester):
             optics = TiDyOptics(MASKS[masks](torch.Generator().manual_seed(0)), sensor=None, compositing="occlusion")
             self.judge(Rig(optics), [(name, 64) for name in NAMES[5::32]], margin=5)
 
+    @pytest.mark.takes_seconds
     @needs_data
     def test_property_real_scenes_seen_in_many_wavelengths_stay_within_the_tolerance_asked(self, spectral):
         self.judge(spectral, [(name, 64) for name in NAMES[2::28]], margin=3)
@@ -116,6 +118,7 @@ class TestTolerance(BaseTester):
             "kornia_tidy.planning.psf_samples.REFERENCE", REFERENCE.replace(name="reference", max_window=65)
         )
 
+    @pytest.mark.takes_seconds
     @pytest.mark.usefixtures("narrow")
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
     @settings(max_examples=2, phases=[Phase.generate], deadline=None, suppress_health_check=list(HealthCheck))
@@ -212,6 +215,7 @@ class TestPlan(BaseTester):
         assert planned(image, depth).shape == image.shape
         assert planned.window == plan.fidelity.window
 
+    @pytest.mark.takes_seconds
     def test_feature_is_the_planner_in_one_call(self, flat):
         image, depth = torch.rand(3, 60, 72), 0.4 + torch.rand(1, 60, 72)
         scene = Planner(flat, 3).scene(flat.camera.defocus(depth[None]), flat.decode(image[None]))

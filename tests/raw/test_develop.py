@@ -117,6 +117,7 @@ class TestDevelop(BaseTester):
         assert whole.float().mean() > 0.2
         assert torch.minimum(*errors)[whole].max() < 1e-4
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(
         ("name", "method"), [(name, method) for name, methods in PICTURES.items() for method in methods]
     )

@@ -62,6 +62,7 @@ def scores(image, depth, camera, noise):
 
 @pytest.mark.parametrize("sensor", [small, large])
 class TestRawRoundTrip(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("seed", [5, 6])
     def test_feature_dead_leaves_are_sharper_than_their_capture(self, sensor, seed):
         far = system()[0].camera.depth_range

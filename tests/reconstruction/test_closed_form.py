@@ -248,6 +248,7 @@ class TestClosedForm(BaseTester):
         restore = closed_form(inverse=inverse).to(device)
         self.gradcheck(lambda capture: restore(capture, 0.01).maps, (photo(8, 8)[:1].to(device),))
 
+    @pytest.mark.takes_seconds
     def test_dynamo(self, device):
         """Traced, kernels are applied by strided convolutions."""
         restore, capture = closed_form().to(device), photo(13, 16).to(device)

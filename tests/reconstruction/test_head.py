@@ -195,6 +195,7 @@ class TestEveryHead(BaseTester):
                 expected = (gain / weight[0].numel()) ** 0.5
                 assert abs(weight.std().item() / expected - 1) < 0.1, label
 
+    @pytest.mark.takes_seconds
     @every_head
     def test_feature_half_precision_autocast_is_near(self, name, device):
         head, image = trained(name).to(device), torch.rand(2, 3, 64, 64, device=device)

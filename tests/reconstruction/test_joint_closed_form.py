@@ -222,6 +222,7 @@ class TestJointClosedFormHead(BaseTester):
         assert type(head) is (JointClosedFormHead if closed_form else LayeredJointHead)
         assert head.out_channels == 5 + 3
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(("kind", "refined"), [(NAFNet, False), (PlainHead, False), (PlainHead, True)])
     def test_feature_tiles_are_the_whole(self, kind, refined):
         """Classes are averaged on a grid of 4 pixels, also behind a network without a grid of its own."""

@@ -44,6 +44,7 @@ class TestResidual(BaseTester):
             optimizer.step()
         assert all(p.grad.abs().max() > 0 for p in head.parameters())
 
+    @pytest.mark.takes_seconds
     def test_feature_onnx(self):
         check_onnx(Residual(PlainHead(3, 4, width=2)), torch.rand(1, 3, 13, 16))
 

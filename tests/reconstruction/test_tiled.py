@@ -205,6 +205,7 @@ class TestReconstructTiled(BaseTester):
         with pytest.raises(KeyboardInterrupt):
             reconstruct_tiled(trained("plain"), torch.rand(1, 3, 150, 90), tile=80, progress=stop)
 
+    @pytest.mark.takes_seconds
     def test_feature_a_smaller_budget_takes_smaller_tiles_that_stay_within_it(self):
         head, image = trained("attention"), torch.rand(1, 3, 700, 900)
         grid = TileGrid((700, 900), 16, receptive_field(head))
@@ -305,6 +306,7 @@ class TestReceptiveField(BaseTester):
 
 
 class TestTileGrid(BaseTester):
+    @pytest.mark.takes_seconds
     @settings(max_examples=100, deadline=None)
     @given(
         st.integers(1, 300),

@@ -85,6 +85,7 @@ class TestCaptureInBands(BaseTester):
         optics.memory_budget = 1
         assert torch.equal(optics(image[0].bfloat16(), depth[0]), expected)
 
+    @pytest.mark.takes_seconds
     @torch.no_grad()
     def test_feature_peak_memory_is_within_the_budget(self):
         optics = make_optics(memory_budget=64 << 20)

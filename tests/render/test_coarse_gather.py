@@ -3,6 +3,7 @@
 import math
 from types import SimpleNamespace
 
+import pytest
 import torch
 
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -74,6 +75,7 @@ class TestGatherGroups(BaseTester):
         monkeypatch.setattr("kornia_tidy.render.coarse_gather._LAYER_BYTES", 1)
         self.assert_close(gather_groups(one, psi, [group], 79), whole, rtol=0, atol=1e-6)
 
+    @pytest.mark.takes_seconds
     def test_gradcheck_of_image_defocus_and_psfs(self):
         fine, coarse = group_of((1.0, 3.0), 1, torch.float64), group_of((3.0, 5.0), 2, torch.float64)
         psi = torch.tensor([1.3, 2.1, 3.4, 4.2, 4.6], dtype=torch.float64) * math.pi * STEP / REFERENCE_WAVELENGTH

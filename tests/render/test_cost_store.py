@@ -128,6 +128,7 @@ class TestInUse(BaseTester):
         write_profile(THREADS, StoredProfile(OTHER, tuple(KINDS)))
         assert settled() is before
 
+    @pytest.mark.takes_seconds
     def test_feature_repeatable_rendering_knows_the_shipped_profile_only(self, cache):
         """And its choices are remembered apart."""
         scene = sample_scene(96, 15)

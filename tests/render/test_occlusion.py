@@ -73,6 +73,7 @@ class TestOcclusion(BaseTester):
             expected = brute_render(image, defocus, bank, **options)
             self.assert_close(render(image, defocus, bank, method=method, **options), expected, rtol=0, atol=1e-12)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
     @pytest.mark.parametrize("method", METHODS)
     def test_feature_equals_the_independent_model(self, border, method):

@@ -34,6 +34,7 @@ class Renderer(torch.nn.Module):
 
 
 class TestRenderLayers(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("border", ["reflect", "valid", "zero"])
     @pytest.mark.parametrize("compositing", COMPOSITING)
     def test_dynamo_passes_the_checks_of_operators(self, compositing, border, dtype):
@@ -46,6 +47,7 @@ class TestRenderLayers(BaseTester):
         for wanted in ([True] * 5, [False, True, False, True, False]):
             torch.library.opcheck(GRADIENTS, (*given, torch.randn(2, 2, 9, 40, dtype=torch.float64), wanted))
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("method", ["auto", "tiled", "dense"])
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("compositing", COMPOSITING)
@@ -77,6 +79,7 @@ class TestRenderLayers(BaseTester):
         assert [target for target in called if "kornia_tidy" in str(target)] == [torch.ops.kornia_tidy.render_layers]
         assert not [target for target in called if "fft" in str(target)]
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("compositing", COMPOSITING)
     def test_dynamo_function_transforms_inside_a_graph_take_plain_operations(self, compositing):
         bank = make_bank(4, 2, 5, light=0.8, veil=True)

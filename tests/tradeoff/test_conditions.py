@@ -106,6 +106,7 @@ class TestConditions(BaseTester):
             assert code_hash() not in hashes, name
             hashes.add(code_hash())
 
+    @pytest.mark.takes_seconds
     def test_feature_all_that_a_measurement_imports_is_in_the_hash(self):
         """But for what draws, writes or names, and for other ways to take pictures, which no row comes from."""
         script = "import sys, kornia_tidy.tradeoff.measure, kornia_tidy.planning.planner; print(*sys.modules)"

@@ -45,6 +45,7 @@ class TestSeconds(BaseTester):
 
 
 class TestPeakBytes(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_counts_what_is_held_at_one_time(self):
         def one_after_the_other():
             for _ in range(10):
@@ -67,6 +68,7 @@ class TestPeakBytes(BaseTester):
         x = torch.ones(2**20)
         assert peak_bytes(lambda: x.add_(1), CPU) < 2**10
 
+    @pytest.mark.takes_seconds
     def test_feature_is_the_same_on_every_run_and_says_nothing(self, capfd):
         once, again = (peak_bytes(lambda: torch.fft.rfft2(torch.ones(100, 100)), CPU) for _ in range(2))
         assert once == again > 100 * 100 * 4

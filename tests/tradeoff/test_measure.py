@@ -61,6 +61,7 @@ class TestMeasure(BaseTester):
         assert row.max_error == pytest.approx(abs(difference).max(), rel=1e-6)
         assert (row.layers, row.window, row.repeats) == (3, 9, 1)
 
+    @pytest.mark.takes_seconds
     def test_feature_every_captures_masks_are_new_and_rendering_keeps_its_bank(self, monkeypatch):
         versions, banks = [], []
         original = PSFModel._computed_bank
@@ -78,6 +79,7 @@ class TestMeasure(BaseTester):
         assert versions[6:10] == [versions[6]] * 4
         assert versions[1:6] == list(range(versions[0] + 1, versions[0] + 6))
 
+    @pytest.mark.takes_seconds
     def test_feature_leaves_the_camera_as_it_was(self):
         image, depth = scene()
         optics = TiDyOptics(PixelwiseMask(2), fidelity=QUICK)
@@ -89,6 +91,7 @@ class TestMeasure(BaseTester):
         assert row.training_bytes > row.capture_bytes > image.nbytes
         assert row.training_seconds > 0
 
+    @pytest.mark.takes_seconds
     def test_feature_no_warning_leaves_the_sweep(self):
         image, depth = scene()
         optics = TiDyOptics(fidelity=QUICK)
@@ -124,6 +127,7 @@ class TestSweep(BaseTester):
         monkeypatch.setitem(sweep.__globals__, "capture", lambda *_: calls.append("truth") or torch.zeros(1))
         return calls
 
+    @pytest.mark.takes_seconds
     def test_feature_the_reference_itself_has_no_error(self):
         optics = TiDyOptics(fidelity=QUICK)
         rows = list(sweep(optics, *scene(), settings(), repeats=1, reference=QUICK))

@@ -228,6 +228,7 @@ def train_and_evaluate(name, root, tmp_path, capsys, *options):
 
 
 class TestEndToEnd(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("name", FILES)
     def test_feature_two_steps_and_a_table_from_each_data_set(self, name, roots, tmp_path, capsys):
         pytest.importorskip("lightning.pytorch")

@@ -34,6 +34,7 @@ def error(optics):
 
 
 class TestDesignMasks(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_five_masks_reach_what_one_does_not(self):
         """In windows of 41 pixels and 30 steps."""
         one, five = swept(1), swept(5)
@@ -45,6 +46,7 @@ class TestDesignMasks(BaseTester):
         assert after[1] < 0.95 * before[1]
         assert after[1] < after[0]
 
+    @pytest.mark.takes_seconds
     def test_feature_masks_are_designed_for_the_noise_given(self):
         """With a tenth of it, masks designed for that are better than the usual ones."""
         found = []
@@ -73,6 +75,7 @@ class TestDesignMasks(BaseTester):
 
 
 class TestTrainingDesignedMasks(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_the_window_is_that_of_the_designed_masks(self):
         designed = TidyTraining.from_settings(SETTINGS.replace(masks=1))
         undesigned = build_optics(SETTINGS.replace(masks=1))

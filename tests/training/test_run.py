@@ -75,6 +75,7 @@ class TestTrain(BaseTester):
         losses = [float(row["val_loss"]) for row in rows(tmp_path / "validation.csv")]
         assert losses[-1] < 0.8 * losses[0]
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(
         "changes",
         [

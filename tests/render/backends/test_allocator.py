@@ -30,6 +30,7 @@ def faults() -> int:
 
 
 class TestKeepMemory:
+    @pytest.mark.takes_seconds
     @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
     def test_feature_pages_are_fetched_once(self):
         """51,200 pages of 4 KiB are written. Where memory is given back most are fetched anew, up to 49,578.

@@ -209,6 +209,7 @@ class TestChoice(BaseTester):
         with pytest.raises(ValueError, match=f"method 'direct' does not support this scene: .*{message}"):
             choose(scene, "direct")
 
+    @pytest.mark.takes_seconds
     def test_feature_without_a_compiler_it_is_refused(self, tmp_path):
         """In a process of its own, whose compiler does nothing."""
         code = (
