@@ -84,7 +84,7 @@ def _drawn(folder: Path, losses: NDArray[np.float64], name: str, decibels: list[
     parts = np.array_split(losses, SMOOTHING)
     means = np.array([part.mean(0) for part in parts if len(part)])
     left.plot(means[:, 0], means[:, 1], color=INK, linewidth=1.3)
-    left.set_yscale("log")
+    left.set_yscale("log" if bool((means[:, 1] > 0).all()) else "linear")  # a loss in decibels is negative
     left.set_ylabel("training loss", fontsize=LABEL, color=INK)
     plateau = plateau_step(steps, decibels)
     right.plot(steps, decibels, color=BLUE, linewidth=1.3, marker="o", markersize=3)

@@ -11,6 +11,7 @@ from kornia_tidy.inference.heads import CLOSED_FORMS, FIXED
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.reconstruction.head import check_count
+from kornia_tidy.reconstruction.metrics import SSIM_WINDOW
 from kornia_tidy.training.noisy_crops import TOLD_ERROR, check_electrons, check_noise_error, check_noise_range
 from kornia_tidy.training.task_loss import LOSSES
 
@@ -137,6 +138,9 @@ class TrainingSettings(SystemSettings):
             check_count("crop", self.crop, 1)
             if self.crop > self.size:
                 raise ValueError(f"crop must be at most the size of the scenes, {self.size}, got {self.crop}")
+        side = self.crop or self.size
+        if self.loss == "psnr-ssim" and side < SSIM_WINDOW:
+            raise ValueError(f"loss 'psnr-ssim' needs images of at least {SSIM_WINDOW} pixels a side, got {side}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must be in [0, 1), got {self.ema}")
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import kornia
 from torch import Tensor
 
 from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.reconstruction.losses import l1_loss, mse_loss, phasecam3d_loss
-from kornia_tidy.reconstruction.metrics import SSIM_WINDOW
+from kornia_tidy.reconstruction.metrics import ssim
 from kornia_tidy.reconstruction.validity import valid_maps
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
@@ -65,6 +64,9 @@ def psnr_ssim_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = Non
     Returns:
         A scalar, the mean over images.
 
+    Raises:
+        ValueError: if maps are smaller than 11 pixels.
+
     Source: Chen et al., Simple Baselines for Image Restoration (ECCV 2022), whose loss is the PSNR; Zhao et al., Loss
     Functions for Image Restoration With Neural Networks (IEEE TCI 2017), for the SSIM beside it.
 
@@ -74,9 +76,8 @@ def psnr_ssim_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = Non
         tensor(-50.)
     """
     prediction, target, mask = valid_maps(prediction, target, mask)
-    squared = ((prediction - target).square() * mask).sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp(min=1)
-    similar = kornia.metrics.ssim(prediction, target, SSIM_WINDOW, eps=0.0, padding="valid").mean((1, 2, 3))
-    return (10 * (squared + LEAST_MSE).log10() + SSIM_WEIGHT * (1 - similar)).mean()
+    squared = (prediction - target).square().sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp(min=1)
+    return (10 * (squared + LEAST_MSE).log10() + SSIM_WEIGHT * (1 - ssim(prediction, target))).mean()
 
 
 # That of TiDy-PSFs, of Ikoma et al. for depth, of PhaseCam3D for depth, and two of restoration networks. Each is

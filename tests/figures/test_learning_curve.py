@@ -44,6 +44,16 @@ class TestDrawLearningCurve(BaseTester):
         assert (steps[0], means[0]) == (4.5, pytest.approx(sum(1 / n for n in range(1, 9)) / 8))
         assert "best validation PSNR 28.00 dB; within 0.1 dB of it at step 300 of 400" in figure.texts[1].get_text()
 
+    def test_feature_a_loss_in_decibels_is_drawn_too(self, tmp_path):
+        write_run(tmp_path)
+        log = tmp_path / "training.csv"
+        name, *rows = log.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        log.write_text("\n".join([name, *(f"{epoch},{step},-{loss}" for epoch, step, loss in cells)]) + "\n")
+        losses, _ = draw_learning_curve(tmp_path).axes
+        low, high = losses.get_ylim()
+        assert all(low <= mean <= high for mean in losses.lines[0].get_ydata())
+
     def test_feature_a_curve_that_rises_to_the_end_is_told_so(self, tmp_path):
         write_run(tmp_path, "val_depth_rmse", (0.4, 0.2, 0.1))
         figure = draw_learning_curve(tmp_path)

@@ -246,6 +246,8 @@ class TestSettings(BaseTester):
             ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
             ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
             ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', 'psnr-ssim', got 'ssim'"),
+            ({"loss": "psnr-ssim", "size": 10}, "'psnr-ssim' needs images of at least 11 pixels a side, got 10"),
+            ({"loss": "psnr-ssim", "crop": 8}, "'psnr-ssim' needs images of at least 11 pixels a side, got 8"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
