@@ -126,8 +126,9 @@ def add_parser(subparsers: Any) -> None:
     _setting(
         system,
         "learn",
-        choices=LEARN,
-        help="both: masks and network together; network: behind fixed masks, with captures rendered once",
+        choices=tuple(LEARN),
+        help="both: masks and network together; network: behind fixed masks, with captures rendered once; refiner: so, "
+        "and only the second network of --refined",
     )
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
     _setting(
@@ -338,15 +339,15 @@ def run(args: argparse.Namespace) -> None:
         settings = TrainingSettings.read(folder / SETTINGS).replace(**given)
     else:
         settings = TrainingSettings(**{**usual_settings(given), **given})
-    if args.captures is not None and settings.learn != "network":
-        raise ValueError(f"--captures is for --learn network, got --learn {settings.learn}")
+    if args.captures is not None and not settings.fixed_optics:
+        raise ValueError(f"--captures is for --learn network or refiner, got --learn {settings.learn}")
     masks_from = args.masks_from
     if args.design_from is not None and masks_from is None and settings.masks:
         masks_from = designed_camera(args.design_from)
     say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # only one process prints
     many = {"strategy": "ddp"} if args.devices > 1 else {}
     say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
-    say("learn", "the network behind fixed optics" if settings.learn == "network" else "masks and network")
+    say("learn", LEARN[settings.learn])
     goes_on = args.resume and (folder / LAST).exists()
     say("run", f"{folder}, {'goes on' if goes_on else 'new'}, {settings.epochs} epochs")
     try:

@@ -392,10 +392,10 @@ def _renew_kernels(module: nn.Module, _: Any) -> None:
 
 
 def _take_window(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Give the PSFs the size that they have in a state, before it is loaded; if it has none, they stay."""
+    """Give the PSFs the size that they have in a state, before it is loaded; if it has none, they and the veil stay."""
     stored = state.get(f"{prefix}psfs")
     if isinstance(module, ClosedForm) and stored is not None and stored.shape[:2] == module.psfs.shape[:2]:
         if stored.numel():
             module.psfs = module.psfs.new_empty(stored.shape)
         else:
-            state[f"{prefix}psfs"] = module.psfs
+            state |= {f"{prefix}{name}": getattr(module, name) for name in ("psfs", "veil")}

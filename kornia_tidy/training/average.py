@@ -60,12 +60,14 @@ class MovingAverage(nn.Module):
         learnt = dict(network.named_parameters())
         if learnt:
             step(list(self.network.parameters()), list(learnt.values()), steps)
+        own = self.network.state_dict()
         others = {
             name: value
             for name, value in network.state_dict().items()
-            if name not in learnt and not name.endswith(EXTRA_STATE)  # settings have no average
-        }
-        self.network.load_state_dict(others, strict=False)  # modules may take buffers of another size
+            if name not in learnt and not name.endswith(EXTRA_STATE) and not torch.equal(value, own[name])
+        }  # settings have no average
+        if others:  # of PSFs that were loaded kernels are computed again, which takes as long as a sixth of a step
+            self.network.load_state_dict(others, strict=False)  # modules may take buffers of another size
         self.steps += 1
 
     def forward(self, *inputs: Tensor, **options: Any) -> Tensor:

@@ -74,7 +74,7 @@ def _painted(settings: TrainingSettings, split: str, count: int | None) -> Datas
     else:
         kind = PhotographicLeaves if settings.data == "photographic-leaves" else DeadLeaves
         scenes = kind(*size, depth_range=depths, seed=seed)
-    return scenes if settings.learn == "network" else Remembered(scenes)  # captures are remembered in files
+    return scenes if settings.fixed_optics else Remembered(scenes)  # captures are remembered in files
 
 
 def _photographs(settings: TrainingSettings, split: str) -> list[Path]:

@@ -68,7 +68,7 @@ class TidyTraining(pl.LightningModule):
     Batches are mappings of ``"image"`` (B, 3, H, W), ``"depth"`` (B, 1, H, W) and, optionally, ``"mask"`` (bool, True
     where depth is known) and ``"noise_seed"`` (int, the seed of the sensor's noise; without it noise is drawn from the
     global generator). Batches of :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`, which hold captures, are for
-    ``learn="network"``.
+    fixed optics.
 
     A network whose ``forward`` has an argument ``noise`` is given the standard deviation of the captures' noise in each
     pixel, (B, 3, H, W), in linear light with full scale 1.
@@ -89,7 +89,8 @@ class TidyTraining(pl.LightningModule):
         depth_weight: of the depth loss in the joint task.
         image_weight: of the image loss in the joint task.
         learn: ``"both"``, or ``"network"``: the optics are fixed, and the network is trained by AdamW with its usual
-            betas, 0.9 and 0.999.
+            betas, 0.9 and 0.999; or ``"refiner"``: so is that of depth, and only the second one, for the image, is
+            trained.
         channels_last: keep the channels of a pixel together in the network's memory.
         settings: those that camera and network were made from; checkpoints hold them to rebuild both.
 
@@ -125,10 +126,14 @@ class TidyTraining(pl.LightningModule):
         super().__init__()
         check_choice("task", task, tuple(MAPS))
         check_choice("schedule", schedule, SCHEDULES)
-        check_choice("learn", learn, LEARN)
+        check_choice("learn", learn, tuple(LEARN))
         check_positive("lr", lr)
         check_positive("lr_metres", lr_metres, "metres")
-        self.optics = optics.requires_grad_(requires_grad=False) if learn == "network" else optics
+        self.optics = optics if learn == "both" else optics.requires_grad_(requires_grad=False)
+        if learn == "refiner":
+            if not isinstance(head, JointClosedFormHead) or head.refiner is None:
+                raise ValueError("learn='refiner' needs a JointClosedFormHead with a refiner")
+            head.requires_grad_(requires_grad=False).refiner.requires_grad_()
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.head = head.to(memory_format=self.memory_format) if channels_last else head  # ty: ignore[no-matching-overload]
         self.takes_noise = takes_noise(head)
@@ -255,8 +260,9 @@ class TidyTraining(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""
-        if self.learn == "network":
-            return self._scheduled(torch.optim.AdamW(self.head.parameters(), lr=self.lr))
+        if self.learn != "both":
+            learnt = (weight for weight in self.head.parameters() if weight.requires_grad)
+            return self._scheduled(torch.optim.AdamW(learnt, lr=self.lr))
         groups = self.optics.parameter_groups(self.lr_metres, self.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
         groups.append({"params": list(self.head.parameters()), "lr": self.lr})
@@ -271,7 +277,7 @@ class TidyTraining(pl.LightningModule):
 
     def on_fit_start(self) -> None:
         """Hand the PSFs of fixed optics to the network and its average."""
-        if self.learn == "network":
+        if self.learn != "both":
             with torch.no_grad():
                 for network in (self.head, self.average):
                     if network is not None:

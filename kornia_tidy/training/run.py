@@ -67,7 +67,7 @@ def train(
         refiner_from: checkpoint with a network for the image, with whose weights the refiner of ``refined`` begins.
         masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
             as ``camera.safetensors`` of ``kornia-tidy design``.
-        captures: folder of the noise-free captures, for ``learn="network"``. Runs with the same camera and scenes may
+        captures: folder of the noise-free captures, for fixed optics. Runs with the same camera and scenes may
             share it. Default: ``captures/`` in the folder of the run.
         save_every: steps between checkpoints within an epoch.
         workers: processes that load scenes.
@@ -143,7 +143,7 @@ def _train(
         if module.average is not None:
             module.average.network.load_state_dict(module.head.state_dict())
     module.settings.write(folder / SETTINGS)
-    if settings.learn == "network":
+    if settings.fixed_optics:
         if checkpoint is not None:  # the masks may have been designed
             load_weights(checkpoint, module.optics)
         parts = {"train": scenes, "validation": validation}

@@ -17,7 +17,11 @@ from kornia_tidy.training.task_loss import LOSSES
 
 SCHEDULES = ("constant", "cosine")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
-LEARN = ("both", "network")
+LEARN = {
+    "both": "masks and network",
+    "network": "the network behind fixed optics",
+    "refiner": "the second network behind fixed optics, after the first",
+}
 
 NETWORK_RUN: dict[str, Any] = {
     "learn": "network", "head": "nafnet", "closed_form": True, "width": 16, "size": 256, "crop": None, "scenes": 1000,
@@ -39,25 +43,26 @@ class TrainingSettings(SystemSettings):
     Args:
         learn: ``"both"``, masks and network together; or ``"network"`` alone behind fixed optics: scenes are rendered
             once, see :class:`~kornia_tidy.training.noise_free.NoiseFreeCaptures`, and crop, gain and noise are drawn
-            for each step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`.
+            for each step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`; or ``"refiner"``: as
+            ``"network"``, but only the second network of ``refined`` is learnt, and depth stays as it is.
         design: gradient steps that optimise the masks for the task before training, without scenes or network, see
             :func:`~kornia_tidy.training.designed.design_masks`; for the task ``"edof"`` only. 0: none. A fixed lens
             is not changed.
         data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
         root: folder of the data, where they are files. None: ``data/NAME``.
         size: side of the scenes in pixels; larger scenes are cropped, at random for training.
-        crop: side of the crops of the captures in pixels, for ``learn="network"``. None: whole captures.
+        crop: side of the crops of the captures in pixels, for fixed optics. None: whole captures.
         noise_range: least and largest standard deviation of read noise, in units of full scale, for
-            ``learn="network"``; the sensor's own noise is that of scores afterwards.
-        noise_error: largest factor by which the noise told to the network is wrong, for ``learn="network"``: how well
+            fixed optics; the sensor's own noise is that of scores afterwards.
+        noise_error: largest factor by which the noise told to the network is wrong, for fixed optics: how well
             the noise of later captures will be known. 1: exactly.
         electrons: least and largest number of electrons of a white pixel at the reference f-number, for the captures
-            with shot noise of ``learn="network"``. A smaller aperture gets fewer in the same exposure time. None: 500
+            with shot noise of fixed optics. A smaller aperture gets fewer in the same exposure time. None: 500
             to 60,000 at every f-number.
         reference_f_number: f-number at which the electrons are counted.
         scenes: number of training scenes, for data whose number of scenes is not fixed.
         validation_scenes: largest number of validation scenes.
-        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for ``learn="network"``.
+        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for fixed optics.
         lr: learning rate of the network.
         lr_metres: learning rate of the masks in metres of height.
         schedule: of both rates: ``"constant"``, or ``"cosine"``: a rise over the first tenth of the steps, then a fall
@@ -114,7 +119,9 @@ class TrainingSettings(SystemSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("learn", self.learn, LEARN)
+        check_choice("learn", self.learn, tuple(LEARN))
+        if self.learn == "refiner" and not self.refined:
+            raise ValueError("learn='refiner' needs the second network of refined=True")
         check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
         check_choice("schedule", self.schedule, SCHEDULES)
@@ -143,6 +150,11 @@ class TrainingSettings(SystemSettings):
             raise ValueError(f"loss 'psnr-ssim' needs images of at least {SSIM_WINDOW} pixels a side, got {side}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must be in [0, 1), got {self.ema}")
+
+    @property
+    def fixed_optics(self) -> bool:
+        """Whether the masks stay as they are, so that each scene is rendered once."""
+        return self.learn != "both"
 
     @classmethod
     def of(cls, system: TrainedSystem) -> Self:
@@ -173,7 +185,7 @@ def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
         >>> usual_settings({"task": "joint", "closed_form": True})
         {'inverse': 'wiener', 'depth_classes': 21, 'refocus': 9, 'depth_weight': 0.03}
     """
-    usual = dict(NETWORK_RUN) if given.get("learn") == "network" else {}
+    usual = dict(NETWORK_RUN) if given.get("learn", "both") != "both" else {}
     if given.get("head") in (*FIXED, *CLOSED_FORMS):
         usual.pop("closed_form", None)
         usual.pop("width", None)

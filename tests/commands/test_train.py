@@ -80,6 +80,11 @@ class TestTrain(BaseTester):
         refined += ["--refiner-from", str(run / "best.safetensors")]
         assert main(["train", *SMALL, *refined, "-o", str(tmp_path / "refined")]) == 0
         assert load_trained(tmp_path / "refined" / "best.safetensors").head.refiner.out_channels == 3
+        more = [*refined[:-2], "--learn", "refiner", "--head-from", str(tmp_path / "refined" / "best.safetensors")]
+        assert main(["train", *SMALL, *more, "-o", str(tmp_path / "more")]) == 0
+        before, after = (load_trained(tmp_path / name / "best.safetensors").head for name in ("refined", "more"))
+        assert all(map(torch.equal, before.network.parameters(), after.network.parameters()))
+        assert not any(map(torch.equal, before.refiner.parameters(), after.refiner.parameters()))
 
     @pytest.mark.takes_seconds
     def test_feature_a_deeper_network_begins_as_one_that_was_trained(self, tmp_path):
@@ -101,7 +106,7 @@ class TestTrain(BaseTester):
             (["--repeats", "2"], "repeats are for the head nafnet, got 2 for 'plain'"),
             (["--refined"], "refined is for depth_classes with closed_form, which are not both asked for"),
             (["--refiner-from", "x"], "a network begins the refiner of refined, which is not asked for"),
-            (["--captures", "x"], "--captures is for --learn network, got --learn both"),
+            (["--captures", "x"], "--captures is for --learn network or refiner, got --learn both"),
             (["--masks", "1000000"], "masks must be 1024 or fewer, got 1000000"),
             (["--refocus", "1000000"], "refocus must be 1024 or fewer, got 1000000"),
             (["--size", "1000000"], "the scene has 1000000 x 1000000 pixels, more than 268435456"),

@@ -75,8 +75,9 @@ class TestPretrained(BaseTester):
 
     def test_feature_psfs_are_left_out_and_computed_from_the_masks(self, tmp_path):
         system, state = load_pretrained("edof-5"), read_state(FOLDER / "edof-5.safetensors")
-        name = "average.network.closed_form.psfs"
-        state["state_dict"] = {**state["state_dict"], name: system.head.closed_form.psfs + 1.0}
+        name, veil = (f"average.network.closed_form.{part}" for part in ("psfs", "veil"))
+        own = {name: system.head.closed_form.psfs + 1.0, veil: system.head.closed_form.veil + 0.1}  # of another camera
+        state["state_dict"] = {**state["state_dict"], **own}
         write_state(tmp_path / "run.safetensors", state)
         ship(tmp_path / "run.safetensors", tmp_path / "small.safetensors", short=False)
         assert read_state(tmp_path / "small.safetensors")["state_dict"][name].numel() == 0

@@ -173,6 +173,22 @@ class TestTidyTraining(BaseTester):
         assert not any(p.requires_grad for p in module.optics.parameters())
         assert module.head.layers[0].weight.is_contiguous(memory_format=torch.channels_last)
 
+    def test_feature_the_refiner_alone_learns_and_depth_stays_as_it_is(self, monkeypatch):
+        refined = {"depth_classes": 6, "refocus": 2, "closed_form": True, "refined": True, "learn": "refiner"}
+        module = made(**refined)
+        (group,) = module.configure_optimizers().param_groups
+        assert {id(p) for p in group["params"]} == {id(p) for p in module.head.refiner.parameters()}
+        monkeypatch.setattr(module, "log", lambda *args, **options: None)
+        module.on_fit_start()
+        module.training_step(batch(), 0).backward()
+        assert {name for name, p in module.named_parameters() if p.grad is not None} == {
+            name for name, _ in module.named_parameters() if name.startswith("head.refiner.")
+        }
+
+    def test_exception_there_is_no_refiner(self):
+        with pytest.raises(ValueError, match="needs a JointClosedFormHead with a refiner"):
+            TidyTraining(build_optics(SETTINGS), nn.Identity(), learn="refiner")
+
     def test_feature_the_psnr_of_validation_is_that_of_the_clipped_image(self, monkeypatch):
         module, logged = made(task="edof", learn="network").eval(), {}
         monkeypatch.setattr(module, "forward", lambda coded, noise=None: coded + 5)

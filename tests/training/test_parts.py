@@ -84,6 +84,16 @@ class TestMovingAverage(BaseTester):
         average.update(network)
         assert torch.equal(average.network.running_mean, network.running_mean)
 
+    def test_feature_buffers_that_stay_are_not_loaded_again(self):
+        network, loaded = nn.BatchNorm1d(2), []
+        average = MovingAverage(network)
+        average.network.register_load_state_dict_post_hook(lambda *_: loaded.append(average))
+        average.update(network)
+        assert not loaded
+        network(torch.randn(8, 2))
+        average.update(network)
+        assert loaded == [average]
+
     @pytest.mark.parametrize("decay", [-0.1, 1.0])
     def test_exception_decay(self, decay):
         with pytest.raises(ValueError, match="must be in"):
@@ -248,6 +258,7 @@ class TestSettings(BaseTester):
             ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', 'psnr-ssim', got 'ssim'"),
             ({"loss": "psnr-ssim", "size": 10}, "'psnr-ssim' needs images of at least 11 pixels a side, got 10"),
             ({"loss": "psnr-ssim", "crop": 8}, "'psnr-ssim' needs images of at least 11 pixels a side, got 8"),
+            ({"learn": "refiner"}, "learn='refiner' needs the second network of refined=True"),
             ({"precision": "64"}, "precision must be one of"),
             ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
@@ -262,7 +273,7 @@ class TestSettings(BaseTester):
             ({"noise_error": 0.5}, "noise_error must be a factor of at least 1, got 0.5"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
-            ({"learn": "masks"}, "learn must be one of 'both', 'network', got 'masks'"),
+            ({"learn": "masks"}, "learn must be one of 'both', 'network', 'refiner', got 'masks'"),
             ({"size": 64, "crop": 65}, "crop must be at most the size of the scenes, 64, got 65"),
             ({"f_number": 0.4}, "f_number must be 0.5 or more, got 0.4"),
             ({"focus": float("nan")}, "focus must be a number of metres, got nan"),
