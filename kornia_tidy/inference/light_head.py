@@ -19,7 +19,7 @@ from kornia_tidy.reconstruction.closed_form import ClosedForm, whole_picture
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.receptive_field import receptive_field
-from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, reconstruct_tiled, shared_copy
+from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, one_tile, reconstruct_tiled, shared_copy
 from kornia_tidy.sensor.noise import SensorNoise
 
 
@@ -142,9 +142,10 @@ def reconstruct_light(
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
     colours = light.expand(3, -1, -1)[None]
     with whole_picture(head, colours):
-        check_seamless(head)  # which does not know of stray light
-        reach = receptive_field(head)
-        cut = None if overlap is None or overlap >= reach else overlap
+        cut = None
+        if one_tile(head, colours, memory_budget) is None:
+            check_seamless(head)  # which does not know of stray light
+            cut = None if overlap is None or overlap >= receptive_field(head) else overlap
         maps: Any = reconstruct_tiled(head, colours, overlap=cut, memory_budget=memory_budget, progress=progress)
     names = [*MAPS[head.task], *(["deviation"] if head.uncertain else [])]
     named = {name: part[0].float() for name, part in zip(names, maps, strict=True)}

@@ -60,14 +60,19 @@ def receptive_field(head: nn.Module) -> int:
         >>> receptive_field(head.eval())
         3
     """
-    if any(module.training for module in head.modules()):
-        raise ValueError("the head must be in eval mode, not training: call head.eval()")
+    check_eval(head)
     for module in head.modules():
         if isinstance(module, ReconstructionHead) and module.whole_image:
             raise ValueError(f"the head cannot be tiled: {type(module).__name__} sees the whole image")
     if head not in _found:
         _found[head] = _measure(copy.deepcopy(head).float().cpu(), total_stride(head))
     return _found[head]
+
+
+def check_eval(head: nn.Module) -> None:
+    """Raise ``ValueError`` for a network in training mode, in which batch statistics depend on all pixels."""
+    if any(module.training for module in head.modules()):
+        raise ValueError("the head must be in eval mode, not training: call head.eval()")
 
 
 def take_receptive_field(copied: nn.Module, head: nn.Module) -> None:

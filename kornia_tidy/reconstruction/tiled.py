@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
-from weakref import WeakSet
+from weakref import WeakKeyDictionary, WeakSet
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,7 @@ from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.reconstruction.closed_form import untold_closed_forms, whole_picture
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import (
+    check_eval,
     input_channels,
     maps_of,
     receptive_field,
@@ -31,6 +32,7 @@ SEAM = 1e-4  # largest difference, relative to the largest output
 _COUNTED_ON = 128  # px; sides of the tile on which memory is counted
 
 _seamless: WeakSet[nn.Module] = WeakSet()
+_counted: WeakKeyDictionary[nn.Module, dict[Any, float]] = WeakKeyDictionary()  # bytes a pixel by kind of image
 
 
 @torch.no_grad()
@@ -49,7 +51,7 @@ def reconstruct_tiled(
     Tiles are cut on the grid of the network's stride, and outputs within its receptive field of a cut are discarded.
     The others equal the result for the whole image up to rounding. The receptive field is measured, see
     :func:`~kornia_tidy.reconstruction.receptive_field.receptive_field`. Networks for which tiles differ from the whole
-    are refused.
+    are refused. An image that fits the memory is one tile, for which nothing is measured and any network is taken.
 
     Args:
         head: network in eval mode, on any device, from (B, C, H, W) to a map of the same size or a tuple of maps.
@@ -65,11 +67,12 @@ def reconstruct_tiled(
         progress: called after each tile with the numbers of finished and of all tiles. Its exceptions end the work.
 
     Returns:
-        The network's output for the whole image. An image that fits the memory is one tile.
+        The network's output for the whole image.
 
     Raises:
         TypeError: if the image is not a floating-point tensor.
-        ValueError: if the network cannot be tiled, a tile is not larger than its overlap, or no tile fits the memory.
+        ValueError: if the network is in training mode or cannot be tiled, a tile is not larger than its overlap, or no
+            tile fits the memory.
 
     Convention:
         Gradients are not computed. Stray light that a network takes away follows from the mean light of the whole
@@ -104,16 +107,36 @@ def _in_tiles(
     out: Tensor | tuple[Tensor, ...] | None,
     progress: Callable[[int, int], object] | None,
 ) -> Any:
+    check_eval(head)
+    like = next(head.parameters(), image)
+    if tile is None and (whole := one_tile(head, image, memory_budget)) is not None:
+        return _run(head, image, whole, whole.whole, like, out, progress)
     if overlap is None:
         check_seamless(head)
         overlap = receptive_field(head)
     grid = TileGrid((image.shape[-2], image.shape[-1]), total_stride(head), overlap)
-    like = next(head.parameters(), image)
     if tile is None:
-        sides = _sides_that_fit(head, grid, like.new_empty((*image.shape[:2], 0, 0)), memory_budget)
+        sides = _sides_that_fit(head, grid, image, memory_budget)
     else:
         sides = grid.sides_within((tile, tile) if isinstance(tile, int) else tile)
     return _run(head, image, grid, sides, like, out, progress)
+
+
+def one_tile(head: nn.Module, image: Tensor, memory_budget: int) -> TileGrid | None:
+    """Return the grid of an image that a network may see as one tile within the memory; None if it must be cut.
+
+    Args:
+        head: network in eval mode.
+        image: (B, C, H, W).
+        memory_budget: bytes that the network may use, beyond its weights, the image and the result.
+
+    Example:
+        >>> image = torch.rand(1, 3, 64, 64)
+        >>> one_tile(nn.Conv2d(3, 8, 1), image, 1 << 20).whole, one_tile(nn.Conv2d(3, 8, 1), image, 1 << 10)
+        ((64, 64), None)
+    """
+    grid = TileGrid((image.shape[-2], image.shape[-1]), total_stride(head), overlap=0)
+    return grid if _bytes_a_pixel(head, image) * grid.whole[0] * grid.whole[1] <= memory_budget else None
 
 
 def shared_copy(head: nn.Module) -> nn.Module:
@@ -133,6 +156,7 @@ def shared_copy(head: nn.Module) -> nn.Module:
     """
     shared = {id(tensor): tensor for tensor in (*head.parameters(), *head.buffers())}
     copied = copy.deepcopy(head, shared)
+    _counted[copied] = _counted.setdefault(head, {})
     if head in _seamless:
         _seamless.add(copied)
         take_receptive_field(copied, head)
@@ -177,10 +201,21 @@ def _blank(output: Any, image: Tensor) -> Any:
     return type(output)(*maps) if hasattr(output, "_fields") else tuple(maps)
 
 
-def _sides_that_fit(head: nn.Module, grid: TileGrid, like: Tensor, memory_budget: int) -> tuple[int, int]:
-    """Return the sides of the tile with the least computation within the memory, which is linear in its pixels."""
-    side = -(-_COUNTED_ON // grid.stride) * grid.stride
-    each = head_bytes(head, like.new_zeros(*like.shape[:2], side, side)) / side**2
+def _bytes_a_pixel(head: nn.Module, image: Tensor) -> float:
+    """Return the memory of a network for an image, which is linear in its pixels; counted once for a network."""
+    like = next(head.parameters(), image)
+    kind = (*image.shape[:2], like.dtype, like.device)
+    counted = _counted.setdefault(head, {})
+    if kind not in counted:
+        stride = total_stride(head)
+        side = -(-_COUNTED_ON // stride) * stride
+        counted[kind] = head_bytes(head, like.new_zeros(*image.shape[:2], side, side)) / side**2
+    return counted[kind]
+
+
+def _sides_that_fit(head: nn.Module, grid: TileGrid, image: Tensor, memory_budget: int) -> tuple[int, int]:
+    """Return the sides of the tile with the least computation within the memory."""
+    each = _bytes_a_pixel(head, image)
     sides = grid.cheapest_sides(int(memory_budget / each))
     if sides is None:
         rows, columns = grid.smallest_sides()

@@ -133,7 +133,8 @@ class TidyTraining(pl.LightningModule):
         if learn == "refiner":
             if not isinstance(head, JointClosedFormHead) or head.refiner is None:
                 raise ValueError("learn='refiner' needs a JointClosedFormHead with a refiner")
-            head.requires_grad_(requires_grad=False).refiner.requires_grad_()
+            head.requires_grad_(requires_grad=False)
+            head.refiner.requires_grad_()
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.head = head.to(memory_format=self.memory_format) if channels_last else head  # ty: ignore[no-matching-overload]
         self.takes_noise = takes_noise(head)

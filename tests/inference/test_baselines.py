@@ -105,7 +105,7 @@ class TestMonocularDepth(BaseTester):
 
     def test_exception_tiles(self):
         with pytest.raises(ValueError, match="cannot be tiled: MonocularDepth sees the whole image"):
-            reconstruct_tiled(nn.Sequential(red()).eval(), torch.rand(1, 3, 60, 60))
+            reconstruct_tiled(nn.Sequential(red()).eval(), torch.rand(1, 3, 60, 60), tile=28)
 
     def test_gradcheck(self):
         self.gradcheck(red(**PLAIN).double(), (torch.rand(1, 3, 9, 12),))
