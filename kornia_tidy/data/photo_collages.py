@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from numbers import Integral
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,9 +23,15 @@ from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.seeds import keyed_seed
 
-PIXELS_A_LEAF = (1500.0, 150_000.0)  # of the final picture, uniform in its logarithm over the scenes
+PIXELS_A_LEAF = (300.0, 40_000.0)  # of the final picture, uniform in its logarithm over the scenes
+DISPLACED_SHARE = 0.5  # share of scenes whose depth has outlines beside those of the image, as sensors have
+OFFSET = 3.0  # largest offset of depth along rows in pixels, as by the distance between two lenses
+WAVES = (12.0, 40.0)  # pixels between the nodes of a smooth displacement, uniform in its logarithm
+WAVE, RAGGED = 1.5, 0.7  # standard deviations in pixels of that displacement, and of one for each pixel
 MOST_PHOTOGRAPHS = 4  # that a scene shows
 REDUCTION = (1.0, 3.0)  # of a photograph's sides, uniform in its logarithm
+CONTRAST = (0.2, 1.0)  # of a leaf's texture with its surroundings in the photograph, uniform over the leaves
+AROUND = 16  # painted pixels over which the surroundings are averaged
 EXPOSURE, TINT = 0.25, 0.15  # standard deviations of the logarithms of a leaf's light and of its three colours
 
 
@@ -40,8 +47,10 @@ def photo_collage(
 
     Shapes and depths are those of :func:`~kornia_tidy.data.dead_leaves.dead_leaves`, sampling and softness those of
     :func:`~kornia_tidy.data.photographic_leaves.photographic_leaves`. A scene shows up to four photographs, reduced to
-    a third of their sides or more, in one shape for 1,500 to 150,000 pixels. Shapes differ in exposure and tint. Depth
-    has nothing to do with what the photographs show, so that a network can learn it from defocus alone.
+    a third of their sides or more, in one shape for 300 to 40,000 pixels. Shapes differ in exposure, tint and the
+    contrast of their texture. Depth has nothing to do with what the photographs show, so that a network can learn it
+    from defocus alone. In half of the scenes outlines of depth lie some pixels beside those of the image, as in the
+    depth maps of sensors.
 
     Args:
         photographs: paths of files that :func:`~kornia_tidy.data.image_files.read_image` reads, in sRGB, all of them
@@ -86,7 +95,10 @@ def photo_collage(
     index, inverse_depth = rasterise(ZOOM * height, ZOOM * width, leaves)
     image = photographed(_collage(index, photographs, rng).clip(0, 1), rng)
 
-    depth = depth_of(of_most(inverse_depth), near, far)
+    inverse_depth = of_most(inverse_depth)
+    if rng.random() < DISPLACED_SHARE:
+        inverse_depth = displaced(inverse_depth, rng)
+    depth = depth_of(inverse_depth, near, far)
     encoded = linear_rgb_to_rgb(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None])[0]
     return encoded.clamp(0, 1), torch.from_numpy(depth[None])
 
@@ -172,6 +184,32 @@ def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:
     return found
 
 
+def displaced(plane: NDArray[Any], rng: Generator) -> NDArray[Any]:
+    """Return a plane (H, W) whose outlines are moved by a few pixels: all alike, in smooth waves, and raggedly.
+
+    Depth maps of sensors are so: another lens saw them, holes at outlines were filled, and edges are ragged. No values
+    are mixed.
+
+    Args:
+        plane: such as inverse depth.
+        rng: of all that is random.
+
+    Example:
+        >>> plane = np.repeat([[0.0, 1.0]], 64, 1).repeat(128, 0)
+        >>> moved = displaced(plane, np.random.default_rng(0))
+        >>> set(moved.flat) == {0.0, 1.0}, bool((moved != plane).any())
+        (True, True)
+    """
+    rows, columns = plane.shape
+    spacing = WAVES[0] * (WAVES[1] / WAVES[0]) ** rng.random()
+    nodes = rng.normal(0, WAVE, (round(rows / spacing) + 2, round(columns / spacing) + 2, 2))
+    waves = cv2.resize(nodes, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    moved = waves + rng.normal(0, RAGGED, (rows, columns, 2)) + np.array([rng.uniform(-OFFSET, OFFSET), 0.0])
+    across, along = np.meshgrid(np.arange(columns), np.arange(rows))
+    place = np.rint(moved).astype(np.intp)
+    return plane[(along + place[..., 1]).clip(0, rows - 1), (across + place[..., 0]).clip(0, columns - 1)]
+
+
 def _collage(
     index: NDArray[np.int32], photographs: Sequence[str | os.PathLike[str]], rng: Generator
 ) -> NDArray[np.float32]:
@@ -180,13 +218,23 @@ def _collage(
     leaves = int(index.max()) + 1
     photograph = rng.integers(len(shown), size=leaves)
     gain = np.exp(rng.normal(0, EXPOSURE, (leaves, 1)) + rng.normal(0, TINT, (leaves, 3))).astype(np.float32)
+    contrast = rng.uniform(*CONTRAST, (leaves, 1)).astype(np.float32)
     light = np.empty((*index.shape, 3), np.float32)
     for number, place in enumerate(shown):
         draws = rng.random(4)  # however many leaves show it, if any
         here = photograph[index] == number
         if here.any():
-            light[here] = _cut(photographs[place], *index.shape, draws)[here]
+            cut = _cut(photographs[place], *index.shape, draws)
+            around = _surroundings(cut)[here]
+            light[here] = around + contrast[index[here]] * (cut[here] - around)
     return light * gain[index]
+
+
+def _surroundings(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean light around each painted pixel, interpolated between the means of squares."""
+    rows, columns = light.shape[:2]
+    small = cv2.resize(light, (-(-columns // AROUND), -(-rows // AROUND)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR)
 
 
 def _cut(path: str | os.PathLike[str], height: int, width: int, draws: NDArray[np.float64]) -> NDArray[np.float32]:

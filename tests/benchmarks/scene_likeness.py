@@ -9,6 +9,9 @@ All pictures are cut into tiles of 224 px and rounded to 8 bits. Each scene coun
 - spectrum: root mean square difference over octave thirds of the mean log power of linear light, in dB;
 - gradients, light, colour: total variation distance (0 to 1) of the histograms of differences between neighbouring
   pixels, of luminance, and of two colour differences, all of sRGB values.
+
+A second table is about outlines of depth: how many pixels lie at them, and how much steeper the image is there than far
+from them. Where a sensor's depth map is some pixels beside the image, it is no steeper.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from kornia.color import rgb_to_linear_rgb
@@ -28,6 +32,9 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.photo_collages import PhotoCollages, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves
 from kornia_tidy.data.scene_dataset import SceneDataset
+from kornia_tidy.inference.tasks import normalised_inverse_depth
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from tests.benchmarks.results.scenes import real_scenes
 from tests.scenes import ENTRIES, load_scene
 
 TILE = 224
@@ -37,6 +44,10 @@ STEPS = np.array([0, 0.5, 1.5, 3.5, 7.5, 15.5, 31.5, 63.5, 256]) / 255  # of gra
 LEVELS = np.linspace(0, 1, 17)
 CHROMA = np.concatenate([[-1], np.linspace(-0.3, 0.3, 16), [1]])
 SEED = 20261122  # of no training
+JUMP = 0.06  # of normalised inverse depth, between neighbouring pixels
+AT, FAR = 1.5, 14.0  # px from an outline
+FEWEST = 50  # outline pixels that a scene must have
+DEPTHS = ThinLensCamera().depth_range
 
 
 def half_a() -> list[str]:
@@ -90,6 +101,32 @@ def distances(one: Statistics, other: Statistics) -> tuple[float, float, float, 
     return spectrum, *(float(value) for value in histograms)  # ty: ignore[invalid-return-type]
 
 
+class Outlines(NamedTuple):
+    """Of depth, for each scene."""
+
+    shares: list[float]
+    """Of pixels at which depth jumps."""
+    steepness: list[float]
+    """Mean gradient of the image at outlines over that far from them; scenes with few outlines are left out."""
+
+
+def outlines(scenes: Iterable[tuple[Tensor, Tensor]]) -> Outlines:
+    """Return how outlines of depth lie in scenes: images (3, H, W) and normalised inverse depths (1, H, W)."""
+    found = Outlines([], [])
+    for image, depth in scenes:
+        luma = cv2.GaussianBlur(np.tensordot(LUMA, image.double().numpy(), 1), (0, 0), 0.7)
+        gradient = np.hypot(cv2.Sobel(luma, -1, 1, 0), cv2.Sobel(luma, -1, 0, 1))
+        plane = depth[0].double().numpy()
+        jumps = [np.abs(np.diff(plane, axis=axis, prepend=plane.take([0], axis))) for axis in (0, 1)]
+        edge = np.maximum(*jumps) > JUMP
+        found.shares.append(float(edge.mean()))
+        distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
+        far = distance > FAR
+        if edge.sum() >= FEWEST and far.any():
+            found.steepness.append(float(gradient[distance < AT].mean() / gradient[far].mean()))
+    return found
+
+
 def _tile_statistics(tile: Tensor) -> tuple[NDArray[np.float64] | float, ...]:
     linear = np.tensordot(LUMA, rgb_to_linear_rgb(tile[None])[0].double().numpy(), 1)
     luma = np.tensordot(LUMA, tile.double().numpy(), 1)
@@ -124,11 +161,13 @@ def main() -> None:
     pictures = {name: load_scene(name).image for name in half_a()}
     photographs = [image.expand(3, -1, -1) for name, image in pictures.items() if not name.startswith("flying")]
     painted: dict[str, SceneDataset] = {
-        "dead leaves": DeadLeaves(count, 256, 256, seed=SEED),
-        "photographic leaves": PhotographicLeaves(count, 256, 256, seed=SEED),
+        "dead leaves": DeadLeaves(count, 256, 256, depth_range=DEPTHS, seed=SEED),
+        "photographic leaves": PhotographicLeaves(count, 256, 256, depth_range=DEPTHS, seed=SEED),
     }
     if args.photographs is not None:
-        painted["photo collages"] = PhotoCollages(photographs_in(args.photographs), count, 256, 256, seed=SEED)
+        painted["photo collages"] = PhotoCollages(
+            photographs_in(args.photographs), count, 256, 256, depth_range=DEPTHS, seed=SEED
+        )
     sets = {
         f"photographs of half A ({len(photographs)})": photographs,
         "every second one of them": photographs[::2],
@@ -148,6 +187,18 @@ def main() -> None:
         spectrum, *histograms = distances(reference, own)
         cells = [f"{spectrum:.1f}", *(f"{value:.3f}" for value in histograms)]
         print(f"| {name} | {' | '.join(cells)} | {own.exponent:.2f} | {own.mean:.3f} | {own.spread:.3f} |")
+    print(
+        "\n| scenes | pixels at outlines of depth | image there, times as steep: quartiles of scenes |\n|---|---|---|"
+    )
+    real, camera = real_scenes(), ThinLensCamera()
+    with_depth = {"half A": [(scene.image[0], scene.inverse_depth[0]) for scene in map(real.load, real.half_a)]}
+    for name, scenes in painted.items():
+        items = [scenes[i] for i in range(count)]
+        with_depth[name] = [(item["image"], normalised_inverse_depth(camera, item["depth"])) for item in items]
+    for name, pairs_of_maps in with_depth.items():
+        shares, steepness = outlines(pairs_of_maps)
+        quartiles = ", ".join(f"{value:.1f}" for value in np.percentile(steepness, (25, 50, 75)))
+        print(f"| {name} ({len(shares)}) | {100 * np.mean(shares):.1f} % | {quartiles} |")
 
 
 if __name__ == "__main__":

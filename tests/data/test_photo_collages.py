@@ -14,7 +14,7 @@ from kornia.color import rgb_to_linear_rgb
 
 from kornia_tidy.data import PhotoCollages, photo_collage, photographs_in
 from kornia_tidy.data import photo_collages as module
-from kornia_tidy.data.photo_collages import _cut
+from kornia_tidy.data.photo_collages import _cut, displaced
 from tests.base import BaseTester
 
 COLOURS = {"red": (200, 30, 20), "green": (25, 150, 60), "blue": (30, 60, 220)}
@@ -84,7 +84,7 @@ class TestPhotoCollage(BaseTester):
         parts = torch.cartesian_prod(*(torch.arange(5) for _ in COLOURS))
         parts = parts[parts.sum(1) == 4]
         mixtures = parts.double() @ light / 4
-        for seed in range(12):
+        for seed in range(40):
             image, _ = photo_collage(paths, 64, 64, seed=seed)
             pixels = rgb_to_linear_rgb(image[None])[0].flatten(1).T.double()
             away = (pixels[:, None] - mixtures).abs().amax(-1)
@@ -121,6 +121,41 @@ class TestPhotoCollage(BaseTester):
             cut = _cut(tmp_path / "ramp.png", size, size, np.array((draw, 0.5, 0.5, 1.0)))
             found = float(np.diff(cut[size // 2, 5:-5, 0]).mean())
             assert found == pytest.approx(slope * reduction, rel=0.03), (draw, size)
+
+    def test_feature_contrast_is_that_of_texture_and_leaves_the_light_around_it(self, tmp_path, monkeypatch):
+        """Of a board of single dark and bright pixels."""
+        board = np.where(np.indices((96, 96)).sum(0) % 2, 200, 60).astype(np.uint8)
+        assert cv2.imwrite(str(tmp_path / "board.png"), board)
+        monkeypatch.setattr(module, "REDUCTION", (2.0, 2.0))  # a pixel of the file for each sample
+        index = np.zeros((96, 96), np.int32)
+        found = {}
+        for contrast in (1.0, 0.25):
+            monkeypatch.setattr(module, "CONTRAST", (contrast, contrast))
+            light = module._collage(index, [tmp_path / "board.png"], np.random.default_rng(0))
+            found[contrast] = (float(light.mean()), float(light.std()))
+        assert found[0.25] == (pytest.approx(found[1.0][0], rel=1e-3), pytest.approx(found[1.0][1] / 4, rel=1e-3))
+
+    def test_feature_outlines_of_depth_lie_beside_those_of_the_image_in_a_share_of_the_scenes(self, folder, monkeypatch):
+        scenes = {}
+        for share in (0.0, 1.0):
+            monkeypatch.setattr(module, "DISPLACED_SHARE", share)
+            scenes[share] = photo_collage(photographs_in(folder), 64, 64, depth_range=(1.0, 2.0), seed=4)
+        assert torch.equal(scenes[0.0][0], scenes[1.0][0])
+        moved = (scenes[0.0][1] != scenes[1.0][1]).float().mean()
+        assert 0.01 < moved < 0.9  # planes are tilted, so that most depths differ by a little
+        assert (scenes[0.0][1] - scenes[1.0][1]).abs().mean() < 0.1
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_feature_an_outline_is_moved_in_smooth_waves_and_raggedly(self, seed):
+        """By all of the offset, and by what six standard deviations allow."""
+        plane = np.repeat([[0.0, 1.0]], 64, 1).repeat(400, 0)
+        moved = displaced(plane, np.random.default_rng(seed))
+        assert set(moved.flat) == {0.0, 1.0}
+        place = 128 - moved.sum(1)  # of the outline in each row
+        assert abs(place - 64).max() <= module.OFFSET + 6 * (module.WAVE + module.RAGGED)
+        assert 0.5 < place.std() < 6
+        near, far = (np.corrcoef(place[:-step], place[step:])[0, 1] for step in (1, 150))
+        assert near > max(0.3, far)
 
     def test_feature_depth_is_uniform_in_no_photograph(self, folder):
         """Depth does not follow from what is shown: over many scenes each photograph is seen near and far."""
