@@ -135,7 +135,7 @@ class TestPhotoCollage(BaseTester):
             found[contrast] = (float(light.mean()), float(light.std()))
         assert found[0.25] == (pytest.approx(found[1.0][0], rel=1e-3), pytest.approx(found[1.0][1] / 4, rel=1e-3))
 
-    def test_feature_outlines_of_depth_lie_beside_those_of_the_image_in_a_share_of_the_scenes(self, folder, monkeypatch):
+    def test_feature_outlines_of_depth_lie_beside_those_of_the_image_in_a_share_of_scenes(self, folder, monkeypatch):
         scenes = {}
         for share in (0.0, 1.0):
             monkeypatch.setattr(module, "DISPLACED_SHARE", share)
