@@ -234,7 +234,7 @@ def _surroundings(light: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean light around each painted pixel, interpolated between the means of squares."""
     rows, columns = light.shape[:2]
     small = cv2.resize(light, (-(-columns // AROUND), -(-rows // AROUND)), interpolation=cv2.INTER_AREA)
-    return cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR).astype(np.float32, copy=False)
 
 
 def _cut(path: str | os.PathLike[str], height: int, width: int, draws: NDArray[np.float64]) -> NDArray[np.float32]:
