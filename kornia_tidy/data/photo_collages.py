@@ -24,7 +24,7 @@ from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.seeds import keyed_seed
 
 PIXELS_A_LEAF = (300.0, 40_000.0)  # of the final picture, uniform in its logarithm over the scenes
-DISPLACED_SHARE = 0.5  # share of scenes whose depth has outlines beside those of the image, as sensors have
+DISPLACED_SHARE = 0.5  # share of scenes with outlines of depth beside those of the image, as in depth maps of sensors
 OFFSET = 3.0  # largest offset of depth along rows in pixels, as by the distance between two lenses
 WAVES = (12.0, 40.0)  # pixels between the nodes of a smooth displacement, uniform in its logarithm
 WAVE, RAGGED = 1.5, 0.7  # standard deviations in pixels of that displacement, and of one for each pixel
@@ -185,7 +185,7 @@ def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def displaced(plane: NDArray[Any], rng: Generator) -> NDArray[Any]:
-    """Return a plane (H, W) whose outlines are moved by a few pixels: all alike, in smooth waves, and raggedly.
+    """Move the outlines of a plane (H, W) by a few pixels: all of them alike, in smooth waves, and raggedly.
 
     Depth maps of sensors are so: another lens saw them, holes at outlines were filled, and edges are ragged. No values
     are mixed.

@@ -48,7 +48,7 @@ def charbonnier_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = N
 
 
 def psnr_ssim_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return what restored images are judged by, as a loss: the negative PSNR, and structural dissimilarity.
+    r"""Return the negative PSNR plus structural dissimilarity, by which restored images are judged.
 
     .. math:: L = 10 \log_{10}(\mathrm{MSE} + 10^{-5}) + 20 \, (1 - \mathrm{SSIM})
 
