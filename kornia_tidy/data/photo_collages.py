@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from numbers import Integral
@@ -28,6 +29,10 @@ DISPLACED_SHARE = 0.5  # share of scenes with outlines of depth beside those of 
 OFFSET = 3.0  # largest offset of depth along rows in pixels, as by the distance between two lenses
 WAVES = (12.0, 40.0)  # pixels between the nodes of a smooth displacement, uniform in its logarithm
 WAVE, RAGGED = 1.5, 0.7  # standard deviations in pixels of that displacement, and of one for each pixel
+GRAINY_SHARE = 0.5  # share of scenes with grain of their own, as pictures of small sensors have
+GRAIN = (0.002, 0.012)  # its standard deviation in the encoded picture, uniform in its logarithm
+GRAIN_SIZE = (0.3, 1.5)  # standard deviation in pixels of the blur that made it coarse, uniform in its logarithm
+GRAIN_COLOR = 0.5  # share of its variance that is not common to the colours
 MOST_PHOTOGRAPHS = 4  # that a scene shows
 REDUCTION = (1.0, 3.0)  # of a photograph's sides, uniform in its logarithm
 CONTRAST = (0.2, 1.0)  # of a leaf's texture with its surroundings in the photograph, uniform over the leaves
@@ -50,7 +55,7 @@ def photo_collage(
     a third of their sides or more, in one shape for 300 to 40,000 pixels. Shapes differ in exposure, tint and the
     contrast of their texture. Depth has nothing to do with what the photographs show, so that a network can learn it
     from defocus alone. In half of the scenes outlines of depth lie some pixels beside those of the image, as in the
-    depth maps of sensors.
+    depth maps of sensors, and half have grain, as pictures of small sensors.
 
     Args:
         photographs: paths of files that :func:`~kornia_tidy.data.image_files.read_image` reads, in sRGB, all of them
@@ -100,6 +105,8 @@ def photo_collage(
         inverse_depth = displaced(inverse_depth, rng)
     depth = depth_of(inverse_depth, near, far)
     encoded = linear_rgb_to_rgb(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None])[0]
+    if rng.random() < GRAINY_SHARE:
+        encoded = encoded + torch.from_numpy(grain(height, width, rng))
     return encoded.clamp(0, 1), torch.from_numpy(depth[None])
 
 
@@ -208,6 +215,28 @@ def displaced(plane: NDArray[Any], rng: Generator) -> NDArray[Any]:
     across, along = np.meshgrid(np.arange(columns), np.arange(rows))
     place = np.rint(moved).astype(np.intp)
     return plane[(along + place[..., 1]).clip(0, rows - 1), (across + place[..., 0]).clip(0, columns - 1)]
+
+
+def grain(height: int, width: int, rng: Generator) -> NDArray[np.float32]:
+    """Return grain of an encoded picture, (3, H, W): normal, of one strength and size, in part common to the colours.
+
+    Demosaicking and compression made it coarse. A network that never saw grain takes it for texture, and draws lines.
+
+    Args:
+        height: rows in pixels.
+        width: columns in pixels.
+        rng: of all that is random.
+
+    Example:
+        >>> drawn = grain(64, 64, np.random.default_rng(0))
+        >>> drawn.shape, bool(GRAIN[0] <= drawn.std() <= GRAIN[1])
+        ((3, 64, 64), True)
+    """
+    strength, size = (least * (most / least) ** rng.random() for least, most in (GRAIN, GRAIN_SIZE))
+    common, own = rng.normal(size=(height, width, 1)), rng.normal(size=(height, width, 3))
+    drawn = math.sqrt(1 - GRAIN_COLOR) * common + math.sqrt(GRAIN_COLOR) * own
+    drawn = cv2.GaussianBlur(drawn, (0, 0), size)
+    return (strength / max(drawn.std(), 1e-6) * drawn).transpose(2, 0, 1).astype(np.float32)
 
 
 def _collage(

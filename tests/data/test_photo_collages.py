@@ -14,7 +14,7 @@ from kornia.color import rgb_to_linear_rgb
 
 from kornia_tidy.data import PhotoCollages, photo_collage, photographs_in
 from kornia_tidy.data import photo_collages as module
-from kornia_tidy.data.photo_collages import _cut, displaced
+from kornia_tidy.data.photo_collages import _cut, displaced, grain
 from tests.base import BaseTester
 
 COLOURS = {"red": (200, 30, 20), "green": (25, 150, 60), "blue": (30, 60, 220)}
@@ -34,16 +34,17 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def _as_photographed(request, monkeypatch):
-    """Unless a test is about them, shapes have the exposure and tint of the photographs, and no scene is softened."""
+    """Unless a test is about them, shapes are exposed and tinted as the photographs, no scene is softened or grainy."""
     if "varied" not in request.fixturenames:
         monkeypatch.setattr(module, "EXPOSURE", 0.0)
         monkeypatch.setattr(module, "TINT", 0.0)
+        monkeypatch.setattr(module, "GRAINY_SHARE", 0.0)
         monkeypatch.setattr(sys.modules["kornia_tidy.data.photographic_leaves"], "SOFT_SHARE", 0.0)
 
 
 @pytest.fixture
 def varied():
-    """Exposure, tint and softness as they are."""
+    """Exposure, tint, softness and grain as they are."""
 
 
 class TestPhotographs(BaseTester):
@@ -156,6 +157,32 @@ class TestPhotoCollage(BaseTester):
         assert 0.5 < place.std() < 6
         near, far = (np.corrcoef(place[:-step], place[step:])[0, 1] for step in (1, 150))
         assert near > max(0.3, far)
+
+    def test_feature_a_share_of_scenes_has_grain(self, folder, monkeypatch):
+        scenes = {}
+        for share in (0.0, 1.0):
+            monkeypatch.setattr(module, "GRAINY_SHARE", share)
+            scenes[share] = photo_collage(photographs_in(folder), 64, 64, depth_range=(1.0, 2.0), seed=4)
+        assert torch.equal(scenes[0.0][1], scenes[1.0][1])
+        difference = scenes[1.0][0] - scenes[0.0][0]
+        assert module.GRAIN[0] / 2 < difference.std() < module.GRAIN[1]  # less where it is clipped
+
+    @pytest.mark.parametrize("size", [0.5, 1.0, 1.5])
+    def test_feature_grain_has_its_strength_size_and_colour(self, size, monkeypatch):
+        """Of white noise blurred by a Gaussian, neighbours correlate by exp(-1 / (4 size^2))."""
+        monkeypatch.setattr(module, "GRAIN", (0.01, 0.01))
+        monkeypatch.setattr(module, "GRAIN_SIZE", (size, size))
+        drawn = grain(400, 300, np.random.default_rng(0)).astype(np.float64)
+        independent = drawn[0].size / (4 * np.pi * size**2)  # samples, about
+        bound = 6 / np.sqrt(independent)
+        assert drawn.std() == pytest.approx(0.01, rel=1e-5)
+        assert abs(drawn.mean()) < bound * 0.01
+        for step in (drawn[:, 1:] * drawn[:, :-1], drawn[:, :, 1:] * drawn[:, :, :-1]):
+            sampled = np.exp(-(np.arange(-9, 10) ** 2) / (2 * size**2))  # as OpenCV samples the Gaussian
+            expected = (sampled[1:] @ sampled[:-1]) / (sampled @ sampled)
+            assert step.mean() / 0.01**2 == pytest.approx(expected, abs=bound)
+        between = np.corrcoef(drawn.reshape(3, -1))[np.triu_indices(3, 1)]
+        assert abs(between - (1 - module.GRAIN_COLOR)).max() < bound
 
     def test_feature_depth_is_uniform_in_no_photograph(self, folder):
         """Depth does not follow from what is shown: over many scenes each photograph is seen near and far."""
