@@ -220,7 +220,7 @@ def displaced(plane: NDArray[Any], rng: Generator) -> NDArray[Any]:
 def grain(height: int, width: int, rng: Generator) -> NDArray[np.float32]:
     """Return grain of an encoded picture, (3, H, W): normal, of one strength and size, in part common to the colours.
 
-    Demosaicking and compression made it coarse. A network that never saw grain takes it for texture, and draws lines.
+    Demosaicking and compression made it coarse. A network that seldom saw grain takes it for texture.
 
     Args:
         height: rows in pixels.
