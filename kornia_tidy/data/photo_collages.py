@@ -236,7 +236,7 @@ def grain(height: int, width: int, rng: Generator) -> NDArray[np.float32]:
     common, own = rng.normal(size=(height, width, 1)), rng.normal(size=(height, width, 3))
     drawn = math.sqrt(1 - GRAIN_COLOR) * common + math.sqrt(GRAIN_COLOR) * own
     drawn = cv2.GaussianBlur(drawn, (0, 0), size)
-    return (strength / max(drawn.std(), 1e-6) * drawn).transpose(2, 0, 1).astype(np.float32)
+    return (strength / drawn.std() * drawn).transpose(2, 0, 1).astype(np.float32)
 
 
 def _collage(

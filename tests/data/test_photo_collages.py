@@ -59,6 +59,14 @@ class TestPhotographs(BaseTester):
 
 
 class TestPhotoCollage(BaseTester):
+    def in_no_scene_and_in_each(self, share, folder, monkeypatch):
+        """Return one scene, image and depth, with a share of scenes at 0, and with it at 1."""
+        scenes = []
+        for value in (0.0, 1.0):
+            monkeypatch.setattr(module, share, value)
+            scenes.append(photo_collage(photographs_in(folder), 64, 64, depth_range=(1.0, 2.0), seed=4))
+        return scenes
+
     @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 50), (7, 3), (33, 64), (130, 20)])
     def test_cardinality(self, height, width, folder):
         image, depth = photo_collage(photographs_in(folder), height, width)
@@ -137,14 +145,10 @@ class TestPhotoCollage(BaseTester):
         assert found[0.25] == (pytest.approx(found[1.0][0], rel=1e-3), pytest.approx(found[1.0][1] / 4, rel=1e-3))
 
     def test_feature_outlines_of_depth_lie_beside_those_of_the_image_in_a_share_of_scenes(self, folder, monkeypatch):
-        scenes = {}
-        for share in (0.0, 1.0):
-            monkeypatch.setattr(module, "DISPLACED_SHARE", share)
-            scenes[share] = photo_collage(photographs_in(folder), 64, 64, depth_range=(1.0, 2.0), seed=4)
-        assert torch.equal(scenes[0.0][0], scenes[1.0][0])
-        moved = (scenes[0.0][1] != scenes[1.0][1]).float().mean()
-        assert 0.01 < moved < 0.9  # planes are tilted, so that most depths differ by a little
-        assert (scenes[0.0][1] - scenes[1.0][1]).abs().mean() < 0.1
+        (image, depth), (same, moved) = self.in_no_scene_and_in_each("DISPLACED_SHARE", folder, monkeypatch)
+        assert torch.equal(image, same)
+        assert 0.01 < (depth != moved).float().mean() < 0.9  # planes are tilted, so that most depths differ by a little
+        assert (depth - moved).abs().mean() < 0.1
 
     @pytest.mark.parametrize("seed", range(4))
     def test_feature_an_outline_is_moved_in_smooth_waves_and_raggedly(self, seed):
@@ -159,13 +163,9 @@ class TestPhotoCollage(BaseTester):
         assert near > max(0.3, far)
 
     def test_feature_a_share_of_scenes_has_grain(self, folder, monkeypatch):
-        scenes = {}
-        for share in (0.0, 1.0):
-            monkeypatch.setattr(module, "GRAINY_SHARE", share)
-            scenes[share] = photo_collage(photographs_in(folder), 64, 64, depth_range=(1.0, 2.0), seed=4)
-        assert torch.equal(scenes[0.0][1], scenes[1.0][1])
-        difference = scenes[1.0][0] - scenes[0.0][0]
-        assert module.GRAIN[0] / 2 < difference.std() < module.GRAIN[1]  # less where it is clipped
+        (image, depth), (grainy, same) = self.in_no_scene_and_in_each("GRAINY_SHARE", folder, monkeypatch)
+        assert torch.equal(depth, same)
+        assert module.GRAIN[0] / 2 < (grainy - image).std() < module.GRAIN[1]  # less where it is clipped
 
     @pytest.mark.parametrize("size", [0.5, 1.0, 1.5])
     def test_feature_grain_has_its_strength_size_and_colour(self, size, monkeypatch):
