@@ -167,7 +167,7 @@ class TestPhotoCollage(BaseTester):
         assert torch.equal(depth, same)
         assert module.GRAIN[0] / 2 < (grainy - image).std() < module.GRAIN[1]  # less where it is clipped
 
-    @pytest.mark.parametrize("size", [0.5, 1.0, 1.5])
+    @pytest.mark.parametrize("size", [0.5, 1.5, 3.0])
     def test_feature_grain_has_its_strength_size_and_colour(self, size, monkeypatch):
         """Of white noise blurred by a Gaussian, neighbours correlate by exp(-1 / (4 size^2))."""
         monkeypatch.setattr(module, "GRAIN", (0.01, 0.01))
