@@ -36,6 +36,7 @@ GRAIN_COLOR = 0.5  # share of its variance that is not common to the colours
 MOST_PHOTOGRAPHS = 4  # that a scene shows
 REDUCTION = (1.0, 3.0)  # of a photograph's sides, uniform in its logarithm
 CONTRAST = (0.2, 1.0)  # of a leaf's texture with its surroundings in the photograph, uniform over the leaves
+BLANK_SHARE = 0.2  # share of leaves without texture, which are smoothly shaded as walls are
 AROUND = 16  # painted pixels over which the surroundings are averaged
 EXPOSURE, TINT = 0.25, 0.15  # standard deviations of the logarithms of a leaf's light and of its three colours
 
@@ -53,9 +54,10 @@ def photo_collage(
     Shapes and depths are those of :func:`~kornia_tidy.data.dead_leaves.dead_leaves`, sampling and softness those of
     :func:`~kornia_tidy.data.photographic_leaves.photographic_leaves`. A scene shows up to four photographs, reduced to
     a third of their sides or more, in one shape for 300 to 40,000 pixels. Shapes differ in exposure, tint and the
-    contrast of their texture. Depth has nothing to do with what the photographs show, so that a network can learn it
-    from defocus alone. In half of the scenes outlines of depth lie some pixels beside those of the image, as in the
-    depth maps of sensors, and half have grain, as pictures of small sensors.
+    contrast of their texture; a fifth has none, only the light around it. Depth has nothing to do with what the
+    photographs show, so that a network can learn it from defocus alone. In half of the scenes outlines of depth lie
+    some pixels beside those of the image, as in the depth maps of sensors, and half have grain, as pictures of small
+    sensors.
 
     Args:
         photographs: paths of files that :func:`~kornia_tidy.data.image_files.read_image` reads, in sRGB, all of them
@@ -248,6 +250,7 @@ def _collage(
     photograph = rng.integers(len(shown), size=leaves)
     gain = np.exp(rng.normal(0, EXPOSURE, (leaves, 1)) + rng.normal(0, TINT, (leaves, 3))).astype(np.float32)
     contrast = rng.uniform(*CONTRAST, (leaves, 1)).astype(np.float32)
+    contrast[rng.random(leaves) < BLANK_SHARE] = 0
     light = np.empty((*index.shape, 3), np.float32)
     for number, place in enumerate(shown):
         draws = rng.random(4)  # however many leaves show it, if any

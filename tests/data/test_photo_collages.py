@@ -136,6 +136,7 @@ class TestPhotoCollage(BaseTester):
         board = np.where(np.indices((96, 96)).sum(0) % 2, 200, 60).astype(np.uint8)
         assert cv2.imwrite(str(tmp_path / "board.png"), board)
         monkeypatch.setattr(module, "REDUCTION", (2.0, 2.0))  # a pixel of the file for each sample
+        monkeypatch.setattr(module, "BLANK_SHARE", 0.0)
         index = np.zeros((96, 96), np.int32)
         found = {}
         for contrast in (1.0, 0.25):
@@ -143,6 +144,18 @@ class TestPhotoCollage(BaseTester):
             light = module._collage(index, [tmp_path / "board.png"], np.random.default_rng(0))
             found[contrast] = (float(light.mean()), float(light.std()))
         assert found[0.25] == (pytest.approx(found[1.0][0], rel=1e-3), pytest.approx(found[1.0][1] / 4, rel=1e-3))
+
+    def test_feature_a_share_of_shapes_is_blank(self, tmp_path, monkeypatch):
+        """Of 576 squares of a board: within five standard deviations of the binomial distribution."""
+        board = np.where(np.indices((96, 96)).sum(0) % 2, 200, 60).astype(np.uint8)
+        assert cv2.imwrite(str(tmp_path / "board.png"), board)
+        monkeypatch.setattr(module, "REDUCTION", (2.0, 2.0))
+        index = np.arange(576, dtype=np.int32).reshape(24, 24).repeat(4, 0).repeat(4, 1)
+        light = module._collage(index, [tmp_path / "board.png"], np.random.default_rng(0))
+        squares = light.reshape(24, 4, 24, 4, 3).transpose(0, 2, 1, 3, 4).reshape(576, 16, 3)
+        blank = (np.ptp(squares, axis=1) < 1e-3 * squares.mean(1)).all(1)
+        share = module.BLANK_SHARE
+        assert abs(blank.sum() - 576 * share) < 5 * (576 * share * (1 - share)) ** 0.5
 
     def test_feature_outlines_of_depth_lie_beside_those_of_the_image_in_a_share_of_scenes(self, folder, monkeypatch):
         (image, depth), (same, moved) = self.in_no_scene_and_in_each("DISPLACED_SHARE", folder, monkeypatch)
