@@ -210,7 +210,7 @@ def _in_metres(psi: float, optics: TiDyOptics) -> str:
     if not isinstance(optics.camera, ThinLensCamera):
         return "-"
     depth = depth_at(psi, optics.camera)
-    return "inf" if math.isinf(depth) or depth > 1e4 else f"{depth:.3g} m"
+    return "inf" if math.isinf(depth) else f"{depth:.3g} m"
 
 
 def _channels(optics: TiDyOptics) -> list[str]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 UNKNOWN = 0.6  # grey of a pixel without known depth, of white
 LONGER_SIDE = 12.0  # inches; 150 dots an inch make 1800 pixels
+ROUNDINGS = 4  # of a defocus in float32, within which a depth is taken for infinite
 TICK_DEPTHS = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 7, 10, 20, 50, math.inf)  # m
 
 
@@ -65,12 +66,15 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None =
 def depth_at(defocus: float, camera: ThinLensCamera) -> float:
     """Return the depth in metres for a defocus in radians; infinite for the defocus of infinity and below.
 
+    It is infinite, too, where a few roundings of the defocus in float32 make it so.
+
     Example:
         >>> round(depth_at(0.0, ThinLensCamera()), 3)
         0.595
     """
     depth = float(camera.depth(torch.tensor(defocus, dtype=torch.float64)))
-    return depth if depth < 1e9 else math.inf
+    rounding = ROUNDINGS * torch.finfo(torch.float32).eps / float(camera.focus_distance)  # of 1 / focus - 1 / depth
+    return depth if 1 / depth > rounding else math.inf
 
 
 def depth_colors(inverse_depth: Tensor) -> Tensor:

@@ -38,3 +38,15 @@ class TestDepthAt(BaseTester):
         camera = ThinLensCamera()
         defocus = float(camera.defocus(torch.tensor(depth, dtype=torch.float64)))
         assert depth_at(defocus, camera) == pytest.approx(depth, rel=1e-9)
+
+    @pytest.mark.parametrize("focus", [0.3, 0.99167, 20.0])
+    @pytest.mark.parametrize("roundings", [-2, 0, 2])
+    def test_feature_infinity_is_found_in_float32(self, focus, roundings):
+        """A bank's defocus is a float32, a rounding or two off; depths of kilometres are not taken for infinite."""
+        camera = ThinLensCamera(0.05, 0.05 / 23.966, focus)
+        defocus = np.float32(camera.defocus(torch.tensor(math.inf, dtype=torch.float64)))
+        for _ in range(abs(roundings)):
+            defocus = np.nextafter(defocus, np.float32(np.sign(roundings) * np.inf))
+        assert math.isinf(depth_at(float(defocus), camera))
+        kilometres = float(camera.defocus(torch.tensor(5000.0, dtype=torch.float64)))
+        assert depth_at(kilometres, camera) == pytest.approx(5000, rel=1e-6)
