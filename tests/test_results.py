@@ -19,6 +19,7 @@ from kornia_tidy.inference.pretrained import load_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
 from kornia_tidy.mask_design.candidates import FLAT as FLAT_LENS
+from kornia_tidy.reconstruction import self_ensemble
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from tests.base import BaseTester
 from tests.benchmarks import depth_uncertainty
@@ -28,7 +29,7 @@ from tests.benchmarks.results import measure
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
 from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
 from tests.benchmarks.results.report import page
-from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK, bilateral, restorations_for
+from tests.benchmarks.results.restorations import BY_DEPTH, ENSEMBLE, NETWORK, bilateral, restorations_for
 from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
 from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, perceptual_distance, ramp, score
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
@@ -187,6 +188,16 @@ class TestRestorations(BaseTester):
         self.assert_close(told[3].square(), taken.light / electrons + (2.4 / electrons) ** 2)
         self.assert_close(told[4], told[3] / 2)
 
+    def test_feature_networks_behind_a_closed_form_are_averaged_over_orientations(self):
+        system = available()[FIVE]()
+        taken = capture(system, dead_leaves(1, 32).load("leaves 00"), torch.rand(1, 3, 32, 32), "0.01")
+        found = restorations_for(system)
+        with torch.inference_mode():
+            alone, averaged = (found[name].restore(taken, {})["image"] for name in (NETWORK, ENSEMBLE))
+            expected = self_ensemble(system.head)(taken.image, noise=taken.noise).clamp(0, 1)
+        self.assert_close(averaged, expected)
+        assert (averaged - alone).abs().max() > 1e-3
+
     def test_feature_networks_without_noise_have_no_wrong_levels(self):
         assert [name for name in restorations_for(available()["joint-1"]()) if NETWORK in name] == [NETWORK]
         assert not any(NETWORK in name for name in restorations_for(available()[FLAT]()))
@@ -337,20 +348,28 @@ class TestResults(BaseTester):
                 (noise, ONE, NETWORK): scored(scenes, 27.5),
                 (noise, f"{FIVE} as trained", NETWORK): scored(scenes, 29.0),
                 (noise, FIVE, f"{NETWORK}, noise x 2"): scored(scenes, 28.0 - loss),
+                (noise, FIVE, ENSEMBLE): scored(scenes, 28.6),
             }
         for noise, gain in zip(PHYSICAL, (2.0, 0.1, -1.0, -2.0), strict=True):
             scores |= {
                 (noise, FLAT, NETWORK): scored(scenes, 26.0),
                 (noise, FIVE, NETWORK): scored(scenes, 26.0 + gain),
+                (noise, FLAT, ENSEMBLE): scored(scenes, 26.0),
+                (noise, FIVE, ENSEMBLE): scored(scenes, 26.5 + gain),
             }
         sure = scored(scenes, 26.0)
         for name in scenes.names:
             sure[name] |= {"depth_textured": 0.12, "depth_surest": 0.104}
         scores[(FIXED[0], JOINT, NETWORK)] = sure
+        scores[(FIXED[0], JOINT, ENSEMBLE)] = {name: {**sure[name], "depth_surest": 0.098} for name in sure}
         found = {row.claim: row for row in verdicts(synthetic(scores, [scenes]))}
-        surest = found[f"{JOINT}, noise 0.002: depth RMSE over the 70 % of each scene that it is surest of"]
+        surest = found[f"{JOINT}, noise 0.002: network, depth RMSE over the 70 % of each scene that it is surest of"]
         assert (surest.measured, surest.met) == ("0.104", False)
+        surest = found[f"{JOINT}, noise 0.002: {ENSEMBLE}, depth RMSE over the 70 % of each scene that it is surest of"]
+        assert (surest.measured, surest.met) == ("0.098", True)
         met = {claim: row.met for claim, row in found.items()}
+        assert all(met[f"{FIVE}, noise {noise}: {ENSEMBLE} over {TIKHONOV}"] for noise in FIXED)
+        assert found[f"57,000 electrons, in 8 orientations: {FIVE} over {FLAT}"].measured.startswith("+2.50 ± 0.00")
         assert [met[f"{FIVE}, noise {noise}: network over {TIKHONOV}"] for noise in FIXED] == [True, True, False]
         assert found[f"{FIVE}: network ahead of its best closed form"].measured == "9 of 9 scenes and noises"
         assert met[f"noise 0.002: network of {FIVE} over that of {ONE}"] is False

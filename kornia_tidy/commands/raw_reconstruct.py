@@ -35,6 +35,7 @@ from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
 from kornia_tidy.raw.developed_noise import developed_noise
 from kornia_tidy.reconstruction.head import takes_noise
+from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from kornia_tidy.reconstruction.tiled import OVERLAP
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -80,6 +81,9 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
 examples:
   All files of a folder; if interrupted, go on with --resume:
     kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o sharp --resume
+
+  As good as it gets, in 8 times the time:
+    kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o best --orientations 8
 
   A network of one's own; of two files, one is read and written while the other is computed:
     kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths --jobs 2
@@ -142,6 +146,14 @@ def add_parser(subparsers: Any) -> None:
         help=f"of a tile that are discarded at each cut (default: {OVERLAP}, with which shipped networks are within "
         "0.001 of the result for the whole picture; 1000 or all else that is farther than a network sees is exact)",
     )
+    parser.add_argument(
+        "--orientations",
+        type=int,
+        choices=ORIENTATIONS,
+        default=1,
+        help="of its input over which a network that begins with the closed form is averaged: with 8 shipped networks "
+        "are 0.1 to 0.3 dB better and take 8 times as long (default: 1)",
+    )
     parser.add_argument("--device", default="cpu", help="where the network runs, such as cuda (default: cpu)")
     add_dump_options(parser)
 
@@ -156,7 +168,7 @@ def run(args: argparse.Namespace) -> None:
         check_positive("noise", args.noise, "in units of full scale")
     weights = head_file(args.head)
     system = load_trained(weights)
-    head = LightHead(system).to(torch.device(args.device))
+    head = LightHead(system, orientations=args.orientations).to(torch.device(args.device))
     if args.noise is not None and not takes_noise(system.head):
         raise ValueError(f"--noise is for a network that takes it, and that of {args.head} does not")
     suffixes = result_suffixes(system.settings.task, args.format, uncertain=head.uncertain)
@@ -170,6 +182,7 @@ def run(args: argparse.Namespace) -> None:
         "linear": args.linear,
         "noise": args.noise,
         "overlap": args.overlap,
+        "orientations": args.orientations,
         "white_balance": args.white_balance,
         "dump": {name: getattr(args, name) for name in DUMP_OPTIONS},
     }

@@ -19,6 +19,7 @@ from kornia_tidy.reconstruction.closed_form import ClosedForm, whole_picture
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.receptive_field import receptive_field
+from kornia_tidy.reconstruction.self_ensemble import self_ensemble
 from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, one_tile, reconstruct_tiled, shared_copy
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -56,6 +57,7 @@ class LightHead(nn.Module):
         system: camera and network, see :func:`~kornia_tidy.inference.trained.load_trained`.
         noise: standard deviation of the captures' noise in linear light, in units of full scale, for a network that is
             conditioned on it. None: as the sensor of the system has it.
+        orientations: over which the network is averaged, see :func:`~kornia_tidy.reconstruction.self_ensemble`.
 
     Shape:
         - light: (B, 3, H, W) or (B, 1, H, W), linear; black is 0 and saturation 1; other values are clipped.
@@ -64,10 +66,11 @@ class LightHead(nn.Module):
 
     Raises:
         TypeError: if the camera has no metric scale.
-        ValueError: if a noise is given that is not positive, or the network is not conditioned on it.
+        ValueError: if a noise is given that is not positive, or the network is not conditioned on it; for orientations
+            that are not offered, or a network that knows PSFs in one orientation.
     """
 
-    def __init__(self, system: TrainedSystem, noise: float | None = None) -> None:
+    def __init__(self, system: TrainedSystem, noise: float | None = None, orientations: int = 1) -> None:
         super().__init__()
         if noise is not None:
             check_positive("noise", noise, "in units of full scale")
@@ -75,7 +78,7 @@ class LightHead(nn.Module):
                 raise ValueError("noise is for a network that is conditioned on it, and this one is not")
         if not isinstance(system.optics.camera, ThinLensCamera):
             raise TypeError(f"depth in metres needs a ThinLensCamera, got {type(system.optics.camera).__name__}")
-        self.head = system.head
+        self.head = system.head if orientations == 1 else self_ensemble(system.head, orientations)
         self.noise = noise
         self.task = system.settings.task
         self.camera = system.optics.camera

@@ -42,6 +42,9 @@ def checkpoint(path, seed=0, width=4, **settings):
     torch.manual_seed(seed)
     settings = TrainingSettings(masks=1, window=23, ema=0, head="plain", width=width, **settings)
     training = TidyTraining.from_settings(settings)
+    for parameter in training.head.parameters():
+        if not parameter.any():  # the last convolution behind a closed form
+            torch.nn.init.normal_(parameter, std=0.02)
     write_state(path, {"settings": training.settings.as_dict(), "state_dict": training.state_dict(), "global_step": 3})
     return str(path)
 
@@ -120,6 +123,19 @@ class TestRawReconstruct(BaseTester):
         with pytest.raises(SystemExit):
             main(["raw", "reconstruct", "--help"])
         assert "uncertainty of the depth: its standard deviation" in capsys.readouterr().out
+
+    def test_feature_orientations_are_averaged(self, tmp_path, capsys):
+        weights = checkpoint(tmp_path / "edof.safetensors", task="edof", closed_form=True)
+        folder, file = tmp_path / "out", capture(tmp_path / "a.png")
+        assert reconstruct([file], weights, folder, "--linear", "--orientations", "4") == 0
+        found, system = read_image(folder / "a.png"), load_trained(weights)
+        alone, averaged = (reconstruct_light(LightHead(system, None, n), read_image(file)).image for n in (1, 4))
+        assert (found - averaged).abs().max() <= 0.5 / 65535 + 1e-7
+        assert (found - alone).abs().max() > 1e-3
+        assert json.loads((folder / "a.json").read_text())["made_by"]["orientations"] == 4
+        other = checkpoint(tmp_path / "other.safetensors", task="edof")
+        assert reconstruct([file], other, folder, "--orientations", "4") == 2
+        assert "is for a network that begins with the closed form" in capsys.readouterr().err
 
     def test_feature_an_image_task_has_no_depth(self, tmp_path):
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")

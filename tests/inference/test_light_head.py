@@ -12,7 +12,7 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import nn
 
-from kornia_tidy.data import DeadLeaves
+from kornia_tidy.data import DeadLeaves, PhotographicLeaves
 from kornia_tidy.inference.light_head import (
     LightHead,
     UncertainReconstruction,
@@ -170,6 +170,19 @@ class TestReconstructLight(BaseTester):
         whole = reconstruct_light(head, capture, memory_budget=4 << 30)
         assert len(seen) > 1
         assert (found.image - whole.image).abs().max() < 1e-3
+
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize("name", ["edof-5", "joint-uncertain"])
+    def test_feature_shipped_systems_are_better_in_eight_orientations(self, name):
+        system = load_pretrained(name)
+        image, depth, _ = PhotographicLeaves(1, 128, 192, seed=4).read(0)
+        with torch.no_grad():
+            light = rgb_to_linear_rgb(system.optics(image[None], depth[None]))[0]
+            errors = [
+                (reconstruct_light(LightHead(system, orientations=count), light).image - image).square().mean()
+                for count in (1, 8)
+            ]
+        assert errors[1] < errors[0]
 
     def test_feature_pictures_at_the_same_time_have_copies_with_their_own_noise_and_stray_light(self, monkeypatch):
         settings = SystemSettings(masks=1, window=9, stray_light="veil", head="tikhonov-bilateral")

@@ -57,7 +57,7 @@ class Capture:
     restored: dict[object, Tensor] = field(default_factory=dict)
     """Images of inversions that were computed, by name and settings."""
     estimates: dict[object, dict[str, Tensor]] = field(default_factory=dict)
-    """Maps that the network estimated, by the noise level that it was told."""
+    """Maps that the network estimated, by the factor of the noise level that it was told and by orientations."""
 
     @cached_property
     def image(self) -> Tensor:

@@ -44,7 +44,7 @@ this page, and goes on where it was interrupted.
   capture; *by estimated depth* it inverts the PSFs of 11 depths, blended by the depth that the network estimates.
   *Wiener* weighs frequencies by the mean PSF, the noise and the power spectrum of photographs; the factor is that of
   the noise's power. *Bilateral* is OpenCV's filter on the result, 7 pixels wide. *Network* is the one that was trained
-  with the camera.
+  with the camera; *in 8 orientations* it is the mean of what it makes of its input turned and mirrored.
 - **Scores** are those of sRGB images clipped to [0, 1]. Chroma PSNR is that of Cb and Cr. ± is the standard error of
   the mean of differences, taken scene by scene.
 - **Systems.** `edof-5` has five masks, `edof-1` one, and `edof-0` a Fresnel element of 10 rad, the paper's camera of

@@ -14,6 +14,7 @@ from torch import Tensor
 from kornia_tidy.inference.tasks import MAPS, depth_logits, split_maps
 from kornia_tidy.reconstruction import head
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
+from kornia_tidy.reconstruction.self_ensemble import self_ensemble, takes_orientations
 from kornia_tidy.reconstruction.tikhonov import tikhonov
 from kornia_tidy.reconstruction.wiener import Wiener
 from tests.benchmarks.results.captures import Capture, encode
@@ -26,6 +27,7 @@ FACTORS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 DIAMETER = 7  # pixels of the bilateral filter
 LAYERS = 11  # depths of an inversion that knows the depth
 NETWORK = "network"
+ENSEMBLE = "network in 8 orientations"
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def _tikhonov_by_depth(capture: Capture, settings: Settings) -> Tensor:
     system = capture.system
     lo, hi = system.optics.camera.defocus_range
     bank = system.optics.psf_bank(defocus=torch.linspace(lo, hi, LAYERS, dtype=torch.float64).tolist())
-    place = (LAYERS - 1) * _estimate(capture, 1.0)["depth"]
+    place = (LAYERS - 1) * _estimate(capture)["depth"]
     light = torch.zeros_like(capture.light)
     for layer in range(LAYERS):
         share = (1 - (place - layer).abs()).clamp(min=0)  # linear between two depths
@@ -110,9 +112,11 @@ def restorations_for(system: System) -> dict[str, Restoration]:
         found[name] = _plain(name, form)
         found[f"{name} + bilateral"] = _with_bilateral(name, form)
     if system.head is not None:
-        found[NETWORK] = _network(1.0)
+        found[NETWORK] = _network()
         if takes_noise(system):
             found |= {f"{NETWORK}, noise x {factor:g}": _network(factor) for factor in (0.5, 2.0)}
+        if takes_orientations(system.head):
+            found[ENSEMBLE] = _network(orientations=8)
     return found
 
 
@@ -143,24 +147,25 @@ def _with_bilateral(name: str, form: ClosedForm) -> Restoration:
     return Restoration(restore, {**form.grid, "color": COLORS, "space": SPACES}, start)
 
 
-def _network(factor: float) -> Restoration:
-    """The system's network, told the noise level times a factor where it takes one."""
+def _network(factor: float = 1.0, orientations: int = 1) -> Restoration:
+    """The system's network, told the noise level times a factor where it takes one, averaged over orientations."""
 
-    return Restoration(lambda capture, _: _estimate(capture, factor))
+    return Restoration(lambda capture, _: _estimate(capture, factor, orientations))
 
 
-def _estimate(capture: Capture, factor: float) -> dict[str, Tensor]:
+def _estimate(capture: Capture, factor: float = 1.0, orientations: int = 1) -> dict[str, Tensor]:
     system = capture.system
     assert system.head is not None
     assert system.task is not None
-    if (NETWORK, factor) not in capture.estimates:
+    if (factor, orientations) not in capture.estimates:
         told = {"noise": factor * capture.noise} if takes_noise(system) else {}
-        output = system.head(capture.image, **told).float()
+        network = system.head if orientations == 1 else self_ensemble(system.head, orientations)
+        output = network(capture.image, **told).float()
         maps = split_maps(system.task, output)
         if (logits := depth_logits(system.task, output)) is not None:
             maps["deviation"] = depth_moments(logits)[1]
-        capture.estimates[NETWORK, factor] = {name: value.clamp(0, 1) for name, value in maps.items()}
-    return capture.estimates[NETWORK, factor]
+        capture.estimates[factor, orientations] = {name: value.clamp(0, 1) for name, value in maps.items()}
+    return capture.estimates[factor, orientations]
 
 
 def nearest(values: tuple[float, ...], wanted: float) -> int:

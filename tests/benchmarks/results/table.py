@@ -107,13 +107,12 @@ class Results:
         """Return the paired difference of a score on half B."""
         return paired(self.values(ours, score), self.values(theirs, score))
 
-    def keys(self, scenes: str, noise: str, *, system: str | None = None, network: bool | None = None) -> list[Key]:
-        """Return the rows of a set of scenes and a noise with an image; of a system; networks alone or none of them."""
+    def keys(self, scenes: str, noise: str, *, system: str | None = None, network: bool = True) -> list[Key]:
+        """Return the rows of a set of scenes and a noise with an image; of a system; with or without networks."""
         found = []
         for key in self.rows:
             fits = key[:2] == (scenes, noise) and key.system != NO_CAMERA and system in (None, key.system)
-            fits = fits and network in (None, key.restoration == NETWORK) and bool(self.values(key, "psnr"))
-            if fits and (network is None or key.restoration == NETWORK or not key.restoration.startswith(NETWORK)):
+            if fits and self.values(key, "psnr") and (network or not key.restoration.startswith(NETWORK)):
                 found.append(key)
         return found
 

@@ -13,7 +13,7 @@ from kornia_tidy.mask_design.design_report import DATA
 from kornia_tidy.sensor.exposure import electrons_at
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, REFERENCE_F_NUMBER
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
-from tests.benchmarks.results.restorations import BY_DEPTH, NETWORK
+from tests.benchmarks.results.restorations import BY_DEPTH, ENSEMBLE, NETWORK
 from tests.benchmarks.results.scores import SURE
 from tests.benchmarks.results.table import Difference, Key, Results
 
@@ -77,20 +77,30 @@ def verdicts(results: Results, recommended: Mapping[str, str] | None = None) -> 
 
 def _networks(results: Results) -> Iterator[Verdict]:
     """Five masks: network against the best closed form of the same captures."""
+    yield from _over_closed_form(results, NETWORK)
+    if any(Key(REAL, noise, FIVE, ENSEMBLE) in results.rows for noise in FIXED):
+        yield from _over_closed_form(results, ENSEMBLE)
+    both = [Key(REAL, FIXED[0], system, NETWORK) for system in (FIVE, ONE)]
+    gain = results.difference(both[0], both[1]) if all(key in results.rows for key in both) else None
+    yield _at_least(f"noise {FIXED[0]}: network of {FIVE} over that of {ONE}", gain, MASKS_GAIN)
+
+
+def _over_closed_form(results: Results, restoration: str) -> Iterator[Verdict]:
+    """A kind of network of five masks against their best closed form."""
     pairs = {}
     for noise in FIXED:
         closed = results.best(results.keys(REAL, noise, system=FIVE, network=False))
-        ours = Key(REAL, noise, FIVE, NETWORK)
+        ours = Key(REAL, noise, FIVE, restoration)
         if closed is not None and ours in results.rows:
             pairs[noise] = ours, closed
     for noise, target in GAINS.items():
         name = pairs[noise][1].restoration if noise in pairs else "its best closed form"
         gain = results.difference(*pairs[noise]) if noise in pairs else None
-        yield _at_least(f"{FIVE}, noise {noise}: network over {name}", gain, target)
+        yield _at_least(f"{FIVE}, noise {noise}: {restoration} over {name}", gain, target)
     gains = [results.difference(*pair) for pair in pairs.values()]
     count, ahead = sum(gain.pairs for gain in gains), sum(gain.ahead for gain in gains)
     yield Verdict(
-        f"{FIVE}: network ahead of its best closed form",
+        f"{FIVE}: {restoration} ahead of its best closed form",
         f"{ahead} of {count} scenes and noises",
         f"{100 * SHARE_AHEAD:.0f} of 100",
         ahead >= SHARE_AHEAD * count if len(gains) == len(FIXED) else None,
@@ -98,10 +108,9 @@ def _networks(results: Results) -> Iterator[Verdict]:
     for score, name, target in (("ssim", "SSIM", SSIM_GAIN), ("chroma", "chroma PSNR", CHROMA_GAIN)):
         for noise in FIXED:
             gain = results.difference(*pairs[noise], score) if noise in pairs else None
-            yield _at_least(f"{FIVE}, noise {noise}: {name} of the network over its best closed form", gain, target)
-    both = [Key(REAL, FIXED[0], system, NETWORK) for system in (FIVE, ONE)]
-    gain = results.difference(both[0], both[1]) if all(key in results.rows for key in both) else None
-    yield _at_least(f"noise {FIXED[0]}: network of {FIVE} over that of {ONE}", gain, MASKS_GAIN)
+            yield _at_least(
+                f"{FIVE}, noise {noise}: {name} of the {restoration} over its best closed form", gain, target
+            )
 
 
 def _stray_light(results: Results) -> Iterator[Verdict]:
@@ -120,7 +129,7 @@ def _wrong_noise(results: Results) -> Iterator[Verdict]:
     losses = {}
     for key in results.rows:
         true = key._replace(restoration=NETWORK)
-        if key.scenes == REAL and key.restoration.startswith(f"{NETWORK}, ") and true in results.rows:
+        if key.scenes == REAL and key.restoration.startswith(f"{NETWORK}, noise ") and true in results.rows:
             losses[key] = results.difference(true, key)
     worst = max(losses, key=lambda key: losses[key].mean, default=None)
     claim, target = "largest loss of a network by half or twice the noise level", f"at most {WRONG_NOISE_LOSS:g}"
@@ -136,18 +145,20 @@ def _wrong_noise(results: Results) -> Iterator[Verdict]:
 def _coded_against_flat(results: Results) -> Iterator[Verdict]:
     """Coded against flat at equal exposure time: of each kind the best on half A, networks and closed forms apart."""
     for noise in PHYSICAL:
-        for network, kind in ((True, "networks"), (False, "closed forms")):
-            both = _best_of_kinds(results, noise, network=network)
+        for restoration, kind in ((NETWORK, "networks"), (ENSEMBLE, "in 8 orientations"), (None, "closed forms")):
+            both = _best_of_kinds(results, noise, restoration)
+            if both is None and restoration == ENSEMBLE:
+                continue
             names = "coded over flat" if both is None else f"{both[0].system} over {both[1].system}"
             gain = None if both is None else results.difference(*both)
-            target = CODED_GAINS.get(noise) if network else None
+            target = None if restoration is None else CODED_GAINS.get(noise)
             yield _at_least(f"{int(noise[:-1]):,} electrons, {kind}: {names}", gain, target)
 
 
 def _recommended(results: Results, recommended: Mapping[str, str]) -> Iterator[Verdict]:
     """What `kornia-tidy design` recommends for each amount of light, against the other kind, both with networks."""
     for noise, kind in recommended.items():
-        pair = _best_of_kinds(results, noise, network=True)
+        pair = _best_of_kinds(results, noise, NETWORK)
         gain = None if pair is None else results.difference(*(pair if kind == "coded" else pair[::-1]))
         claim = f"{int(noise[:-1]):,} electrons, networks: what design recommends ({kind}) over the other"
         measured = "not measured" if gain is None else f"{gain} ({gain.ahead} of {gain.pairs} scenes)"
@@ -155,9 +166,15 @@ def _recommended(results: Results, recommended: Mapping[str, str]) -> Iterator[V
         yield Verdict(claim, measured, "a loss of at most two standard errors", met)
 
 
-def _best_of_kinds(results: Results, noise: str, *, network: bool) -> tuple[Key, Key] | None:
-    """Return the rows of coded and flat that are best on half A; None unless there are both."""
-    keys = results.keys(REAL, noise, network=network)
+def _best_of_kinds(results: Results, noise: str, restoration: str | None) -> tuple[Key, Key] | None:
+    """Return the rows of coded and flat that are best on half A, of a restoration or, None, of closed forms.
+
+    None unless there are both.
+    """
+    if restoration is None:
+        keys = results.keys(REAL, noise, network=False)
+    else:
+        keys = [key for key in results.keys(REAL, noise) if key.restoration == restoration]
     coded, flat = (
         results.best([key for key in keys if results.systems[key.system].kind == kind]) for kind in ("coded", "flat")
     )
@@ -166,28 +183,31 @@ def _best_of_kinds(results: Results, noise: str, *, network: bool) -> tuple[Key,
 
 def _joint(results: Results) -> Iterator[Verdict]:
     """Joint estimates: the image against the inversion by estimated depth, the depth against the best ramp."""
-    ours, layered = (Key(REAL, FIXED[0], JOINT, name) for name in (NETWORK, BY_DEPTH))
-    gain = results.difference(ours, layered) if {ours, layered} <= results.rows.keys() else None
-    yield _at_least(f"{JOINT}, noise {FIXED[0]}: network over {BY_DEPTH}", gain, LAYERED_GAIN)
-    score = "depth_textured"
-    error = results.mean(ours, score)
-    of_ramp = results.mean(Key(REAL, NO_NOISE, NO_CAMERA, BEST_RAMP), score)
-    known = math.isfinite(error) and math.isfinite(of_ramp)
-    below = 1 - error / of_ramp if known else math.nan
-    yield Verdict(
-        f"{JOINT}, noise {FIXED[0]}: depth RMSE over textured pixels below the best ramp of each scene",
-        f"{100 * below:.0f} % ({error:.3f}, {of_ramp:.3f})" if known else "not measured",
-        f"at least {100 * TEXTURED_GAIN:.0f} %",
-        below >= TEXTURED_GAIN if known else None,
-    )
-    surest = results.mean(ours, "depth_surest")
-    known = math.isfinite(surest)
-    yield Verdict(
-        f"{JOINT}, noise {FIXED[0]}: depth RMSE over the {100 * SURE:.0f} % of each scene that it is surest of",
-        f"{surest:.3f}" if known else "not measured",
-        f"at most {SUREST_ERROR:.2f}",
-        surest <= SUREST_ERROR if known else None,
-    )
+    layered = Key(REAL, FIXED[0], JOINT, BY_DEPTH)
+    of_ramp = results.mean(Key(REAL, NO_NOISE, NO_CAMERA, BEST_RAMP), "depth_textured")
+    for restoration in (NETWORK, ENSEMBLE):
+        ours = layered._replace(restoration=restoration)
+        if restoration == ENSEMBLE and ours not in results.rows:
+            continue
+        gain = results.difference(ours, layered) if {ours, layered} <= results.rows.keys() else None
+        about = f"{JOINT}, noise {FIXED[0]}: {restoration}"
+        yield _at_least(f"{about} over {BY_DEPTH}", gain, LAYERED_GAIN)
+        error, surest = results.mean(ours, "depth_textured"), results.mean(ours, "depth_surest")
+        known = math.isfinite(error) and math.isfinite(of_ramp)
+        below = 1 - error / of_ramp if known else math.nan
+        yield Verdict(
+            f"{about}, depth RMSE over textured pixels below the best ramp of each scene",
+            f"{100 * below:.0f} % ({error:.3f}, {of_ramp:.3f})" if known else "not measured",
+            f"at least {100 * TEXTURED_GAIN:.0f} %",
+            below >= TEXTURED_GAIN if known else None,
+        )
+        known = math.isfinite(surest)
+        yield Verdict(
+            f"{about}, depth RMSE over the {100 * SURE:.0f} % of each scene that it is surest of",
+            f"{surest:.3f}" if known else "not measured",
+            f"at most {SUREST_ERROR:.2f}",
+            surest <= SUREST_ERROR if known else None,
+        )
 
 
 def _at_least(claim: str, gain: Difference | None, target: float | None) -> Verdict:
