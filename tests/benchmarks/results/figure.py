@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, GREEN, INK, open_chart
 from tests.benchmarks.results.captures import FIXED, PHYSICAL
 from tests.benchmarks.results.report import reference_row
-from tests.benchmarks.results.restorations import NETWORK
+from tests.benchmarks.results.restorations import ENSEMBLE, NETWORK
 from tests.benchmarks.results.table import Key, Results
 from tests.benchmarks.results.verdicts import FIVE, ONE, REAL
 
@@ -43,9 +43,12 @@ def _over_noise(axes: Axes, results: Results, scenes: str) -> None:
     """The best closed form and the network of each system with a network, and the best flat lens."""
     names = [name for name in COLORS if any(key.system == name for key in results.rows)]
     for name in names:
-        for network, style in ((True, "-"), (False, "--")):
-            rows = [results.best(results.keys(scenes, noise, system=name, network=network)) for noise in FIXED]
-            label = f"{name}, {'network' if network else 'best closed form'}"
+        for network, style in ((NETWORK, "-"), (None, "--")):
+            keys = [
+                results.keys(scenes, n, system=name, restoration=network, network=network is not None) for n in FIXED
+            ]
+            rows = [results.best(each) for each in keys]
+            label = f"{name}, {network or 'best closed form'}"
             _line(axes, results, [(float(row.noise), row) for row in rows if row], COLORS[name], style, label)
     flat = [name for name, row in results.systems.items() if row.kind == "flat"]
     rows = [
@@ -67,7 +70,8 @@ def _over_f_number(axes: Axes, results: Results, scenes: str) -> None:
     for noise, color in LIGHTS.items():
         by_kind: dict[str, list[tuple[float, Key]]] = {"flat": [], "coded": []}
         for name, row in results.systems.items():
-            best = results.best(results.keys(scenes, noise, system=name))
+            keys = results.keys(scenes, noise, system=name)
+            best = results.best([key for key in keys if key.restoration != ENSEMBLE])
             if row.kind in by_kind and best is not None:
                 by_kind[row.kind].append((row.f_number, best))
         label = f"{int(noise[:-1]):,} electrons"

@@ -107,12 +107,22 @@ class Results:
         """Return the paired difference of a score on half B."""
         return paired(self.values(ours, score), self.values(theirs, score))
 
-    def keys(self, scenes: str, noise: str, *, system: str | None = None, network: bool = True) -> list[Key]:
-        """Return the rows of a set of scenes and a noise with an image; of a system; with or without networks."""
+    def keys(
+        self,
+        scenes: str,
+        noise: str,
+        *,
+        system: str | None = None,
+        restoration: str | None = None,
+        network: bool = True,
+    ) -> list[Key]:
+        """Return the rows of a set of scenes and a noise with an image; of a system or a restoration; without networks
+        if ``network`` is False."""
         found = []
         for key in self.rows:
             fits = key[:2] == (scenes, noise) and key.system != NO_CAMERA and system in (None, key.system)
-            if fits and self.values(key, "psnr") and (network or not key.restoration.startswith(NETWORK)):
+            fits = fits and restoration in (None, key.restoration) and bool(self.values(key, "psnr"))
+            if fits and (network or not key.restoration.startswith(NETWORK)):
                 found.append(key)
         return found
 

@@ -171,10 +171,7 @@ def _best_of_kinds(results: Results, noise: str, restoration: str | None) -> tup
 
     None unless there are both.
     """
-    if restoration is None:
-        keys = results.keys(REAL, noise, network=False)
-    else:
-        keys = [key for key in results.keys(REAL, noise) if key.restoration == restoration]
+    keys = results.keys(REAL, noise, restoration=restoration, network=restoration is not None)
     coded, flat = (
         results.best([key for key in keys if results.systems[key.system].kind == kind]) for kind in ("coded", "flat")
     )
