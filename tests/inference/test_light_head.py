@@ -159,10 +159,10 @@ class TestReconstructLight(BaseTester):
         self.assert_close(near[..., :16], whole[..., :16])
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["edof-5", "joint-uncertain"])
-    def test_feature_tiles_of_shipped_networks_are_near_the_whole(self, name):
+    @pytest.mark.parametrize(("name", "orientations"), [("edof-5", 1), ("joint-uncertain", 1), ("edof-5", 8)])
+    def test_feature_tiles_of_shipped_networks_are_near_the_whole(self, name, orientations):
         system = load_pretrained(name)
-        head, (image, depth, _) = LightHead(system), DeadLeaves(1, 900, 600, seed=1).read(0)
+        head, (image, depth, _) = LightHead(system, orientations=orientations), DeadLeaves(1, 900, 600, seed=1).read(0)
         with torch.no_grad():
             capture = rgb_to_linear_rgb(system.optics(image[None], depth[None]))[0]
         seen = []
