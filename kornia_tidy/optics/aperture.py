@@ -208,9 +208,11 @@ def _disc_area_up_to(lines: Tensor, radius: float) -> Tensor:
     The area changes sign with y and with x. In the first quadrant it is x y while the corner (x, y) lies within the
     disc. For a corner outside, it is the integral of min(y, sqrt(r² - x²)):
     (x sqrt(r² - x²) + y sqrt(r² - y²) + r² (asin(x/r) + asin(y/r) - π/2)) / 2.
+    The arcsine is taken as atan2(x, sqrt(r² - x²)): near the rim it would make 1e-8 of the rounding of x/r.
     """
     distance = lines.abs().clamp(max=radius)
-    half_sector = distance * ((radius - distance) * (radius + distance)).sqrt() + radius**2 * (distance / radius).asin()
+    height = ((radius - distance) * (radius + distance)).sqrt()
+    half_sector = distance * height + radius**2 * torch.atan2(distance, height)
     curved = (half_sector[:, None] + half_sector - radius**2 * math.pi / 2) / 2
     straight = distance[:, None] * distance
     inside = torch.hypot(distance[:, None], distance) <= radius

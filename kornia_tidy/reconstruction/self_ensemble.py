@@ -38,6 +38,7 @@ class SelfEnsemble(ReconstructionHead):
     section 3.7, enhanced prediction; Lim et al., Enhanced Deep Residual Networks (CVPR Workshops 2017), for the name.
 
     Example:
+        >>> import torch
         >>> from kornia_tidy.reconstruction.nafnet import NAFNet
         >>> network = NAFNet(width=4).eval()
         >>> ensemble, image = SelfEnsemble(network, 2), torch.rand(1, 3, 32, 48)
@@ -86,6 +87,7 @@ def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
     Source: as for :class:`SelfEnsemble`.
 
     Example:
+        >>> import torch
         >>> from kornia_tidy.inference.pretrained import load_pretrained
         >>> system = load_pretrained("edof-5")
         >>> with torch.inference_mode():
