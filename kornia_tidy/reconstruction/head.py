@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import warnings
 from abc import ABC, abstractmethod
@@ -104,6 +105,18 @@ def takes_noise(head: nn.Module) -> bool:
         (True, False)
     """
     return "noise" in inspect.signature(head.forward).parameters
+
+
+def sharing_weights(head: nn.Module) -> nn.Module:
+    """Return a copy of a network that shares its parameters and buffers.
+
+    Example:
+        >>> head = nn.Conv2d(3, 3, 1)
+        >>> copied = sharing_weights(head)
+        >>> copied is head, copied.weight is head.weight
+        (False, True)
+    """
+    return copy.deepcopy(head, {id(tensor): tensor for tensor in (*head.parameters(), *head.buffers())})
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
-
 from torch import Tensor, nn
 
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
-from kornia_tidy.reconstruction.head import ReconstructionHead
+from kornia_tidy.reconstruction.head import ReconstructionHead, sharing_weights
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 
 ORIENTATIONS = (1, 2, 4, 8)
@@ -94,13 +92,15 @@ def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
         ...     image = self_ensemble(system.head, 2)(torch.rand(1, 3, 64, 64))
     """
     check_orientations(orientations)
-    if orientations > 1 and not takes_orientations(head):
+    copied = sharing_weights(head)
+    if orientations == 1:
+        return copied
+    if not (parts := _refining(copied)):
         raise ValueError(
-            f"orientations={orientations} is for a network that begins with the closed form; {type(head).__name__} "
-            f"sees captures alone, and knows their PSFs in one orientation"
+            f"orientations={orientations} is for a network that begins with the closed form, and "
+            f"{type(head).__name__} has none: a network that sees captures alone knows PSFs in one orientation"
         )
-    copied = copy.deepcopy(head, {id(tensor): tensor for tensor in (*head.parameters(), *head.buffers())})
-    for part in _refining(copied) if orientations > 1 else []:
+    for part in parts:
         assert part.network is not None
         part.network = SelfEnsemble(part.network, orientations)
         if isinstance(part, JointClosedFormHead) and part.refiner is not None:

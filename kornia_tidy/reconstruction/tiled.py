@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.reconstruction.closed_form import untold_closed_forms, whole_picture
+from kornia_tidy.reconstruction.head import sharing_weights
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import (
     check_eval,
@@ -154,8 +155,7 @@ def shared_copy(head: nn.Module) -> nn.Module:
         >>> copied is head, copied.weight is head.weight
         (False, True)
     """
-    shared = {id(tensor): tensor for tensor in (*head.parameters(), *head.buffers())}
-    copied = copy.deepcopy(head, shared)
+    copied = sharing_weights(head)
     _counted[copied] = _counted.setdefault(head, {})
     if head in _seamless:
         _seamless.add(copied)

@@ -172,7 +172,7 @@ class TestReconstructLight(BaseTester):
         assert (found.image - whole.image).abs().max() < 1e-3
 
     @pytest.mark.takes_seconds
-    @pytest.mark.parametrize("name", ["edof-5", "joint-uncertain"])
+    @pytest.mark.parametrize("name", ["edof-5", "edof-designed"])
     def test_feature_shipped_systems_are_better_in_eight_orientations(self, name):
         system = load_pretrained(name)
         image, depth, _ = PhotographicLeaves(1, 128, 192, seed=4).read(0)

@@ -37,6 +37,12 @@ def small(maps=3, layers=0):
     return NAFNet(closed_form_channels(layers), maps, width=2)
 
 
+def tiled_and_whole(head):
+    image = photo(40, 330, dtype=torch.float32)[:1]
+    with torch.no_grad():
+        return reconstruct_tiled(head, image, tile=(48, 288)), head(image)
+
+
 class TestClosedFormHead(BaseTester):
     @pytest.mark.parametrize("kind", [NAFNet, AttentionUNet, PlainHead])
     @pytest.mark.parametrize("maps", [3, 4])
@@ -107,10 +113,7 @@ class TestClosedFormHead(BaseTester):
         """Kernels, the filter and the network see no farther than the margin."""
         head = head_of(small(), trained=True)
         assert receptive_field(head_of(None)) == 5 // 2 + 8 + 3
-        image = photo(40, 330, dtype=torch.float32)[:1]
-        with torch.no_grad():
-            whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 288))
-        self.assert_close(tiled, whole, atol=1e-4, rtol=0)
+        self.assert_close(*tiled_and_whole(head), atol=1e-4, rtol=0)
 
     @pytest.mark.slow
     def test_feature_onnx_takes_capture_and_noise(self):

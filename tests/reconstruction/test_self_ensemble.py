@@ -14,7 +14,6 @@ from kornia_tidy.reconstruction import (
     SelfEnsemble,
     closed_form_channels,
     receptive_field,
-    reconstruct_tiled,
     self_ensemble,
 )
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall
@@ -22,7 +21,7 @@ from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo
-from tests.reconstruction.test_closed_form_head import head_of, small
+from tests.reconstruction.test_closed_form_head import head_of, small, tiled_and_whole
 
 # The symmetries of a square, as NumPy turns arrays (H, W, C).
 SQUARE = [(turns, mirrored) for mirrored in (False, True) for turns in range(4)]
@@ -140,10 +139,7 @@ class TestSelfEnsembleOfAHead(BaseTester):
     def test_feature_tiles_are_the_whole(self):
         head = self_ensemble(head_of(small(), trained=True))
         assert receptive_field(head) >= receptive_field(head_of(small(), trained=True))
-        image = photo(40, 330, dtype=torch.float32)[:1]
-        with torch.no_grad():
-            whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 288))
-        self.assert_close(tiled, whole, atol=1e-4, rtol=0)
+        self.assert_close(*tiled_and_whole(head), atol=1e-4, rtol=0)
 
     @pytest.mark.slow
     def test_feature_onnx_is_equal(self):
@@ -152,7 +148,7 @@ class TestSelfEnsembleOfAHead(BaseTester):
         check_onnx(head, (photo(18, 21, dtype=torch.float32)[:1], torch.full((1, 1, 1, 1), 0.02)))
 
     def test_exception(self):
-        with pytest.raises(ValueError, match="orientations=8 is for a network that begins with the closed form; MiDaS"):
+        with pytest.raises(ValueError, match="begins with the closed form, and MiDaSSmall has none"):
             self_ensemble(MiDaSSmall(out_channels=1))
         with pytest.raises(ValueError, match="orientations=2 is for a network that begins with the closed form"):
             self_ensemble(head_of(None), 2)
