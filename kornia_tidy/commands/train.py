@@ -77,6 +77,10 @@ examples:
     kornia-tidy train --learn both --start "focal sweep" --design 120 --head nafnet --width 16 \\
       --closed-form --head-from outputs/network/best.safetensors --lr 2e-4 --size 128 --batch 4 \\
       -o outputs/both
+  Masks again, for a network that has learnt, at a rate for masks that are good already:
+    kornia-tidy train --learn masks --start "focal sweep" --lr-metres 4e-9 --batch 2 --epochs 2 \\
+      --masks-from outputs/network/best.safetensors --head-from outputs/network/best.safetensors \\
+      -o outputs/masks
   A network for the camera that `kornia-tidy design` recommends, and one for a lens without
   masks at f/48, both for 500 to 57,000 electrons of white at f/17.6 in the same time:
     kornia-tidy train --learn network --design-from outputs/design --electrons 500 57000 \\
@@ -128,7 +132,7 @@ def add_parser(subparsers: Any) -> None:
         "learn",
         choices=tuple(LEARN),
         help="both: masks and network together; network: behind fixed masks, with captures rendered once; refiner: so, "
-        "and only the second network of --refined",
+        "and only the second network of --refined; masks: through the network of --head-from, which stays as it is",
     )
     _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
     _setting(
@@ -247,14 +251,14 @@ def _add_network_settings(group: Any) -> None:
 
 
 def _add_noise_settings(group: Any) -> None:
-    """Add the options of the noise in training of the network alone."""
+    """Add the options of the noise where not masks and network are learnt together."""
     _setting(
         group,
         "noise_range",
         type=float,
         nargs=2,
         metavar=("LEAST", "LARGEST"),
-        help="read noise, of full scale, drawn for half of the captures; --learn network only",
+        help="read noise, of full scale, drawn for half of the captures; not for --learn both",
     )
     _setting(
         group,
@@ -271,7 +275,7 @@ def _add_noise_settings(group: Any) -> None:
         nargs=2,
         metavar=("LEAST", "LARGEST"),
         help="of white at --reference-f-number, drawn for the other half, which has shot noise: a smaller aperture "
-        "gets fewer in the same exposure time; default: 500 to 60000 at any f-number; --learn network only",
+        "gets fewer in the same exposure time; default: 500 to 60000 at any f-number; not for --learn both",
     )
     _setting(group, "reference_f_number", type=float, metavar="F", help="f-number of --electrons")
 

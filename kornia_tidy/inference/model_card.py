@@ -140,7 +140,7 @@ def _masks(system: TrainedSystem) -> str:
 
 def _is_flat(system: TrainedSystem) -> bool:
     """Return whether the camera is a lens alone: masks of zero height that were not trained."""
-    return system.settings.start == "flat" and system.run.get("learn", "both") != "both"
+    return system.settings.start == "flat" and system.run.get("learn", "both") not in ("both", "masks")
 
 
 def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
@@ -223,7 +223,7 @@ def _limits(system: TrainedSystem) -> list[str]:
 
 
 def _noise_seen(system: TrainedSystem) -> str:
-    """Return the noise of the training: a range where captures were rendered once, else that of the camera."""
+    """Return the noise of the training: that of the camera where masks and network learnt together, else a range."""
     noise = system.run.get("noise_range")
     if system.run.get("learn", "both") == "both" or not noise:
         seen = f"It was trained with a noise of {system.settings.sigma:.4g} of full scale."

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
+from typing import Any, NamedTuple, Self
 
 import lightning.pytorch as pl
 import torch
@@ -20,10 +23,14 @@ from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
+from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
+from kornia_tidy.training.drawn_sensors import SensorEach, with_sensor
+from kornia_tidy.training.noisy_crops import electrons_of, random_sensor
+from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.scenes import Broken
-from kornia_tidy.training.settings import LEARN, SCHEDULES, TrainingSettings, differences
+from kornia_tidy.training.settings import FIXED_OPTICS, LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
 HELD_OUT_STEP = 4  # the temperature is fitted to every fourth pixel of every fourth row
@@ -90,7 +97,10 @@ class TidyTraining(pl.LightningModule):
         image_weight: of the image loss in the joint task.
         learn: ``"both"``, or ``"network"``: the optics are fixed, and the network is trained by AdamW with its usual
             betas, 0.9 and 0.999; or ``"refiner"``: so is that of depth, and only the second one, for the image, is
-            trained.
+            trained; or ``"masks"``: they alone are trained, through a network that stays as it is, so that it has
+            neither training mode nor average.
+        sensors: draws the sensor of each scene by torch's global generator, for a network that knows the level of the
+            noise. None: the camera's own.
         channels_last: keep the channels of a pixel together in the network's memory.
         settings: those that camera and network were made from; checkpoints hold them to rebuild both.
 
@@ -120,6 +130,7 @@ class TidyTraining(pl.LightningModule):
         depth_weight: float = 1.0,
         image_weight: float = 1.0,
         learn: str = "both",
+        sensors: Callable[[], SensorNoise] | None = None,
         channels_last: bool = False,
         settings: TrainingSettings | None = None,
     ) -> None:
@@ -129,17 +140,20 @@ class TidyTraining(pl.LightningModule):
         check_choice("learn", learn, tuple(LEARN))
         check_positive("lr", lr)
         check_positive("lr_metres", lr_metres, "metres")
-        self.optics = optics if learn == "both" else optics.requires_grad_(requires_grad=False)
+        self.fixed_optics = learn in FIXED_OPTICS
+        self.optics = optics.requires_grad_(requires_grad=False) if self.fixed_optics else optics
         if learn == "refiner":
             if not isinstance(head, JointClosedFormHead) or head.refiner is None:
                 raise ValueError("learn='refiner' needs a JointClosedFormHead with a refiner")
             head.requires_grad_(requires_grad=False)
             head.refiner.requires_grad_()
+        if learn == "masks":
+            head.requires_grad_(requires_grad=False)
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.head = head.to(memory_format=self.memory_format) if channels_last else head  # ty: ignore[no-matching-overload]
         self.takes_noise = takes_noise(head)
-        self.average = MovingAverage(head, ema) if ema else None
-        self.task, self.loss, self.learn, self.settings = task, loss, learn, settings
+        self.average = MovingAverage(head, ema) if ema and learn != "masks" else None
+        self.task, self.loss, self.learn, self.sensors, self.settings = task, loss, learn, sensors, settings
         self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
         self.weights = {"depth": depth_weight, "image": image_weight}
         self._held_out: list[tuple[Tensor, ...]] = []  # distributions of depth of validation scenes, with the truth
@@ -158,6 +172,7 @@ class TidyTraining(pl.LightningModule):
             design_masks(optics, settings.design, progress=progress)
             optics.fidelity = optics.fidelity.replace(window=settings.window)
             fix_window(optics)  # for the designed masks
+        electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
         return cls(
             optics,
             build_head(settings),
@@ -170,9 +185,17 @@ class TidyTraining(pl.LightningModule):
             depth_weight=settings.depth_weight,
             image_weight=settings.image_weight,
             learn=settings.learn,
+            sensors=partial(random_sensor, settings.noise_range, electrons) if settings.learn == "masks" else None,
             channels_last=settings.channels_last,
             settings=settings.replace(window=optics.window),
         )
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the training mode; a network that is not learnt stays in that of evaluation."""
+        super().train(mode)
+        if self.learn == "masks":
+            self.head.eval()
+        return self
 
     def forward(self, coded: Tensor, noise: Tensor | None = None) -> Tensor:
         """Return the network's estimates from captures; in eval mode those of its moving average.
@@ -183,7 +206,7 @@ class TidyTraining(pl.LightningModule):
                 of the camera's sensor.
         """
         network = self.head if self.training or self.average is None else self.average
-        if self.learn == "both":  # else the PSFs are those of on_fit_start
+        if not self.fixed_optics:  # else the PSFs are those of on_fit_start
             update_psfs(network, self.optics)
         coded = coded.contiguous(memory_format=self.memory_format)
         return network(coded, noise=noise) if self.takes_noise else network(coded)
@@ -197,18 +220,21 @@ class TidyTraining(pl.LightningModule):
         if isinstance(batch, Broken):
             raise ValueError(batch.reason)
         if "coded" in batch:
-            coded, mask = batch["coded"], batch["mask"]
+            coded, mask, noise = batch["coded"], batch["mask"], batch.get("noise")
             truth = {"image": batch["image"], "depth": batch["inverse_depth"]}
         else:
-            coded, truth, mask = self._photograph(batch)
-        output = self(coded, batch.get("noise")).float()
+            coded, truth, mask, noise = self._photograph(batch)
+        output = self(coded, noise).float()
         return BatchResult(coded, split_maps(self.task, output), truth, mask, depth_logits(self.task, output))
 
-    def _photograph(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-        """Return captures, true maps and the mask of known depth of a batch of scenes."""
+    def _photograph(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor], Tensor, Tensor | None]:
+        """Return captures, true maps, the mask of known depth and, with ``sensors``, the noise of a batch of scenes."""
         seed = batch.get("noise_seed")
-        noise = None if seed is None else torch.Generator(self.device).manual_seed(seed)
-        sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=noise)
+        drawn = None if seed is None else torch.Generator(self.device).manual_seed(seed)
+        sensor = self.optics.sensor if self.sensors is None else self._drawn_sensors(len(batch["image"]), seed)
+        with with_sensor(self.optics, sensor):
+            sample = self.optics({"image": batch["image"], "depth": batch["depth"]}, generator=drawn)
+        told = sensor.std(self.optics.decode(sample["image"].detach())) if isinstance(sensor, SensorEach) else None
         coded, depth = sample["image"], sample["depth"]
         truth = {
             "image": sample["all_in_focus"],
@@ -216,7 +242,12 @@ class TidyTraining(pl.LightningModule):
         }
         mask = batch.get("mask")
         mask = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
-        return coded, truth, centre_crop(mask, *coded.shape[-2:])
+        return coded, truth, centre_crop(mask, *coded.shape[-2:]), told
+
+    def _drawn_sensors(self, count: int, seed: int | None) -> SensorEach:
+        assert self.sensors is not None
+        with nullcontext() if seed is None else seeded(seed):
+            return SensorEach([self.sensors() for _ in range(count)])
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
@@ -261,12 +292,13 @@ class TidyTraining(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""
-        if self.learn != "both":
+        if self.fixed_optics:
             learnt = (weight for weight in self.head.parameters() if weight.requires_grad)
             return self._scheduled(torch.optim.AdamW(learnt, lr=self.lr))
         groups = self.optics.parameter_groups(self.lr_metres, self.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
-        groups.append({"params": list(self.head.parameters()), "lr": self.lr})
+        if self.learn == "both":
+            groups.append({"params": list(self.head.parameters()), "lr": self.lr})
         return self._scheduled(torch.optim.Adam(groups, lr=self.lr, betas=self.betas))
 
     def _scheduled(self, adam: torch.optim.Optimizer) -> Any:
@@ -278,7 +310,7 @@ class TidyTraining(pl.LightningModule):
 
     def on_fit_start(self) -> None:
         """Hand the PSFs of fixed optics to the network and its average."""
-        if self.learn != "both":
+        if self.fixed_optics:
             with torch.no_grad():
                 for network in (self.head, self.average):
                     if network is not None:

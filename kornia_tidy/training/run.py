@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from kornia_tidy.files import only_here
+from kornia_tidy.inference.heads import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
@@ -83,6 +84,11 @@ def train(
     """
     if refiner_from is not None and not settings.refined:
         raise ValueError("a network begins the refiner of refined, which is not asked for")
+    if settings.learn == "masks" and settings.head not in CLOSED_FORMS and head_from is None and not resume:
+        raise ValueError(
+            f"learn='masks' learns through a network that stays as it is: begin with that of a trained system, "
+            f"head_from, or take a head without weights, {' or '.join(CLOSED_FORMS)}"
+        )
     folder = Path(folder)
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
     if folder.exists() and not folder.is_dir():

@@ -21,7 +21,9 @@ LEARN = {
     "both": "masks and network",
     "network": "the network behind fixed optics",
     "refiner": "the second network behind fixed optics, after the first",
+    "masks": "the masks, through a network that stays as it is",
 }
+FIXED_OPTICS = ("network", "refiner")
 
 NETWORK_RUN: dict[str, Any] = {
     "learn": "network", "head": "nafnet", "closed_form": True, "width": 16, "size": 256, "crop": None, "scenes": 1000,
@@ -44,7 +46,8 @@ class TrainingSettings(SystemSettings):
         learn: ``"both"``, masks and network together; or ``"network"`` alone behind fixed optics: scenes are rendered
             once, see :class:`~kornia_tidy.training.noise_free.NoiseFreeCaptures`, and crop, gain and noise are drawn
             for each step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`; or ``"refiner"``: as
-            ``"network"``, but only the second network of ``refined`` is learnt, and depth stays as it is.
+            ``"network"``, but only the second network of ``refined`` is learnt, and depth stays as it is; or
+            ``"masks"``: they are learnt through a network that stays as it is, with noise drawn for each scene.
         design: gradient steps that optimise the masks for the task before training, without scenes or network, see
             :func:`~kornia_tidy.training.designed.design_masks`; for the task ``"edof"`` only. 0: none. A fixed lens
             is not changed.
@@ -52,12 +55,12 @@ class TrainingSettings(SystemSettings):
         root: folder of the data, where they are files. None: ``data/NAME``.
         size: side of the scenes in pixels; larger scenes are cropped, at random for training.
         crop: side of the crops of the captures in pixels, for fixed optics. None: whole captures.
-        noise_range: least and largest standard deviation of read noise, in units of full scale, for
-            fixed optics; the sensor's own noise is that of scores afterwards.
+        noise_range: least and largest standard deviation of read noise, in units of full scale, where not masks and
+            network are learnt together; the sensor's own noise is that of scores afterwards.
         noise_error: largest factor by which the noise told to the network is wrong, for fixed optics: how well
             the noise of later captures will be known. 1: exactly.
         electrons: least and largest number of electrons of a white pixel at the reference f-number, for the captures
-            with shot noise of fixed optics. A smaller aperture gets fewer in the same exposure time. None: 500
+            with shot noise, likewise. A smaller aperture gets fewer in the same exposure time. None: 500
             to 60,000 at every f-number.
         reference_f_number: f-number at which the electrons are counted.
         scenes: number of training scenes, for data whose number of scenes is not fixed.
@@ -154,7 +157,7 @@ class TrainingSettings(SystemSettings):
     @property
     def fixed_optics(self) -> bool:
         """Whether the masks stay as they are, so that each scene is rendered once."""
-        return self.learn != "both"
+        return self.learn in FIXED_OPTICS
 
     @classmethod
     def of(cls, system: TrainedSystem) -> Self:

@@ -11,6 +11,7 @@ from kornia_tidy.data import DeadLeaves
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
+from kornia_tidy.sensor.exposure import electrons_at
 from kornia_tidy.training.scenes import Broken, SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
@@ -184,6 +185,41 @@ class TestTidyTraining(BaseTester):
         assert {name for name, p in module.named_parameters() if p.grad is not None} == {
             name for name, _ in module.named_parameters() if name.startswith("head.refiner.")
         }
+
+    def test_feature_the_masks_alone_learn_through_a_network_that_stays(self, monkeypatch):
+        module = made(learn="masks", closed_form=True, task="edof", ema=0.9, lr_metres=1e-8)
+        optimizer = module.configure_optimizers()
+        (group,) = optimizer.param_groups
+        assert {id(p) for p in group["params"]} == {id(p) for p in module.optics.parameters()}
+        assert module.average is None
+        assert module.train().training
+        assert not module.head.training
+        monkeypatch.setattr(module, "log", lambda *args, **options: None)
+        before = {name: value.clone() for name, value in module.state_dict().items() if isinstance(value, torch.Tensor)}
+        module.training_step(batch(), 0).backward()
+        optimizer.step()
+        changed = {name for name, value in before.items() if not torch.equal(value, module.state_dict()[name])}
+        assert "optics.masks.phase" in changed
+        network = changed - {"optics.masks.phase"}
+        assert all(name.startswith("head.closed_form.") for name in network)  # it follows the camera
+
+    def test_feature_masks_see_each_scene_with_a_noise_of_its_own_and_the_network_is_told(self):
+        module = made(learn="masks", closed_form=True, task="edof", noise_range=(0.001, 0.001), electrons=(100, 100))
+        told, own = [], module.optics.sensor
+        monkeypatch = pytest.MonkeyPatch()
+        monkeypatch.setattr(module.head, "forward", lambda coded, noise: told.append(noise) or coded)
+        scenes = batch(8)
+        coded = module.reconstruct(scenes).coded
+        assert torch.equal(coded, module.reconstruct(scenes).coded)  # noise and sensors follow from the batch
+        assert module.optics.sensor is own
+        levels = told[0].amin((1, 2, 3))
+        reads = levels == 0.001
+        assert 0 < reads.sum() < 8  # half of the sensors have shot noise, here 2.4 electrons of 100 in the dark
+        electrons = electrons_at(module.optics.camera.f_number, 100, 17.6)
+        assert torch.equal(told[0][reads], torch.full_like(told[0][reads], 0.001))
+        light = module.optics.decode(coded[~reads])
+        wanted = ((2.4 / electrons) ** 2 + light / electrons).sqrt()
+        self.assert_close(told[0][~reads], wanted, rtol=1e-4, atol=1e-6)
 
     def test_exception_there_is_no_refiner(self):
         with pytest.raises(ValueError, match="needs a JointClosedFormHead with a refiner"):

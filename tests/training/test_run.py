@@ -110,6 +110,24 @@ class TestTrain(BaseTester):
         assert second.optics.window == 11
         assert second.optics.fidelity.stray_light == "veil"
 
+    def test_feature_masks_go_on_through_the_network_of_another_run(self, tmp_path):
+        both = SETTINGS.replace(task="edof", epochs=1, masks=2)
+        first = train(both, tmp_path / "a")
+        given = {"head_from": tmp_path / "a" / "last.safetensors", "masks_from": tmp_path / "a" / "last.safetensors"}
+        module = train(both.replace(learn="masks"), tmp_path / "b", **given)
+        kept = read_state(tmp_path / "b" / "best.safetensors")["state_dict"]
+        weights = first.average.network.state_dict()
+        assert all(torch.equal(kept[f"head.{name}"], value) for name, value in weights.items())
+        assert not torch.equal(module.optics.masks.phase, first.optics.masks.phase)
+        assert not (tmp_path / "b" / "captures").exists()
+        train(both.replace(learn="masks", epochs=2), tmp_path / "b", resume=True)
+        assert len(rows(tmp_path / "b" / "training.csv")) == 4
+
+    def test_exception_masks_alone_need_a_network_that_has_learnt(self, tmp_path):
+        with pytest.raises(ValueError, match=r"begin with that of a trained system, head_from, or take a head without"):
+            train(SETTINGS.replace(learn="masks"), tmp_path)
+        train(SETTINGS.replace(learn="masks", task="edof", head="wiener-bilateral", epochs=1), tmp_path)
+
     def test_exception_masks_of_another_number_are_refused(self, tmp_path):
         train(SETTINGS.replace(epochs=1), tmp_path / "a")
         with pytest.raises(ValueError, match=r"optics\.masks does not fit: .*phase is \(1, 23, 23\)"):

@@ -1,0 +1,72 @@
+"""A sensor of its own for each capture of a batch, so that masks learn for a range of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.sensor.noise import SensorNoise
+
+
+class SensorEach(nn.Module):
+    """A batch of sensors, one for each capture.
+
+    Args:
+        sensors: as many as the batch has captures.
+
+    Raises:
+        ValueError: if a batch has another number of captures.
+
+    Shape:
+        - irradiance: (B, C, H, W), linear light, full scale 1. Output: the same.
+
+    Example:
+        >>> sensors = SensorEach([SensorNoise(0.0), SensorNoise(0.1)])
+        >>> seen = sensors(torch.full((2, 1, 8, 8), 0.5))
+        >>> [round(float(one.std()), 1) for one in seen]
+        [0.0, 0.1]
+    """
+
+    def __init__(self, sensors: Sequence[SensorNoise]) -> None:
+        super().__init__()
+        self.sensors = nn.ModuleList(sensors)
+
+    def forward(
+        self, irradiance: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return the recorded captures; noise is drawn for one after the other."""
+        seen = [sensor(one[None], params, generator) for sensor, one in self._each(irradiance)]
+        return torch.cat(seen)
+
+    def std(self, image: Tensor) -> Tensor:
+        """Return the standard deviation of the noise in each pixel of a batch, see :meth:`SensorNoise.std`."""
+        return torch.cat([sensor.std(one[None]) for sensor, one in self._each(image)])
+
+    def _each(self, batch: Tensor) -> list[tuple[SensorNoise, Tensor]]:
+        if len(batch) != len(self.sensors):
+            raise ValueError(f"{len(self.sensors)} sensors take as many captures, got {len(batch)}")
+        return list(zip(self.sensors, batch, strict=True))  # ty: ignore[invalid-explicit-return]
+
+
+@contextmanager
+def with_sensor(optics: TiDyOptics, sensor: nn.Module | None) -> Generator[None]:
+    """Let a camera have another sensor for a block.
+
+    Example:
+        >>> optics = TiDyOptics()
+        >>> with with_sensor(optics, None):
+        ...     print(optics.sensor)
+        None
+        >>> optics.sensor.sigma
+        0.01
+    """
+    own = optics.sensor
+    optics.sensor = sensor
+    try:
+        yield
+    finally:
+        optics.sensor = own
