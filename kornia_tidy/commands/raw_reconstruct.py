@@ -5,22 +5,19 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import sys
-import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
-from tqdm import tqdm
 
 from kornia_tidy.checks import check_positive
+from kornia_tidy.commands.file_jobs import Row, table, work_on_all
 from kornia_tidy.commands.raw_develop import SUFFIXES, add_white_balance_option, output_paths, parse_white_balance
 from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, open_raw
 from kornia_tidy.commands.report import tell
@@ -94,15 +91,6 @@ Exit status 2 if any file failed; the others are reconstructed all the same.
 PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".pfm", ".pgm", ".ppm"}
 PREVIEW_DPI = 150
 SMALLEST_DEVIATION = 1e-9  # m
-
-
-class Row(NamedTuple):
-    """A line of the summary."""
-
-    file: str
-    result: str
-    size: str = ""
-    seconds: float | None = None
 
 
 def add_parser(subparsers: Any) -> None:
@@ -208,7 +196,7 @@ def run(args: argparse.Namespace) -> None:
         write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
         return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
 
-    rows = work_on_all(list(outputs), work, args.jobs)
+    rows = work_on_all("reconstruct", list(outputs), work, args.jobs)
     failed = sum(row.result not in {"done", "kept"} for row in rows)
     for line in table(rows):
         print(line)
@@ -314,77 +302,6 @@ def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
     return isinstance(record, dict) and all(record.get(name) == value for name, value in said.items())
 
 
-def work_on_all(paths: list[str], work: Callable[[str, Callable[[int, int], None]], Row], jobs: int) -> list[Row]:
-    """Process all files, several at a time, and go on after errors; an interrupt ends all between two tiles.
-
-    Threads share the weights of the network in memory, and long operations release the interpreter lock.
-    """
-    stop = threading.Event()
-    lock = threading.Lock()
-    rows: dict[str, Row] = {}
-    form = "{l_bar}{bar}| {n:.2f}/{total} [{elapsed}<{remaining}]"
-    with tqdm(total=len(paths), desc="reconstruct", file=sys.stderr, leave=False, bar_format=form) as bar:
-
-        def each(path: str) -> Row:
-            shown = 0.0
-
-            def progress(done: int, tiles: int) -> None:
-                nonlocal shown
-                if stop.is_set():
-                    raise KeyboardInterrupt
-                with lock:
-                    bar.update(done / tiles - shown)
-                shown = done / tiles
-
-            if stop.is_set():
-                raise KeyboardInterrupt
-            try:
-                return work(path, progress)
-            finally:
-                with lock:
-                    bar.update(1 - shown)
-
-        with ThreadPoolExecutor(jobs, initializer=_share_cores, initargs=(jobs,)) as pool:
-            futures = {pool.submit(each, path): path for path in paths}
-            try:
-                for future in as_completed(futures):
-                    rows[futures[future]] = _row(futures[future], future)
-            except BaseException:
-                stop.set()
-                pool.shutdown(cancel_futures=True)
-                raise
-    return [rows[path] for path in paths]
-
-
-def table(rows: list[Row]) -> list[str]:
-    """Return the summary with one line per file.
-
-    Example:
-        >>> for line in table([Row("a.dng", "done", "60 x 40", 1.25), Row("bb.dng", "cannot read bb.dng: empty")]):
-        ...     print(line)
-        file    size     seconds  result
-        a.dng   60 x 40     1.25  done
-        bb.dng                    cannot read bb.dng: empty
-    """
-    files, sizes = (max(len(name), *(len(row[i]) for row in rows)) for i, name in ((0, "file"), (2, "size")))
-    lines = [f"{'file':<{files}}  {'size':<{sizes}}  seconds  result"]
-    for row in rows:
-        seconds = "" if row.seconds is None else f"{row.seconds:.2f}"
-        lines.append(f"{row.file:<{files}}  {row.size:<{sizes}}  {seconds:>7}  {row.result}")
-    return lines
-
-
-def _row(path: str, future: Future[Row]) -> Row:
-    """Return the summary row of a processed file; an error is printed and becomes the text of the row."""
-    try:
-        return future.result()
-    except Exception as error:
-        sentence = " ".join(str(error).split()) or type(error).__name__
-        with tqdm.external_write_mode(file=sys.stderr):
-            print(f"kornia-tidy: error: {sentence}", file=sys.stderr, flush=True)
-        return Row(path, sentence)
-
-
 def _identity(path: str) -> dict[str, Any]:
     """Return the identity of an input file, to recognise it on resuming."""
     if not Path(path).is_file():
@@ -405,11 +322,6 @@ def _in_words(head: LightHead, args: argparse.Namespace) -> dict[str, str]:
             words["deviation_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or more, or unbounded"
         words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
     return words
-
-
-def _share_cores(jobs: int) -> None:
-    if jobs > 1:
-        torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
 
 
 def _as_it_is(image: Tensor) -> Tensor:

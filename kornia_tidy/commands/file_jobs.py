@@ -1,0 +1,112 @@
+"""Work on several files at a time, with a progress bar, and its summary."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from typing import NamedTuple
+
+import torch
+from tqdm import tqdm
+
+
+class Row(NamedTuple):
+    """A line of the summary."""
+
+    file: str
+    result: str
+    size: str = ""
+    seconds: float | None = None
+
+
+def work_on_all(
+    title: str, paths: list[str], work: Callable[[str, Callable[[int, int], None]], Row], jobs: int = 1
+) -> list[Row]:
+    """Process all files, several at a time, and go on after errors; an interrupt ends all between two tiles.
+
+    Args:
+        title: of the progress bar.
+        paths: of the files.
+        work: processes a file and returns its row. It is also given a function to call with the number of tiles that
+            are done and of all; there an interrupt of another file ends it.
+        jobs: files at a time, each in a thread: threads share the weights of a network in memory, and long operations
+            release the interpreter lock.
+
+    Returns:
+        Rows in the order of the files. An error is printed, and becomes the result of its row.
+
+    Example:
+        >>> [row.result for row in work_on_all("measure", ["a", "b"], lambda path, progress: Row(path, "done"), jobs=2)]
+        ['done', 'done']
+    """
+    stop = threading.Event()
+    lock = threading.Lock()
+    rows: dict[str, Row] = {}
+    form = "{l_bar}{bar}| {n:.2f}/{total} [{elapsed}<{remaining}]"
+    with tqdm(total=len(paths), desc=title, file=sys.stderr, leave=False, bar_format=form) as bar:
+
+        def each(path: str) -> Row:
+            shown = 0.0
+
+            def progress(done: int, tiles: int) -> None:
+                nonlocal shown
+                if stop.is_set():
+                    raise KeyboardInterrupt
+                with lock:
+                    bar.update(done / tiles - shown)
+                shown = done / tiles
+
+            if stop.is_set():
+                raise KeyboardInterrupt
+            try:
+                return work(path, progress)
+            finally:
+                with lock:
+                    bar.update(1 - shown)
+
+        with ThreadPoolExecutor(jobs, initializer=_share_cores, initargs=(jobs,)) as pool:
+            futures = {pool.submit(each, path): path for path in paths}
+            try:
+                for future in as_completed(futures):
+                    rows[futures[future]] = _row(futures[future], future)
+            except BaseException:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+                raise
+    return [rows[path] for path in paths]
+
+
+def table(rows: list[Row]) -> list[str]:
+    """Return the summary with one line per file.
+
+    Example:
+        >>> for line in table([Row("a.dng", "done", "60 x 40", 1.25), Row("bb.dng", "cannot read bb.dng: empty")]):
+        ...     print(line)
+        file    size     seconds  result
+        a.dng   60 x 40     1.25  done
+        bb.dng                    cannot read bb.dng: empty
+    """
+    files, sizes = (max(len(name), *(len(row[i]) for row in rows)) for i, name in ((0, "file"), (2, "size")))
+    lines = [f"{'file':<{files}}  {'size':<{sizes}}  seconds  result"]
+    for row in rows:
+        seconds = "" if row.seconds is None else f"{row.seconds:.2f}"
+        lines.append(f"{row.file:<{files}}  {row.size:<{sizes}}  {seconds:>7}  {row.result}")
+    return lines
+
+
+def _row(path: str, future: Future[Row]) -> Row:
+    """Return the summary row of a processed file; an error is printed and becomes the text of the row."""
+    try:
+        return future.result()
+    except Exception as error:
+        sentence = " ".join(str(error).split()) or type(error).__name__
+        with tqdm.external_write_mode(file=sys.stderr):
+            print(f"kornia-tidy: error: {sentence}", file=sys.stderr, flush=True)
+        return Row(path, sentence)
+
+
+def _share_cores(jobs: int) -> None:
+    if jobs > 1:
+        torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
