@@ -40,7 +40,7 @@ class TestWorkOnAll(BaseTester):
 
         with pytest.raises(KeyboardInterrupt):
             work_on_all("measure", ["a", "b", "c"], work, jobs=2)
-        assert ended == ["b"]
+        assert ended in (["b"], ["b", "c"], ["c", "b"])  # c may have begun before the interrupt
 
     def test_feature_results_of_a_table_stand_below_each_other(self):
         head, *lines = table([Row("a.dng", "done", "60 x 40", 1.25), Row("long/name.dng", "kept")])
