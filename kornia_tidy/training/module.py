@@ -23,6 +23,7 @@ from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
+from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
@@ -246,7 +247,7 @@ class TidyTraining(pl.LightningModule):
 
     def _drawn_sensors(self, count: int, seed: int | None) -> SensorEach:
         assert self.sensors is not None
-        with nullcontext() if seed is None else seeded(seed):
+        with nullcontext() if seed is None else seeded(keyed_seed(seed, "sensors")):
             return SensorEach([self.sensors() for _ in range(count)])
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:

@@ -84,12 +84,13 @@ def train(
     """
     if refiner_from is not None and not settings.refined:
         raise ValueError("a network begins the refiner of refined, which is not asked for")
-    if settings.learn == "masks" and settings.head not in CLOSED_FORMS and head_from is None and not resume:
+    folder = Path(folder)
+    goes_on = resume and (folder / LAST).exists()
+    if settings.learn == "masks" and settings.head not in CLOSED_FORMS and head_from is None and not goes_on:
         raise ValueError(
             f"learn='masks' learns through a network that stays as it is: begin with that of a trained system, "
             f"head_from, or take a head without weights, {' or '.join(CLOSED_FORMS)}"
         )
-    folder = Path(folder)
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")

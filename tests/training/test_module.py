@@ -203,10 +203,9 @@ class TestTidyTraining(BaseTester):
         network = changed - {"optics.masks.phase"}
         assert all(name.startswith("head.closed_form.") for name in network)  # it follows the camera
 
-    def test_feature_masks_see_each_scene_with_a_noise_of_its_own_and_the_network_is_told(self):
+    def test_feature_masks_see_each_scene_with_a_noise_of_its_own_and_the_network_is_told(self, monkeypatch):
         module = made(learn="masks", closed_form=True, task="edof", noise_range=(0.001, 0.001), electrons=(100, 100))
         told, own = [], module.optics.sensor
-        monkeypatch = pytest.MonkeyPatch()
         monkeypatch.setattr(module.head, "forward", lambda coded, noise: told.append(noise) or coded)
         scenes = batch(8)
         coded = module.reconstruct(scenes).coded

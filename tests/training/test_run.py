@@ -125,7 +125,7 @@ class TestTrain(BaseTester):
 
     def test_exception_masks_alone_need_a_network_that_has_learnt(self, tmp_path):
         with pytest.raises(ValueError, match=r"begin with that of a trained system, head_from, or take a head without"):
-            train(SETTINGS.replace(learn="masks"), tmp_path)
+            train(SETTINGS.replace(learn="masks"), tmp_path, resume=True)  # there is nothing to resume
         train(SETTINGS.replace(learn="masks", task="edof", head="wiener-bilateral", epochs=1), tmp_path)
 
     def test_exception_masks_of_another_number_are_refused(self, tmp_path):
