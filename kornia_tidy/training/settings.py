@@ -125,6 +125,8 @@ class TrainingSettings(SystemSettings):
         check_choice("learn", self.learn, tuple(LEARN))
         if self.learn == "refiner" and not self.refined:
             raise ValueError("learn='refiner' needs the second network of refined=True")
+        if self.learn == "masks" and not self.masks:
+            raise ValueError("learn='masks' needs masks to learn, got masks=0, a fixed lens")
         check_choice("loss", self.loss, tuple(LOSSES))
         check_choice("precision", self.precision, PRECISIONS)
         check_choice("schedule", self.schedule, SCHEDULES)

@@ -273,6 +273,7 @@ class TestSettings(BaseTester):
             ({"noise_error": 0.5}, "noise_error must be a factor of at least 1, got 0.5"),
             ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
             ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
+            ({"learn": "masks", "masks": 0}, "learn='masks' needs masks to learn, got masks=0"),
             ({"learn": "all"}, "learn must be one of 'both', 'network', 'refiner', 'masks', got 'all'"),
             ({"size": 64, "crop": 65}, "crop must be at most the size of the scenes, 64, got 65"),
             ({"f_number": 0.4}, "f_number must be 0.5 or more, got 0.4"),
