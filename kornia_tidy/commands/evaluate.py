@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from kornia_tidy.commands.options import seed
 from kornia_tidy.commands.report import tell
-from kornia_tidy.commands.train import add_scene_options, given_settings
+from kornia_tidy.commands.training_options import add_scene_options, given_settings
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.data_sets import make_scenes

@@ -18,7 +18,7 @@ from kornia_tidy.coded_datasets.layout import BESIDE, Layout
 from kornia_tidy.coded_datasets.render_scenes import render_scenes, shard_items_within
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
-from kornia_tidy.commands.train import add_camera_settings, add_scene_options, given_settings
+from kornia_tidy.commands.training_options import add_camera_settings, add_scene_options, given_settings
 from kornia_tidy.files import read_bytes
 from kornia_tidy.inference.trained import build_optics, load_trained
 from kornia_tidy.sensor.noise import SensorNoise

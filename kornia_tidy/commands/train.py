@@ -6,21 +6,22 @@ import argparse
 import os
 import sys
 import textwrap
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
-from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.commands.training_options import (
+    add_camera_settings,
+    add_network_settings,
+    add_noise_settings,
+    add_scene_options,
+    add_setting,
+    given_settings,
+)
 from kornia_tidy.figures.learning_curve import draw_learning_curve
-from kornia_tidy.inference.heads import CLOSED_FORMS, HEADS
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.masks.initial_heights import STARTS
-from kornia_tidy.psf.psf_bank import STRAY_LIGHT
-from kornia_tidy.reconstruction.closed_form import INVERSES
-from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.design_folder import designed_camera, designed_settings
 from kornia_tidy.training.lightning_extra import require_lightning
 from kornia_tidy.training.settings import LEARN, NETWORK_RUN, PRECISIONS, SCHEDULES, TrainingSettings, usual_settings
@@ -126,39 +127,39 @@ def add_parser(subparsers: Any) -> None:
     )
 
     system = parser.add_argument_group("what is learnt")
-    _setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
-    _setting(
+    add_setting(system, "task", choices=tuple(MAPS), help="edof, depth or joint")
+    add_setting(
         system,
         "learn",
         choices=tuple(LEARN),
         help="both: masks and network together; network: behind fixed masks, with captures rendered once; refiner: so, "
         "and only the second network of --refined; masks: through the network of --head-from, which stays as it is",
     )
-    _setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
-    _setting(
+    add_setting(system, "masks", type=int, metavar="K", help="masks in one exposure; 0: a fixed Fresnel lens")
+    add_setting(
         system,
         "start",
         choices=STARTS,
         help="heights of the masks at first; Fisher suits depth, sweep edof; flat, with --masks 1: a lens alone",
     )
-    _setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
-    _add_network_settings(system)
-    _setting(
+    add_setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
+    add_network_settings(system)
+    add_setting(
         system,
         "loss",
         choices=tuple(LOSSES),
         help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes; charbonnier: smooth l1; "
         "psnr-ssim: decibels of the error and of SSIM, for images",
     )
-    _setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
-    _setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
+    add_setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
+    add_setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
 
     data = parser.add_argument_group("scenes")
     add_scene_options(data)
-    _setting(data, "scenes", type=int, metavar="N", help="number for training, of patches and scenes made here")
-    _setting(data, "validation_scenes", type=int, metavar="N", help="number for validation, at most")
-    _setting(data, "crop", type=int, metavar="PX", help="side of what a step sees of a scene; --learn network only")
-    _add_noise_settings(data)
+    add_setting(data, "scenes", type=int, metavar="N", help="number for training, of patches and scenes made here")
+    add_setting(data, "validation_scenes", type=int, metavar="N", help="number for validation, at most")
+    add_setting(data, "crop", type=int, metavar="PX", help="side of what a step sees of a scene; --learn network only")
+    add_noise_settings(data)
     data.add_argument(
         "--captures",
         metavar="FOLDER",
@@ -168,29 +169,29 @@ def add_parser(subparsers: Any) -> None:
     add_camera_settings(parser.add_argument_group("camera"))
 
     learning = parser.add_argument_group("learning")
-    _setting(learning, "epochs", type=int, metavar="N", help="passes over the scenes")
-    _setting(learning, "pretrain_epochs", type=int, metavar="N", help="before, with a fixed Fresnel lens")
-    _setting(learning, "batch", type=int, metavar="B", help="scenes in a batch")
-    _setting(learning, "accumulate", type=int, metavar="N", help="batches in a step")
-    _setting(learning, "lr", type=float, metavar="LR", help="learning rate of the network")
-    _setting(learning, "lr_metres", type=float, metavar="LR", help="learning rate of the masks, metres of height")
-    _setting(learning, "schedule", choices=SCHEDULES, help="of both rates; cosine: up, then down to zero")
-    _setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
-    _setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
-    _setting(
+    add_setting(learning, "epochs", type=int, metavar="N", help="passes over the scenes")
+    add_setting(learning, "pretrain_epochs", type=int, metavar="N", help="before, with a fixed Fresnel lens")
+    add_setting(learning, "batch", type=int, metavar="B", help="scenes in a batch")
+    add_setting(learning, "accumulate", type=int, metavar="N", help="batches in a step")
+    add_setting(learning, "lr", type=float, metavar="LR", help="learning rate of the network")
+    add_setting(learning, "lr_metres", type=float, metavar="LR", help="learning rate of the masks, metres of height")
+    add_setting(learning, "schedule", choices=SCHEDULES, help="of both rates; cosine: up, then down to zero")
+    add_setting(learning, "ema", type=float, metavar="D", help="decay of the network's moving average; 0: none")
+    add_setting(learning, "patience", type=int, metavar="N", help="stop after N epochs without improvement")
+    add_setting(
         learning,
         "precision",
         choices=PRECISIONS,
         help="of the network; optics stay in float32. bf16-mixed is faster on processors that compute in bfloat16 "
         "(AMX or AVX-512 BF16: see lscpu), and far slower on others; default: 32-true",
     )
-    _setting(
+    add_setting(
         learning,
         "channels_last",
         action=argparse.BooleanOptionalAction,
         help="the network's memory holds the channels of a pixel together: faster",
     )
-    _setting(learning, "seed", type=seed, metavar="N", help="everything random follows from it")
+    add_setting(learning, "seed", type=seed, metavar="N", help="everything random follows from it")
 
     machine = parser.add_argument_group("machine")
     machine.add_argument("--accelerator", choices=("cpu", "gpu"), default="cpu", help="(default: cpu)")
@@ -201,125 +202,6 @@ def add_parser(subparsers: Any) -> None:
     machine.add_argument(
         "--save-every", type=int, default=100, metavar="N", help="steps between checkpoints in an epoch (default: 100)"
     )
-
-
-def _add_network_settings(group: Any) -> None:
-    """Add the options of the network and of its inputs."""
-    _setting(
-        group,
-        "head",
-        metavar="NAME",
-        help=f"{', '.join(HEADS)}: networks (without a GPU take nafnet, plain or a small --width: the paper's "
-        f"attention-unet has 34.9 million weights); {', '.join(CLOSED_FORMS)}: no network, only masks are learnt; "
-        f"or module:Class, a class of yours that takes in_channels, out_channels and, if given, width",
-    )
-    _setting(
-        group, "width", type=int, metavar="C", help="channels of its first level; default: its own, the paper's 64"
-    )
-    _setting(group, "repeats", type=int, metavar="N", help="factor of the number of blocks of nafnet; default: 1")
-    _setting(
-        group, "residual", action=argparse.BooleanOptionalAction, help="the network adds to the capture; not for depth"
-    )
-    _setting(
-        group,
-        "closed_form",
-        action=argparse.BooleanOptionalAction,
-        help="the network takes deconvolved captures and the level of the noise, and adds to the best of them",
-    )
-    _setting(
-        group,
-        "inverse",
-        choices=INVERSES,
-        help="filter of the deconvolved captures of --closed-form: wiener knows the spectrum of photographs and how "
-        "PSFs differ between depths; default: wiener",
-    )
-    _setting(group, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
-    _setting(
-        group,
-        "depth_classes",
-        type=int,
-        metavar="D",
-        help="joint: depth as a distribution over D classes, with its uncertainty, from --refocus depths; with "
-        "--closed-form the default is 21 classes from 9 depths; without, 32 and 11 do; 0: one depth a pixel",
-    )
-    _setting(
-        group,
-        "refined",
-        action=argparse.BooleanOptionalAction,
-        help="a second network of the same kind refines the image; for a distribution of depth with --closed-form",
-    )
-
-
-def _add_noise_settings(group: Any) -> None:
-    """Add the options of the noise where not masks and network are learnt together."""
-    _setting(
-        group,
-        "noise_range",
-        type=float,
-        nargs=2,
-        metavar=("LEAST", "LARGEST"),
-        help="read noise, of full scale, drawn for half of the captures; not for --learn both",
-    )
-    _setting(
-        group,
-        "noise_error",
-        type=float,
-        metavar="X",
-        help="largest factor by which the noise told to the network is wrong; default: 2.5; 1 for a camera whose noise "
-        "is known; --learn network only",
-    )
-    _setting(
-        group,
-        "electrons",
-        type=float,
-        nargs=2,
-        metavar=("LEAST", "LARGEST"),
-        help="of white at --reference-f-number, drawn for the other half, which has shot noise: a smaller aperture "
-        "gets fewer in the same exposure time; default: 500 to 60000 at any f-number; not for --learn both",
-    )
-    _setting(group, "reference_f_number", type=float, metavar="F", help="f-number of --electrons")
-
-
-def add_scene_options(group: Any) -> None:
-    """Add the options of scenes, with defaults from stored settings."""
-    _setting(group, "data", choices=tuple(SCENES), help="where scenes come from")
-    _setting(group, "root", metavar="FOLDER", help="folder of data that are files; default: data/NAME")
-    _setting(group, "size", type=int, metavar="PX", help="side of the scenes; larger ones are cropped")
-
-
-def add_camera_settings(group: Any) -> None:
-    """Add the options of lens and sensor, with defaults from stored settings."""
-    _setting(
-        group,
-        "depth_range",
-        type=float,
-        nargs=2,
-        metavar=("NEAR", "FAR"),
-        help="metres: focus and aperture are chosen to tell these depths apart; else 0.298 to inf",
-    )
-    _setting(group, "f_number", type=float, metavar="F", help="of the lens; default: 17.6, or by --depth-range")
-    _setting(
-        group,
-        "focus",
-        type=float,
-        metavar="M",
-        help="distance in focus, metres or inf; default: the middle of the range of 1/depth",
-    )
-    _setting(group, "focal_length", type=float, metavar="M", help="metres")
-    _setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
-    _setting(group, "sigma", type=float, metavar="S", help="read noise, of full scale")
-    _setting(group, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
-    _setting(group, "window", type=int, metavar="PX", help="side of the PSFs, odd; default: measured on the masks")
-    _setting(
-        group, "stray_light", choices=STRAY_LIGHT, help="light outside the window; default: as the fidelity has it"
-    )
-    _setting(group, "compositing", choices=tuple(COMPOSITING), help="of depths")
-    _setting(group, "border", choices=("reflect", "replicate", "zero", "circular", "valid"), help="beyond the scene")
-
-
-def given_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings given on the command line, without defaults."""
-    return {field.name: getattr(args, field.name) for field in fields(TrainingSettings) if field.name in args}
 
 
 def run(args: argparse.Namespace) -> None:
@@ -393,10 +275,3 @@ def _draw_curve(folder: Path) -> list[str]:
 
 def _nothing(*_: str) -> None:
     """Ignore a report line."""
-
-
-def _setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)
-    """Add an option for a setting without a default, so that stored settings remain unless it is given."""
-    default = next(field.default for field in fields(TrainingSettings) if field.name == name)
-    told = help if default is None else f"{help} (default: {default})"
-    group.add_argument(f"--{name.replace('_', '-')}", dest=name, default=argparse.SUPPRESS, help=told, **options)

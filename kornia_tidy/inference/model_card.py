@@ -139,8 +139,9 @@ def _masks(system: TrainedSystem) -> str:
 
 
 def _is_flat(system: TrainedSystem) -> bool:
-    """Return whether the camera is a lens alone: masks of zero height that were not trained."""
-    return system.settings.start == "flat" and system.run.get("learn", "both") not in ("both", "masks")
+    """Return whether the camera is a lens alone: its masks have no relief."""
+    heights = system.optics.masks.heights()
+    return bool((heights == heights[:, :1, :1]).all())
 
 
 def _camera(system: TrainedSystem) -> list[tuple[str, str]]:

@@ -5,18 +5,21 @@ from __future__ import annotations
 import re
 
 import pytest
+import torch
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.inference.model_card import model_card
 from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained, pretrained_record
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.masks.pixelwise import PixelwiseMask
 from tests.base import BaseTester
 
 SECTIONS = ["Use", "Camera and network", "Training", "Scores", "Intended use", "Limits", "Licence", "Citation"]
 
 
 def untrained(**settings):
-    return TrainedSystem(None, None, SystemSettings(**settings), 7)
+    return TrainedSystem(TiDyOptics(), None, SystemSettings(**settings), 7)
 
 
 class TestModelCard(BaseTester):
@@ -57,6 +60,13 @@ class TestModelCard(BaseTester):
     )
     def test_feature_what_the_network_begins_from(self, settings, words):
         assert f"| begins from | {words} |" in model_card(untrained(**settings), "t")
+
+    @pytest.mark.parametrize(("height", "words"), [(1e-7, "a lens without masks"), (None, "1 learnt phase mask ")])
+    def test_feature_masks_are_those_the_camera_has(self, height, words):
+        heights = torch.rand(1, 23, 23) * 1e-7 if height is None else torch.full((1, 23, 23), height)
+        for start in ("flat", "noise"):  # masks may come from a file, however the settings say they start
+            system = untrained(masks=1, start=start)._replace(optics=TiDyOptics(PixelwiseMask(initial=heights)))
+            assert f"A simulated camera with {words}" in model_card(system, "t")
 
     def test_feature_what_is_not_recorded_is_said_to_be_unknown(self):
         card = model_card(untrained(), "t")
