@@ -140,7 +140,7 @@ def add_parser(subparsers: Any) -> None:
         choices=ORIENTATIONS,
         default=1,
         help="of its input over which a network that begins with the closed form is averaged: with 8 shipped networks "
-        "are 0.1 to 0.15 dB better and take 6 to 7 times as long (default: 1)",
+        "are about 0.1 dB better and take 6 to 7 times as long (default: 1)",
     )
     parser.add_argument("--device", default="cpu", help="where the network runs, such as cuda (default: cpu)")
     add_dump_options(parser)
