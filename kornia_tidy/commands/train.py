@@ -151,7 +151,13 @@ def add_parser(subparsers: Any) -> None:
         help="mse: the paper's; l1: Ikoma's of depth; phasecam3d: 20 RMSE + RMSE of slopes; charbonnier: smooth l1; "
         "psnr-ssim: decibels of the error and of SSIM, for images",
     )
-    add_setting(system, "depth_weight", type=float, metavar="W", help="of the depth loss in the joint task")
+    add_setting(
+        system,
+        "depth_weight",
+        type=float,
+        metavar="W",
+        help="of the depth loss in the joint task; beside psnr-ssim, which is in decibels, 10 or more",
+    )
     add_setting(system, "image_weight", type=float, metavar="W", help="of the image loss in the joint task")
 
     data = parser.add_argument_group("scenes")
