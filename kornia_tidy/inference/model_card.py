@@ -133,15 +133,9 @@ def _masks(system: TrainedSystem) -> str:
     settings = system.settings
     if not settings.masks:
         return "a fixed Fresnel lens"
-    if _is_flat(system):
+    if system.optics.masks.is_flat():
         return "a lens without masks"
     return f"{settings.masks} learnt phase mask{'s shown during one exposure' if settings.masks > 1 else ''}"
-
-
-def _is_flat(system: TrainedSystem) -> bool:
-    """Return whether the camera is a lens alone: its masks have no relief."""
-    heights = system.optics.masks.heights()
-    return bool((heights == heights[:, :1, :1]).all())
 
 
 def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
@@ -150,7 +144,7 @@ def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
     near, far = camera.depth_range
     return [
         ("task", settings.task),
-        ("phase masks", "none" if _is_flat(system) else str(settings.masks)),
+        ("phase masks", "none" if system.optics.masks.is_flat() else str(settings.masks)),
         ("lens", f"{camera.focal_length * 1e3:.4g} mm, f/{camera.focal_length / camera.aperture_diameter:.3g}"),
         ("focused at", _distance(float(camera.focus_distance))),
         ("range of depth", f"{near:.4g} m to {_distance(far)}"),

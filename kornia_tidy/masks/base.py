@@ -102,6 +102,17 @@ class PhaseMasks(nn.Module):
         phase = self.phase
         return phase.to(torch.promote_types(phase.dtype, torch.float32)) / metres_to_radians(self.material)
 
+    def is_flat(self) -> bool:
+        """Return whether each mask has one height everywhere, so that the camera is a lens alone.
+
+        Example:
+            >>> from kornia_tidy import PixelwiseMask
+            >>> PixelwiseMask(2, initial="flat").is_flat(), PixelwiseMask(2).is_flat()
+            (True, False)
+        """
+        phase = self.phase.detach()
+        return bool((phase == phase[:, :1, :1]).all())
+
     def dispersion(self, wavelength: float) -> float:
         """Return the ratio of the phase at a wavelength in metres to the phase at 530 nm, index included."""
         return metres_to_radians(self.material, wavelength) / metres_to_radians(self.material)

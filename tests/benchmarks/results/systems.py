@@ -82,9 +82,8 @@ def from_checkpoint(path: Path) -> System:
 
 def of_trained(name: str, trained: TrainedSystem) -> System:
     """Return a trained system with the window of the benchmark; its network stays as it was trained."""
-    flat = not bool(trained.optics.masks.phase.detach().std() > 1e-6)
     lens = isinstance(trained.optics.masks, FresnelLens)
-    kind = "Fresnel" if lens else "flat" if flat else "coded"
+    kind = "Fresnel" if lens else "flat" if trained.optics.masks.is_flat() else "coded"
     return _system(name, kind, trained.optics, trained.head, trained.settings.task)
 
 
