@@ -242,6 +242,13 @@ class TestEveryPage(BaseTester):
         links = {file for file, _ in LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))}
         assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} <= links
 
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_the_site_lists_every_page_once(self, name):
+        """Sphinx takes a page that no list of contents names for an error, but only once the whole site is built."""
+        lines = (ROOT / "docs" / "site" / "index.rst").read_text(encoding="utf-8").splitlines()
+        listed = [re.sub(r".*<(.+)>", r"\1", line.strip()) for line in lines if line.startswith("   ")]
+        assert listed.count(name.removesuffix(".md")) == 1
+
 
 def page(*parts: str) -> str:
     return "\n".join(parts) + "\n"
