@@ -15,12 +15,13 @@ from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.inference.tasks import MAPS, depth_logits, deviation_in_metres, metres, split_maps
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.reconstruction.closed_form import ClosedForm, whole_picture
+from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.self_ensemble import self_ensemble
 from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, one_tile, reconstruct_tiled, shared_copy
+from kornia_tidy.reconstruction.whole_picture import whole_picture
 from kornia_tidy.sensor.noise import SensorNoise
 
 

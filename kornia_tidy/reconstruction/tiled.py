@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
-from kornia_tidy.reconstruction.closed_form import untold_closed_forms, whole_picture
 from kornia_tidy.reconstruction.head import sharing_weights
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import (
@@ -25,6 +24,7 @@ from kornia_tidy.reconstruction.receptive_field import (
 )
 from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
+from kornia_tidy.reconstruction.whole_picture import untold_closed_forms, whole_picture
 
 # Shipped networks see 220 to 450 px far, but heed little beyond 100: tiles of a photograph cut at 128 px
 # differ from the whole by at most 3e-4 (edof-5) and 8e-4 (joint-uncertain) of full scale; at 64 px by 6e-3 and 6e-2.
@@ -77,7 +77,7 @@ def reconstruct_tiled(
 
     Convention:
         Gradients are not computed. Stray light that a network takes away follows from the mean light of the whole
-        image, see :func:`~kornia_tidy.reconstruction.closed_form.whole_picture`.
+        image, see :func:`~kornia_tidy.reconstruction.whole_picture.whole_picture`.
 
     Example:
         >>> head = nn.Sequential(nn.Conv2d(3, 8, 5, padding=2), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1)).eval()

@@ -1,0 +1,60 @@
+"""Stray light of a whole picture, told to the closed forms in a network that see parts of it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import torch
+from kornia.color import rgb_to_linear_rgb
+from torch import Tensor, nn
+
+from kornia_tidy.reconstruction.closed_form import ClosedForm
+
+
+@contextmanager
+def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) -> Generator[None]:
+    """Let the closed forms in a network take away the stray light of a whole picture while they see parts of it.
+
+    :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled` does so by itself for a network that takes captures as
+    its closed form does. One that encodes linear light before is told here. Closed forms that were told before keep
+    what they were told.
+
+    Args:
+        head: a network.
+        picture: (B, 3, H, W), clipped to [0, 1] by the network.
+        encoded: the picture is encoded as sRGB. False: it is linear light.
+
+    Example:
+        >>> from kornia_tidy.psf.psf_bank import PSFBank
+        >>> restore = ClosedForm()
+        >>> bank = PSFBank(torch.rand(4, 3, 5, 5), torch.arange(4.0), torch.ones(4, 3), torch.full((4, 3), 0.1))
+        >>> restore.set_psfs(bank)
+        >>> with whole_picture(restore, torch.full((1, 3, 8, 8), 0.25)):
+        ...     restore.mean_light.flatten()
+        tensor([0.2500, 0.2500, 0.2500])
+    """
+    parts = untold_closed_forms(head)
+    if parts:
+        strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
+        lights = (rgb_to_linear_rgb(strip) if encoded else strip for strip in strips)
+        total = torch.stack([light.sum((-2, -1)) for light in lights]).sum(0)
+        mean = total[..., None, None] / (picture.shape[-2] * picture.shape[-1])
+    try:
+        for part in parts:
+            part.mean_light = mean.to(part.psfs)
+        yield
+    finally:
+        for part in parts:
+            part.mean_light = None
+
+
+def untold_closed_forms(head: nn.Module) -> list[ClosedForm]:
+    """Return the closed forms in a network that estimate stray light from the mean light of their own input.
+
+    Example:
+        >>> untold_closed_forms(nn.Conv2d(3, 3, 1))
+        []
+    """
+    parts = [module for module in head.modules() if isinstance(module, ClosedForm)]
+    return [part for part in parts if part.has_stray_light and part.mean_light is None]
