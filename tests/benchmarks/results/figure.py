@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, GREEN, INK, open_chart
 from tests.benchmarks.results.captures import FIXED, PHYSICAL
 from tests.benchmarks.results.report import reference_row
-from tests.benchmarks.results.restorations import ENSEMBLE, NETWORK
+from tests.benchmarks.results.restorations import NETWORK
 from tests.benchmarks.results.table import Key, Results
 from tests.benchmarks.results.verdicts import FIVE, ONE, REAL
 
@@ -66,25 +66,30 @@ def _over_noise(axes: Axes, results: Results, scenes: str) -> None:
 
 
 def _over_f_number(axes: Axes, results: Results, scenes: str) -> None:
-    """Flat lenses as lines, coded cameras as marks, each with its best restoration."""
-    for noise, color in LIGHTS.items():
-        by_kind: dict[str, list[tuple[float, Key]]] = {"flat": [], "coded": []}
-        for name, row in results.systems.items():
-            keys = results.keys(scenes, noise, system=name)
-            best = results.best([key for key in keys if key.restoration != ENSEMBLE])
-            if row.kind in by_kind and best is not None:
-                by_kind[row.kind].append((row.f_number, best))
-        label = f"{int(noise[:-1]):,} electrons"
-        _line(axes, results, sorted(by_kind["flat"]), color, "-", f"{label}, flat")
-        for number, key in by_kind["coded"]:
-            mark = "D" if key.restoration == NETWORK else "s"
-            axes.plot([number], [results.mean(key, "psnr")], mark, color=color, markersize=5)
-            place = number, results.mean(key, "psnr")
-            axes.annotate(key.system, place, (6, -3), textcoords="offset points", fontsize=SMALL, color=color)
+    """Flat lenses and coded cameras with their networks and best closed forms; each name stands above its marks."""
+    highest: dict[str, tuple[float, float]] = {}
+    for name, row in results.systems.items():
+        if row.kind not in {"flat", "coded"}:
+            continue
+        for noise, color in LIGHTS.items():
+            for network, mark, face in ((NETWORK, "D", color), (None, "s", "white")):
+                keys = results.keys(scenes, noise, system=name, restoration=network, network=network is not None)
+                best = results.best(keys)
+                if best is None:
+                    continue
+                mean = results.mean(best, "psnr")
+                axes.plot([row.f_number], [mean], mark, color=color, markerfacecolor=face, markersize=5)
+                highest[name] = max(highest.get(name, (row.f_number, mean)), (row.f_number, mean))
+    for name, place in highest.items():
+        axes.annotate(name, place, (0, 7), textcoords="offset points", fontsize=SMALL, color=INK, ha="center")
+    if highest:
+        for noise, color in LIGHTS.items():
+            axes.plot([], [], "o", color=color, markersize=5, label=f"{int(noise[:-1]):,} electrons")
+        axes.plot([], [], "D", color=FAINT, markersize=5, label="network")
+        axes.plot([], [], "s", color=FAINT, markerfacecolor="white", markersize=5, label="best closed form")
+    axes.margins(x=0.12, y=0.1)
     axes.set_xlabel("f-number", fontsize=LABEL, color=INK)
-    axes.set_title(
-        "Equal exposure time: flat lenses, and coded cameras as marks", fontsize=TITLE, color=INK, loc="left"
-    )
+    axes.set_title("Equal exposure time", fontsize=TITLE, color=INK, loc="left")
 
 
 def _line(axes: Axes, results: Results, points: list[tuple[float, Key]], color: str, style: str, label: str) -> None:
