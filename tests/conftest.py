@@ -6,8 +6,12 @@ import os
 
 import pytest
 import torch
+from hypothesis import settings
 
 os.environ["KORNIA_TIDY_TUNE"] = "off"  # every test computes with the constants that are shipped, in processes too
+
+settings.register_profile("any machine", settings(), deadline=None)  # tests are not timed: other work may slow them
+settings.load_profile("any machine")
 
 DTYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32, "float64": torch.float64}
 

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, load
 from kornia_tidy.kernels.gather_ops import rows_in_memory
+from kornia_tidy.kernels.window_sides import is_window_size, needed_side, size_step
 
 SOURCE = KERNELS / "overlap.c"
-VECTOR_BYTES = 64  # of a vector, see vectors.h
 NO_LAYER, NO_MEMORY = 1, 2  # what the functions return
 
 for _schema in (
@@ -58,7 +58,7 @@ def gather_overlap(
         psfs: h, (D, C, P, P) with P odd, of the plane's dtype.
         layer_index: d, (B, H, W) int64.
         layer_weight: t, share of the next layer in [0, 1], (B, H, W) of the plane's dtype, or None for zero.
-        size: side of a window in samples, see :func:`window_sizes`, at least P.
+        size: side of a window in samples, see :func:`~kornia_tidy.kernels.window_sides.is_window_size`, at least P.
         correlate: with PSFs that are flipped by 180 degrees.
         weight_gradient: return :math:`\partial I_c / \partial t` instead.
 
@@ -138,55 +138,6 @@ def overlap_psf_gradient(
     return torch.ops.kornia_tidy.overlap_psf_gradient(
         plane, pixels, layer_index, layer_weight, layers, size, correlate, weight_gradient
     )
-
-
-def size_step(dtype: torch.dtype) -> int:
-    """Return the number of samples of which the side of every window is a multiple.
-
-    Example:
-        >>> size_step(torch.float32), size_step(torch.float64)
-        (32, 16)
-    """
-    return 2 * VECTOR_BYTES // dtype.itemsize
-
-
-def is_window_size(size: int, dtype: torch.dtype) -> bool:
-    """Return whether windows may have a side: a multiple of :func:`size_step` without prime factors but 2, 3 and 5.
-
-    Example:
-        >>> [n for n in range(1, 200) if is_window_size(n, torch.float32)]
-        [32, 64, 96, 128, 160, 192]
-    """
-    return size >= 1 and size % size_step(dtype) == 0 and _is_fast(size)
-
-
-def needed_side(size: int, pixels: int, psf_side: int, step: int) -> int:
-    """Return the least side of windows that cut an axis into as many tiles as windows of a size do.
-
-    Args:
-        size: side of a window, in samples.
-        pixels: along the axis.
-        psf_side: P, of the PSFs.
-        step: what the side is a multiple of, as :func:`is_window_size` wants it.
-
-    Returns:
-        Samples, ``size`` at most.
-
-    Example:
-        >>> needed_side(1280, 1110, 513, 16), needed_side(1280, 1282, 513, 32)
-        (1152, 1280)
-    """
-    tiles = -(-pixels // (size - psf_side + 1))
-    least = -(-pixels // tiles) + psf_side - 1
-    return next(side for side in range(-(-least // step) * step, size + 1, step) if _is_fast(side))
-
-
-def _is_fast(size: int) -> bool:
-    """Return whether a transform's length has no prime factors but 2, 3 and 5."""
-    for factor in (2, 3, 5):
-        while size % factor == 0:
-            size //= factor
-    return size == 1
 
 
 class _Tiles(ctypes.Structure):

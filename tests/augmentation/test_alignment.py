@@ -53,7 +53,7 @@ class TestAlignment(BaseTester):
                 aligned += 1
         assert aligned == 6  # those with the tap directly before the optics
 
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(st.lists(st.sampled_from([*GEOMETRY, *PHOTOMETRY, "tap", "optics"]), min_size=2, max_size=6), st.booleans())
     def test_property_any_list_of_augmentations(self, names, shuffled):
         names = [name for n, name in enumerate(names) if name not in ("tap", "optics") or name not in names[:n]]

@@ -22,7 +22,7 @@ from tests.augmentation.optional import need, need_torchvision
 from tests.augmentation.ratio_scene import RatioMark, assert_ratios, ratio_scene
 from tests.base import BaseTester
 
-EXAMPLES = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+EXAMPLES = settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 WARPS = ("flip", "flop", "crop", "turn", "affine", "resize")
 
 

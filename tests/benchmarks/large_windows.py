@@ -18,7 +18,7 @@ from math import log2, prod
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.overlap_ops import needed_side, size_step
+from kornia_tidy.kernels.window_sides import needed_side, size_step
 from kornia_tidy.render.backends.tile_plan import BLOCKS, OVERLAPS, TileKind, cheapest_grid
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.compositing import render

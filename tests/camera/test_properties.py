@@ -22,7 +22,7 @@ SEEDS = st.integers(0, 10_000)
 MASKS = st.integers(1, 4)
 HEIGHTS = st.sampled_from([0.0, 1e-9, 1.06e-6, 1e-4, 1e-3])  # metres; the last is 943 waves
 STRAY_LIGHT = st.sampled_from(["renormalize", "veil", "discard"])
-FEW = settings(max_examples=12, deadline=None)
+FEW = settings(max_examples=12)
 
 
 def heights(count: int, highest: float, seed: int) -> Tensor:

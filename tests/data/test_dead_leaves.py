@@ -125,7 +125,7 @@ class TestDeadLeaves(BaseTester):
         assert (slope.abs() > 1e-5).float().mean() > 0.1
         assert ((slope.diff(dim=1).abs() < 1e-6).float().mean()) > 0.85
 
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15)
     @given(
         st.tuples(st.integers(1, 40), st.integers(1, 40)),
         st.integers(1, 60),

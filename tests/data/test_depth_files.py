@@ -133,7 +133,7 @@ class TestReadDepth(BaseTester):
 
 
 class TestFillHoles(BaseTester):
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     @given(st.integers(0, 2**31), st.floats(0.002, 0.9), st.integers(1, 40), st.integers(1, 40))
     def test_property_a_hole_takes_the_value_of_its_nearest_neighbour(self, seed, share, height, width):
         """Against brute force: the pixel it takes its value from is at most 3.8 % farther than the nearest.

@@ -15,7 +15,7 @@ from tests.base import BaseTester
 
 
 class TestOpenCVArrays(BaseTester):
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(
         st.sampled_from([np.uint8, np.uint16]).flatmap(
             lambda dtype: arrays.arrays(

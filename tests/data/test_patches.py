@@ -39,7 +39,7 @@ def scene_of(patch):
 
 
 class TestCrop(BaseTester):
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(st.data())
     def test_property_every_map_is_the_same_window(self, data):
         height, width = data.draw(st.integers(1, 12)), data.draw(st.integers(1, 12))

@@ -209,7 +209,7 @@ class TestPhotoCollage(BaseTester):
         assert abs(means[0] - means[1]) < 0.15  # of 1 m; a scene's own mean varies by .2, so that of 40 by .03
         assert min(np.std(values) for values in nearness.values()) > 0.15
 
-    @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(
         st.tuples(st.integers(1, 24), st.integers(1, 24)), st.integers(0, 2**64), st.floats(0.01, 10),
         st.floats(1.01, 1e6),

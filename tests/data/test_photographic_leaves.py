@@ -96,7 +96,7 @@ class TestPhotographicLeaves(BaseTester):
             few += len(depths) <= 3
         assert few >= 8  # two thirds of leaves do not slant; any mixing would give a value for each pixel of an outline
 
-    @settings(max_examples=10, deadline=None)
+    @settings(max_examples=10)
     @given(
         st.tuples(st.integers(1, 24), st.integers(1, 24)), st.integers(0, 2**64), st.floats(0.01, 10),
         st.floats(1.01, 1e6),

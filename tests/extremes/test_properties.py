@@ -15,7 +15,7 @@ from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SensorNoise, TiDyOp
 from kornia_tidy.tensor_files import read_tensors
 from tests.base import BaseTester
 
-FEW = settings(max_examples=25, deadline=None, derandomize=True)
+FEW = settings(max_examples=25, derandomize=True)
 POSITIVE = ("nearest", "linear")  # cubic and band-limited PSFs between two depths may be negative by 1e-5 of the light
 TOLERANCE = 1e-12  # float64: a weighted mean of at most 2 x 9 x 9 values in [0, 1], and transforms of 2^12 of them
 

@@ -14,7 +14,7 @@ LEAST = 2.0**-126  # smaller numbers have fewer digits
 
 
 class TestEightBits(BaseTester):
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     @given(seed=st.integers(0, 10**6), size=st.floats(-50.0, 30.0), zero=st.booleans())
     def test_feature_an_error_is_half_a_step_of_its_output_channel(self, seed, size, zero):
         """Steps are 1/127 of the largest weight of the channel; the quotient, its product and the scale are rounded."""

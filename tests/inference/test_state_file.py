@@ -30,7 +30,7 @@ TREES = st.recursive(
 
 class TestStateFile(BaseTester):
     @pytest.mark.takes_seconds
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(tree=st.dictionaries(st.text(max_size=5), TREES, max_size=3))
     def test_feature_any_nesting_of_plain_values_comes_back_as_it_was(self, tree, tmp_path_factory):
         path = tmp_path_factory.getbasetemp() / "tree.safetensors"

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
-from kornia_tidy.kernels import gather_ops, occlusion_ops, overlap_ops
+from kornia_tidy.kernels import gather_ops, occlusion_ops
+from kornia_tidy.kernels.window_sides import is_window_size, size_step
 from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
@@ -274,8 +275,8 @@ def _gathered(draw: random.Random) -> _Scene:
 def _overlapping(draw: random.Random) -> tuple[_Scene, int, bool, bool]:
     """A scene, the side of windows, whether PSFs are flipped, and whether the gradient of weights is meant."""
     scene = _gathered(draw)
-    step, side = overlap_ops.size_step(scene.light.dtype), scene.psfs.shape[-1]
-    sizes = [n for n in range(step, 400, step) if n >= side and overlap_ops.is_window_size(n, scene.light.dtype)]
+    step, side = size_step(scene.light.dtype), scene.psfs.shape[-1]
+    sizes = [n for n in range(step, 400, step) if n >= side and is_window_size(n, scene.light.dtype)]
     size = draw.choice(sizes[: draw.choice((1, 4, len(sizes)))])  # small ones, in which tiles are many, more often
     return scene, size, draw.random() < 0.5, scene.fraction is not None and draw.random() < 0.3
 

@@ -205,7 +205,7 @@ class TestFisherInformation(BaseTester):
         parts = [PointResponse(both.psfs[:, [c]], both.derivatives[:, :, [c]]) for c in range(3)]
         self.assert_close(fisher_information(both), sum(fisher_information(part) for part in parts))
 
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(photons=st.floats(1, 1e6), background=st.floats(0, 1e3), psi=st.floats(-15, 15))
     def test_feature_light_helps_and_background_does_not(self, photons, background, psi):
         response = sampled_response(smooth_mask(), APERTURE, [psi])

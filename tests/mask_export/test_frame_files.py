@@ -151,7 +151,7 @@ class TestWriteSLMFrames(BaseTester):
 
 
 class TestReadSLMFrames(BaseTester):
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     @given(
         st.integers(1, 10),
         st.tuples(st.integers(1, 3), st.integers(1, 7), st.integers(1, 7)),

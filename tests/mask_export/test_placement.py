@@ -104,7 +104,7 @@ class TestPanelPlacement(BaseTester):
                 assert bool((block == values[0, i, j]).all())
         assert int((frame > 0).sum()) == 15 * 100
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(SIDES, SIDES, st.integers(9, 40), st.integers(9, 40), st.fractions(1, 5, max_denominator=50), st.data())
     def test_feature_a_panel_pixel_shows_the_mask_pixel_its_centre_lies_in(self, rows, columns, down, right, s, data):
         """In exact arithmetic for each pixel; a centre on an edge belongs to the right or lower block."""
@@ -121,7 +121,7 @@ class TestPanelPlacement(BaseTester):
                 inside = 0 <= i < rows and 0 <= j < columns
                 assert int(frame[y, x]) == (1 + i * columns + j if inside else 0)
 
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     @given(SIDES, SIDES, st.sampled_from(FLIPS), st.sampled_from(ROTATIONS), st.floats(1, 6), st.data())
     def test_feature_what_is_placed_is_read_back(self, rows, columns, flip, rotate, scale, data):
         shift = (data.draw(st.integers(-4, 4)), data.draw(st.integers(-4, 4)))

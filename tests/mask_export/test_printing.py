@@ -44,7 +44,7 @@ def check_closed(corners: np.ndarray) -> None:
 
 
 class TestRelief(BaseTester):
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(SURFACES, st.floats(0.5, 3))
     def test_feature_closed_and_with_the_volume_of_the_columns(self, columns, pitch):
         vertices, triangles = relief(columns, pitch)

@@ -46,7 +46,7 @@ class TestSLMFrames(BaseTester):
         assert frames.turns.tolist() == [[[0, 0, 0, 0, 1, -1]]]
         assert (frames.bits, frames.background) == (8, 0)
 
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     @given(
         st.integers(1, 10),
         st.floats(0.5, 4 * math.pi),

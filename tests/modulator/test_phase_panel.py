@@ -86,7 +86,7 @@ class TestGreyLevels(BaseTester):
         assert abs(peak % 41 - 20) > 5
         assert float(stepped.flatten()[peak] / exact.max()) == pytest.approx(np.sinc(2.0**-bits) ** 2, abs=0.01)
 
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     @given(
         levels=st.lists(st.floats(0, 9), min_size=1, max_size=20),
         wanted=st.floats(-30, 30),

@@ -63,7 +63,7 @@ class TestSwitching(BaseTester):
         states, _ = Switching(2e-3, between=between)(torch.rand(3, 6, 10))
         assert states.shape[1:] == (6, 10)
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(
         masks=st.integers(1, 16),
         time=st.floats(0, 16e-3),

@@ -11,7 +11,7 @@ from tests.base import BaseTester
 
 SQUARE = {"sides": 4, "rotation": math.pi / 4, "radius": math.sqrt(2)}  # half-width 1, sides along the axes
 both_edges = pytest.mark.parametrize("edges", ["binary", "area"])
-fast = settings(deadline=None, max_examples=40)
+fast = settings(max_examples=40)
 sizes, pitches, radii = st.integers(1, 17), st.floats(0.05, 0.2), st.floats(0.5, 2.0)
 
 

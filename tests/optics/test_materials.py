@@ -122,7 +122,7 @@ class TestMaterial(BaseTester):
 
     @by_name
     @given(st.floats(0.0, 0.99), st.floats(0.001, 1.0))
-    @settings(deadline=None, max_examples=50)
+    @settings(max_examples=50)
     def test_property_dispersion_is_normal(self, material, start, step):
         """In transparent dielectrics n decreases with the wavelength over the whole visible range."""
         shortest, longest = max(material.valid[0], 400e-9), min(material.valid[1], 700e-9)
@@ -141,7 +141,6 @@ class TestConstantIndex(BaseTester):
             constant_index(index)
 
     @given(st.floats(100e-9, 20e-6))
-    @settings(deadline=None)
     def test_property_is_the_same_at_every_wavelength(self, wavelength):
         assert constant_index(1.5).index(wavelength) == 1.5
 

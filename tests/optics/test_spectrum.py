@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
@@ -92,7 +92,6 @@ class TestSpectrum(BaseTester):
             lambda n: st.lists(st.lists(st.floats(1e-6, 1e6), min_size=n, max_size=n), min_size=1)
         )
     )
-    @settings(deadline=None)
     def test_property_channel_weights_add_up_to_one_in_the_same_ratios(self, rows):
         spectrum = Spectrum(np.linspace(400e-9, 700e-9, len(rows[0])), rows)
         for given_row, row in zip(rows, spectrum.channel_weights, strict=True):

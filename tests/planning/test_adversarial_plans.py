@@ -36,7 +36,6 @@ class TestAdversarialScenes(BaseTester):
         max_examples=10,
         phases=[Phase.generate],
         derandomize=True,
-        deadline=None,
         suppress_health_check=list(HealthCheck),
     )
     @given(

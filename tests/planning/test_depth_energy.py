@@ -38,7 +38,7 @@ class TestDepths(BaseTester):
         assert depths.share.tolist() == [0.5, 0.25, 0.25]
 
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular", "valid"])
-    @settings(max_examples=5, deadline=None)
+    @settings(max_examples=5)
     @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31))
     def test_property_products_add_up_to_the_power_of_the_image(self, border, height, width, seed):
         """Less that of the means: of octave after octave nothing is lost. Mirrored at the borders, it counts again."""

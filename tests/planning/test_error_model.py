@@ -33,7 +33,7 @@ def one_depth(power: torch.Tensor) -> SceneLight:
 
 
 class TestInterpolation(BaseTester):
-    @settings(max_examples=20, deadline=None)
+    @settings(max_examples=20)
     @given(st.floats(-30, 0), st.floats(1, 40), st.integers(2, 12))
     def test_property_polynomials_are_exact(self, lo, length, count):
         nodes = chebyshev_nodes(lo, lo + length, count)
@@ -64,7 +64,7 @@ class TestInterpolation(BaseTester):
 
 
 class TestPower(BaseTester):
-    @settings(max_examples=20, deadline=None)
+    @settings(max_examples=20)
     @given(st.integers(9, 24), st.integers(9, 24), st.sampled_from([1, 3, 5]), st.integers(0, 1000))
     def test_property_power_times_filter_is_the_mean_square(self, height, width, side, seed):
         generator = torch.Generator().manual_seed(seed)

@@ -121,7 +121,7 @@ class TestTolerance(BaseTester):
     @pytest.mark.takes_seconds
     @pytest.mark.usefixtures("narrow")
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular"])
-    @settings(max_examples=2, phases=[Phase.generate], deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=2, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
     @given(
         st.sampled_from(sorted(IMAGES)),
         st.sampled_from(sorted(DEPTHS)),

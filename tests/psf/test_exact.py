@@ -132,7 +132,7 @@ class TestExtremes(BaseTester):
 
 
 class TestExactBank(BaseTester):
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(
         f_number=st.floats(1.4, 64),
         psi=st.floats(-100, 100),

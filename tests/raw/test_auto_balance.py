@@ -37,7 +37,7 @@ def grey_under(light, letters="RGGB", white=60000, size=48):
 class TestAutoBalance(BaseTester):
     @pytest.mark.parametrize("letters", ["RGGB", "GBRG", XTRANS, None])
     @given(red=st.floats(0.3, 1.5), blue=st.floats(0.3, 1.5))
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15)
     def test_feature_a_grey_scene_becomes_grey_in_any_light(self, letters, red, blue):
         """To the rounding of counts: half of one, of 60000 * 0.05 * 0.3 at least."""
         raw = grey_under({"R": red, "G": 1.0, "B": blue}, letters)

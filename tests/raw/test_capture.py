@@ -355,7 +355,7 @@ class TestRawCapture(BaseTester):
         height=st.integers(6, 20),
         width=st.integers(6, 20),
     )
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     def test_feature_planes_hold_every_count_of_whole_tiles(self, letters, height, width):
         side = int(len(letters) ** 0.5)
         generator = np.random.default_rng(height * width)

@@ -37,7 +37,7 @@ def tensor(rows):
 class TestCameraToSrgb(BaseTester):
     @pytest.mark.parametrize("xyz_to_camera", [G2, G1])
     @given(colors=st.lists(st.floats(0, 1), min_size=3, max_size=3))
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     def test_feature_colours_that_a_camera_sees_come_back(self, xyz_to_camera, colors):
         """sRGB to XYZ by colour-science, to the camera by its matrix, balanced, and back: to that space's 4 digits."""
         xyz = colour.RGB_to_XYZ(colors, "sRGB", apply_cctf_decoding=False)

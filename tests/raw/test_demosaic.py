@@ -140,7 +140,7 @@ class TestDemosaic(BaseTester):
     @given(
         st.sampled_from([*BAYER, "GMYC", "RGBG", XTRANS]), st.integers(6, 17), st.integers(6, 17), st.integers(0, 99)
     )
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_feature_measured_values_stay_and_others_lie_between(self, letters, height, width, seed):
         mosaic = torch.randn(1, height, width, generator=torch.Generator().manual_seed(seed))
         tile, colors = filter_tile(letters)

@@ -69,7 +69,7 @@ class TestCameraTags(BaseTester):
     @given(
         st.binary(max_size=400), st.sampled_from([b"", b"II*\0\x08\0\0\0", b"MM\0*\0\0\0\x08", b"II\x1a\0\0\0HEAPCCDR"])
     )
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=300)
     def test_feature_any_bytes_end_well(self, data, start):
         found = camera_tags(start + data)
         assert set(found) <= {"make", "model", "lens", "iso", "exposure", "aperture", "focal_length", "timestamp"}
@@ -80,7 +80,7 @@ class TestCameraTags(BaseTester):
 
     @example([(15, 4)])  # a tag without values
     @given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), max_size=30))
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=200)
     def test_feature_a_damaged_header_ends_well(self, changes):
         data = bytearray(dng(COUNTS))
         for place, value in changes:

@@ -61,7 +61,7 @@ def trained(name):
 
 
 class TestReconstructionHead(BaseTester):
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(st.integers(1, 40), st.integers(1, 40))
     def test_property_any_size_comes_back_pixel_for_pixel(self, height, width):
         head, image = SeeingHead(2, 2), torch.rand(1, 2, height, width)

@@ -160,7 +160,7 @@ class TestJointLoss(BaseTester):
 
 class TestProperties(BaseTester):
     @given(seed=st.integers(0, 2**31), hidden=st.sampled_from([0.0, -1e30, float("inf"), float("nan")]))
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     def test_property_what_stands_behind_the_mask_does_not_matter(self, seed, hidden):
         torch.manual_seed(seed)
         prediction, target, mask = make_maps()

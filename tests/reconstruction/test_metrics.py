@@ -116,7 +116,7 @@ class TestMetrics(BaseTester):
         assert (gradient[..., 12:, 12:] != 0).all()
 
     @given(seed=st.integers(0, 2**31), hidden=st.sampled_from([0.0, -3.0, 1e30, float("inf"), float("nan")]))
-    @settings(max_examples=10, deadline=None)
+    @settings(max_examples=10)
     def test_property_what_stands_behind_the_mask_does_not_matter(self, metric, seed, hidden):
         torch.manual_seed(seed)
         prediction, target, mask = make_depths()

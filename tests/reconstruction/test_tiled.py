@@ -88,7 +88,7 @@ def seam(head, image, **options):
 
 class TestSeams(BaseTester):
     @pytest.mark.parametrize("name", ["plain", "corners"])
-    @settings(max_examples=12, deadline=None)
+    @settings(max_examples=12)
     @given(st.integers(1, 150), st.integers(1, 150), st.integers(0, 60), st.integers(0, 60))
     def test_property_any_size_and_tile(self, name, height, width, more, and_more):
         """In float64, tiles barely larger than their overlap and such that hold the image."""
@@ -324,7 +324,7 @@ class TestReceptiveField(BaseTester):
 
 class TestTileGrid(BaseTester):
     @pytest.mark.takes_seconds
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     @given(
         st.integers(1, 300),
         st.integers(1, 300),

@@ -18,7 +18,7 @@ from tests.base import BaseTester
 
 class TestPaddedBand(BaseTester):
     @given(data=st.data())
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     def test_property_is_a_part_of_the_padded_image(self, data):
         radius, border = data.draw(st.integers(0, 4)), data.draw(st.sampled_from(BORDERS))
         height, width = (data.draw(st.integers(2 * radius + 1, 20)) for _ in range(2))

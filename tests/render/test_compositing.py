@@ -157,7 +157,7 @@ class TestRender(BaseTester):
 
     @pytest.mark.parametrize("compositing", COMPOSITINGS)
     @given(a=st.floats(-5, 5), b=st.floats(-5, 5), seed=st.integers(0, 99), border=st.sampled_from(BORDERS))
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     def test_property_rendering_is_linear_in_the_image(self, compositing, a, b, seed, border):
         torch.manual_seed(seed)
         bank = make_bank(3, 1, 5, light=0.9, veil=True)

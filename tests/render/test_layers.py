@@ -62,7 +62,7 @@ class TestLayerWeights(BaseTester):
         assert weights[0, :, 0].T.tolist() == [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
 
     @given(st.lists(st.floats(-30, 30, width=32), min_size=1, max_size=20), st.sampled_from(["nearest", "linear"]))
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     def test_property_weights_sum_to_exactly_one(self, values, mode):
         weights = layer_weights(row(*values), torch.tensor(NODES), mode)
         assert weights.sum(1).eq(1).all()

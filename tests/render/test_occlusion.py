@@ -185,7 +185,7 @@ class TestOcclusion(BaseTester):
         self.assert_close(coded[sees_ground], mixed[sees_ground], rtol=0, atol=1e-3)
 
     @given(seed=st.integers(0, 99), border=st.sampled_from(BORDERS), layers=st.sampled_from(["nearest", "linear"]))
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     def test_property_light_is_never_negative_nor_beyond_the_brightest(self, seed, border, layers):
         torch.manual_seed(seed)
         bank = make_bank(5, 1, 5)
@@ -195,7 +195,7 @@ class TestOcclusion(BaseTester):
         assert float(coded.max()) < 1 + 1e-9
 
     @given(a=st.floats(0, 5), b=st.floats(0, 5), seed=st.integers(0, 99))
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15)
     def test_property_rendering_is_linear_in_the_image(self, a, b, seed):
         torch.manual_seed(seed)
         bank = make_bank(3, 1, 5, light=0.9, veil=True)
@@ -267,7 +267,7 @@ class TestTiledOcclusion(RenderTester):
         self.assert_equals_dense(SMALL_TILES, image, defocus, bank, "occlusion", ATOL[dtype], layers=layers)
 
     @given(data=st.data())
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     def test_property_equals_the_dense_render_at_any_size(self, data):
         draw = data.draw
         torch.manual_seed(draw(st.integers(0, 99)))

@@ -292,7 +292,7 @@ class TestSensorNoise(BaseTester):
             np.float32, hnp.array_shapes(min_dims=4, max_dims=4, max_side=3), elements=st.floats(-1e6, 1e6, width=32)
         )
     )
-    @settings(max_examples=50, deadline=None)
+    @settings(max_examples=50)
     def test_property_without_noise_it_is_a_clamp(self, array):
         assert np.array_equal(SensorNoise(0.0)(torch.from_numpy(array)).numpy(), np.clip(array, 0, 1))
 

@@ -71,7 +71,7 @@ class TestShotNoise(BaseTester):
         self.assert_close(out.cpu(), torch.from_numpy(expected), rtol=1e-6, atol=0.0)
 
     @given(rate=st.floats(0, 24.999), uniform=st.floats(1e-12, 1 - 1e-12))
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=300)
     def test_property_below_the_threshold_it_is_the_poisson_quantile(self, rate, uniform):
         out = shot_noise(torch.tensor(rate, dtype=torch.float64), torch.tensor(uniform, dtype=torch.float64)).item()
         expected = stats.poisson.ppf(uniform, rate)

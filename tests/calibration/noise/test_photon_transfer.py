@@ -105,7 +105,7 @@ class TestFitLine(BaseTester):
 
 
 class TestPhotonTransfer(BaseTester):
-    @settings(max_examples=12, deadline=None)
+    @settings(max_examples=12)
     @given(
         gain=st.floats(0.5, 20),
         read_noise=st.floats(1, 20),
@@ -129,7 +129,7 @@ class TestPhotonTransfer(BaseTester):
         assert result.read_noise_resolved
         assert result.line.r_squared > 0.99
 
-    @settings(max_examples=4, deadline=None)
+    @settings(max_examples=4)
     @given(gain=st.floats(5, 20), share=st.floats(0.05, 0.3), seed=st.integers(0, 2**32 - 1))
     @example(gain=5.0, share=0.25, seed=129)  # measured by chance as 0.49 ± 0.14 counts
     def test_feature_read_noise_that_rounding_hides_is_said_to_be(self, gain, share, seed):

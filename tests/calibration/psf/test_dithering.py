@@ -83,7 +83,7 @@ class TestResolvePSF(BaseTester):
         assert 0.67 < float(weighted / said) < 1.5
 
     @given(st.integers(0, SIDE - 1), st.integers(0, SIDE - 1))
-    @settings(max_examples=10, deadline=None)
+    @settings(max_examples=10)
     def test_feature_whole_pixels_only_move_it(self, down, right):
         offsets = places(5)
         images = airy_like(offsets, 0.8)

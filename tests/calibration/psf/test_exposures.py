@@ -46,7 +46,7 @@ class TestMergeExposures(BaseTester):
         assert (float(merged), float(variance)) == (1.0, math.inf)
 
     @given(st.floats(1e-3, 1e3), st.floats(1e-3, 0.5))
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     def test_feature_the_unit_of_exposure_does_not_matter(self, unit, level):
         frames = torch.tensor([level, min(1.0, 8 * level), 1.0], dtype=torch.float64).view(3, 1, 1, 1)
         merged, variance = merge_exposures(frames, self.EXPOSURES.double(), SENSOR)

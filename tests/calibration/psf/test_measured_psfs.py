@@ -130,7 +130,7 @@ class TestMeasurePSFs(BaseTester):
             measure_psfs({0.5: [image]}, CAMERA, WINDOW)
 
     @given(st.integers(-12, 12), st.integers(-12, 12))
-    @settings(max_examples=5, deadline=None)
+    @settings(max_examples=5)
     def test_feature_where_the_point_lies_does_not_matter(self, down, right):
         """Without noise, a point shifted by whole pixels gives the same image."""
         fine = point_light(PixelwiseMask(1, initial=fisher_mask()), 4.0, SIDE, Spectrum.monochrome(), CAMERA)

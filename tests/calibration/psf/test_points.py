@@ -52,7 +52,7 @@ class TestAnnulusBackground(BaseTester):
 
 class TestCentres(BaseTester):
     @given(st.floats(17.0, 23.0), st.floats(17.0, 23.0))
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     def test_feature_both_find_a_round_spot(self, row, column):
         for centre in (centre_of_light, centre_of_symmetry):
             assert centre(spot(row, column), (20, 20), 25) == pytest.approx((row, column), abs=1e-3)

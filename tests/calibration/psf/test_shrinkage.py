@@ -47,7 +47,7 @@ class TestShrink(BaseTester):
         assert 0.6 < float(ratio) < 1.6
 
     @given(st.floats(1e-6, 1e6))
-    @settings(max_examples=10, deadline=None)
+    @settings(max_examples=10)
     def test_feature_the_unit_of_light_does_not_matter(self, unit):
         variance = torch.full((1, 61, 61), 4e-10, dtype=torch.float64)
         one, other = shrink(noisy(2e-5, 1), variance), shrink(unit * noisy(2e-5, 1), unit**2 * variance)

@@ -79,7 +79,7 @@ class TestDirectOcclusion(RenderTester):
         self.assert_equals_dense("direct", image, psi, bank, "occlusion", ATOL[dtype], **options)
 
     @given(data=st.data())
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     def test_property_equals_the_dense_render_at_any_size(self, data):
         draw = data.draw
         torch.manual_seed(draw(st.integers(0, 99)))

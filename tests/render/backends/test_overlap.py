@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.kernels.overlap_ops import SOURCE, is_window_size
+from kornia_tidy.kernels.overlap_ops import SOURCE
+from kornia_tidy.kernels.window_sides import is_window_size
 from kornia_tidy.render.backends.overlap import window_size
 from kornia_tidy.render.backends.tile_plan import OVERLAPS, candidates
 from kornia_tidy.render.borders import BORDERS

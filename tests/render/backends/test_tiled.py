@@ -83,7 +83,7 @@ class TestTiledRender(RenderTester):
         self.assert_equals_dense(SMALL_TILES, image, defocus, bank, compositing, ATOL[dtype], layers=layers)
 
     @given(data=st.data())
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_property_equals_the_dense_render_at_any_size(self, data):
         draw = data.draw
         torch.manual_seed(draw(st.integers(0, 99)))
