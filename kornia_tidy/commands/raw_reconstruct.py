@@ -132,7 +132,7 @@ def add_parser(subparsers: Any) -> None:
         default=OVERLAP,
         metavar="PIXELS",
         help=f"of a tile that are discarded at each cut (default: {OVERLAP}, with which shipped networks are within "
-        "0.0012 of the result for the whole picture; 1000 or all else that is farther than a network sees is exact)",
+        "0.0002 of the result for the whole picture; 1000 or all else that is farther than a network sees is exact)",
     )
     parser.add_argument(
         "--orientations",

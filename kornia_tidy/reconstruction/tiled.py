@@ -26,10 +26,10 @@ from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
 from kornia_tidy.reconstruction.whole_picture import untold_closed_forms, whole_picture
 
-# Shipped networks see 220 to 450 px far, but heed little beyond 100: tiles of a photograph cut at 128 px
-# differ from the whole by at most 3e-4 (edof-5) and 1.2e-3 (joint-uncertain, nine draws of noise, eight of them below
-# 6e-4) of full scale; at 64 px by 6e-3 and 6e-2, at 160 px by 2e-4 (joint-uncertain, two draws).
-OVERLAP = 128
+# Shipped networks see 220 to 450 px far, but heed little beyond 100: tiles cut at 144 px differ from the whole by at
+# most 2e-4 of full scale (joint-uncertain, twelve draws of noise). At 128 px it is 6e-4, and was 1.2e-3 in another
+# draw; at 160 px 1.5e-4, with a third more computation.
+OVERLAP = 144
 SEAM = 1e-4  # largest difference, relative to the largest output
 _COUNTED_ON = 128  # px; sides of the tile on which memory is counted
 
