@@ -15,9 +15,9 @@ if INSTALLED and not torch.cuda.is_available():
 
     _patch_tensor = interpreter._patch_lang_tensor
 
-    def _patch(tensor: type) -> None:
-        """Let arrays of one element be indices: Triton 3.5 asks NumPy for what NumPy 2.4 refuses."""
-        _patch_tensor(tensor)
+    def _patch(tensor: type, *scope: object) -> None:
+        """Let arrays of one element be indices: Triton, since 3.6 with a scope, asks NumPy for what 2.4 refuses."""
+        _patch_tensor(tensor, *scope)
         tensor.__index__ = lambda self: self.handle.data.item()
 
     interpreter._patch_lang_tensor = _patch
