@@ -2,7 +2,7 @@
 
 ``python -m tests.benchmarks.ship_networks NAME=FOLDER ...``
 Each is scored on new dead leaves and on the real scenes, where these are on the machine, and put into the library with
-the commands that made it, which FOLDER/commands.txt holds.
+the commands that made it, which FOLDER/commands.txt holds. FOLDER/machine.txt tells where it learnt, if not here.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from kornia_tidy.training.callbacks import BEST
 from kornia_tidy.training.settings import TrainingSettings
 from tests.benchmarks.heads import score
 
-COMMANDS, SCORES = "commands.txt", "scores.json"
+COMMANDS, MACHINE, SCORES = "commands.txt", "machine.txt", "scores.json"
 
 
 def record(folder: Path) -> dict[str, Any]:
@@ -38,15 +38,22 @@ def record(folder: Path) -> dict[str, Any]:
         "command": (folder / COMMANDS).read_text().strip(),
         "date": datetime.now(UTC).date().isoformat(),
         "commit": subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], text=True).strip(),
-        "machine": f"{platform.machine()}, one thread a run, {os.cpu_count()} cores shared",
+        "machine": machine_of(folder),
         "torch": torch.__version__,
         "seed": settings.seed,
         "seeds tried": 1,
         "settings": {**settings.as_dict(), "root": None},  # a place on one machine
         "validation": rows["validation"],
-        "minutes": round(len(seconds) * statistics.median(seconds) / 60, 1),
+        "minutes": round(int(rows["training"][-1]["step"]) * statistics.median(seconds) / 60, 1),
         "scores": scores_of(folder),
     }
+
+
+def machine_of(folder: Path) -> str:
+    """Return where a run learnt: what its folder says, or this machine."""
+    path = folder / MACHINE
+    here = f"{platform.machine()}, one thread a run, {os.cpu_count()} cores shared"
+    return path.read_text().strip() if path.exists() else here
 
 
 def scores_of(folder: Path) -> dict[str, dict[str, float]]:
