@@ -138,7 +138,8 @@ class TestThreads(BaseTester):
 
     @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
     def test_feature_all_states_of_an_exposure_are_of_one_moment(self, compositing):
-        assert wrong_captures(80, show_in_place, compositing=compositing) == 0
+        """Of a state that is loaded, which is one step. A thread that writes in place may be halted half-way."""
+        assert wrong_captures(80, show_state, compositing=compositing) == 0
 
     @pytest.mark.slow
     @pytest.mark.timeout(1200)
