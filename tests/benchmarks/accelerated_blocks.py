@@ -61,21 +61,41 @@ def _norm_back(
 
 
 @triton.jit
-def _depthwise_gate(u, weight, bias, out, rows, columns, pixels, C: tl.constexpr, K: tl.constexpr, P: tl.constexpr):
-    pixel = tl.program_id(0) * P + tl.arange(0, P)
-    channel = tl.program_id(1) * K + tl.arange(0, K)
-    row, column = (pixel // columns) % rows, pixel % columns
+def _neighbour(pixel, rows, columns, pixels, down: tl.constexpr, across: tl.constexpr):
+    """Return the index (P, 1) of the neighbour of each pixel, and whether it is in the same image."""
+    row, column = (pixel // columns) % rows + down, pixel % columns + across
+    inside = (pixel < pixels) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    return (pixel + down * columns + across)[:, None], inside[:, None]
+
+
+@triton.jit
+def _pair(maps, place, channel, inside, C: tl.constexpr):
+    """Return the values of two halves of 2 C channels, (P, K) each."""
+    place = place * (2 * C) + channel[None, :]
+    first = tl.load(maps + place, mask=inside, other=0.0).to(tl.float32)
+    return first, tl.load(maps + place + C, mask=inside, other=0.0).to(tl.float32)
+
+
+@triton.jit
+def _depthwise(
+    u, weight, bias, pixel, channel, rows, columns, pixels, C: tl.constexpr, K: tl.constexpr, P: tl.constexpr
+):
+    """Return the two halves of a depthwise 3x3 convolution, (P, K) each."""
     one = tl.zeros((P, K), tl.float32) + tl.load(bias + channel)[None, :]
     two = tl.zeros((P, K), tl.float32) + tl.load(bias + C + channel)[None, :]
     for tap in tl.static_range(9):
-        down, across = tap // 3 - 1, tap % 3 - 1
-        inside = (pixel < pixels) & (row + down >= 0) & (row + down < rows)
-        inside = (inside & (column + across >= 0) & (column + across < columns))[:, None]
-        place = (pixel + down * columns + across)[:, None] * (2 * C) + channel[None, :]
-        first = tl.load(u + place, mask=inside, other=0.0).to(tl.float32)
-        second = tl.load(u + place + C, mask=inside, other=0.0).to(tl.float32)
+        place, inside = _neighbour(pixel, rows, columns, pixels, tap // 3 - 1, tap % 3 - 1)
+        first, second = _pair(u, place, channel, inside, C)
         one += first * tl.load(weight + channel * 9 + tap)[None, :]
         two += second * tl.load(weight + (C + channel) * 9 + tap)[None, :]
+    return one, two
+
+
+@triton.jit
+def _depthwise_gate(u, weight, bias, out, rows, columns, pixels, C: tl.constexpr, K: tl.constexpr, P: tl.constexpr):
+    pixel = tl.program_id(0) * P + tl.arange(0, P)
+    channel = tl.program_id(1) * K + tl.arange(0, K)
+    one, two = _depthwise(u, weight, bias, pixel, channel, rows, columns, pixels, C, K, P)
     place = pixel[:, None] * C + channel[None, :]
     tl.store(out + place, (one * two).to(out.dtype.element_ty), mask=(pixel < pixels)[:, None])
 
@@ -92,18 +112,7 @@ def _depthwise_gate_back(
     weight_one, weight_two = tl.zeros((16, K), tl.float32), tl.zeros((16, K), tl.float32)
     for block in range(tl.program_id(0), tl.cdiv(pixels, P), tl.num_programs(0)):
         pixel = block * P + tl.arange(0, P)
-        row, column = (pixel // columns) % rows, pixel % columns
-        one = tl.zeros((P, K), tl.float32) + tl.load(bias + channel)[None, :]
-        two = tl.zeros((P, K), tl.float32) + tl.load(bias + C + channel)[None, :]
-        for tap in tl.static_range(9):
-            down, across = tap // 3 - 1, tap % 3 - 1
-            inside = (pixel < pixels) & (row + down >= 0) & (row + down < rows)
-            inside = (inside & (column + across >= 0) & (column + across < columns))[:, None]
-            place = (pixel + down * columns + across)[:, None] * (2 * C) + channel[None, :]
-            first = tl.load(u + place, mask=inside, other=0.0).to(tl.float32)
-            second = tl.load(u + place + C, mask=inside, other=0.0).to(tl.float32)
-            one += first * tl.load(weight + channel * 9 + tap)[None, :]
-            two += second * tl.load(weight + (C + channel) * 9 + tap)[None, :]
+        one, two = _depthwise(u, weight, bias, pixel, channel, rows, columns, pixels, C, K, P)
         whole = (pixel < pixels)[:, None]
         slope = tl.load(given + pixel[:, None] * C + channel[None, :], mask=whole, other=0.0).to(tl.float32)
         slope_one, slope_two = slope * two, slope * one
@@ -113,12 +122,8 @@ def _depthwise_gate_back(
         bias_one += tl.sum(slope_one, 0)
         bias_two += tl.sum(slope_two, 0)
         for tap in tl.static_range(9):
-            down, across = tap // 3 - 1, tap % 3 - 1
-            inside = (pixel < pixels) & (row + down >= 0) & (row + down < rows)
-            inside = (inside & (column + across >= 0) & (column + across < columns))[:, None]
-            place = (pixel + down * columns + across)[:, None] * (2 * C) + channel[None, :]
-            first = tl.load(u + place, mask=inside, other=0.0).to(tl.float32)
-            second = tl.load(u + place + C, mask=inside, other=0.0).to(tl.float32)
+            near, inside = _neighbour(pixel, rows, columns, pixels, tap // 3 - 1, tap % 3 - 1)
+            first, second = _pair(u, near, channel, inside, C)
             weight_one += tl.where(taps == tap, tl.sum(slope_one * first, 0)[None, :], 0.0)
             weight_two += tl.where(taps == tap, tl.sum(slope_two * second, 0)[None, :], 0.0)
     tl.atomic_add(bias_sum + channel, bias_one)
@@ -132,14 +137,10 @@ def _spread(slopes, weight, wanted, rows, columns, pixels, C: tl.constexpr, K: t
     """wanted = the transposed depthwise convolution of the slopes, (pixels, C)."""
     pixel = tl.program_id(0) * P + tl.arange(0, P)
     channel = tl.program_id(1) * K + tl.arange(0, K)
-    row, column = (pixel // columns) % rows, pixel % columns
     total = tl.zeros((P, K), tl.float32)
     for tap in tl.static_range(9):
-        down, across = 1 - tap // 3, 1 - tap % 3
-        inside = (pixel < pixels) & (row + down >= 0) & (row + down < rows)
-        inside = (inside & (column + across >= 0) & (column + across < columns))[:, None]
-        place = (pixel + down * columns + across)[:, None] * C + channel[None, :]
-        slope = tl.load(slopes + place, mask=inside, other=0.0).to(tl.float32)
+        place, inside = _neighbour(pixel, rows, columns, pixels, 1 - tap // 3, 1 - tap % 3)
+        slope = tl.load(slopes + place * C + channel[None, :], mask=inside, other=0.0).to(tl.float32)
         total += slope * tl.load(weight + channel * 9 + tap)[None, :]
     place = pixel[:, None] * C + channel[None, :]
     tl.store(wanted + place, total.to(wanted.dtype.element_ty), mask=(pixel < pixels)[:, None])
