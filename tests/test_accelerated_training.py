@@ -65,6 +65,11 @@ class TestProgram(BaseTester):
             assert json.loads((out / f"{name}.json").read_text())["validation"][0]["step"] == 0
             assert "val_psnr_57000e" in (out / name / "validation.csv").read_text().splitlines()[0]
         assert steps["edof-designed"] == steps["edof-flat"] > 0
+        words = [*words[:-1], tmp_path / "more", "--begin", out, "--steps", 2, "--mask-share", 0.5, "--fine"]
+        del words[words.index("--seconds") :][:2]
+        command(monkeypatch, "learn", "edof-designed", *words)
+        more = load_trained(tmp_path / "more" / "edof-designed.safetensors")
+        assert (more.step, more.settings.fine) == (2, True)
 
     def test_feature_masks_move_for_their_share_of_the_time_and_then_stay(self, tiny, tmp_path):
         run = self.run_of("edof-designed", tmp_path)
@@ -94,7 +99,7 @@ class TestProgram(BaseTester):
         scenes.parts = [(images, nearness)]
         args = Namespace(
             begin=program.FOLDER, batch=2, lr=1e-4, lr_metres=4e-9, ema=0.9, count=2, seed=1, masks=True, fast=False,
-            noise_range=None, electrons=None, output=folder,
+            noise_range=None, electrons=None, output=folder, fine=False, mask_share=None,
         )  # fmt: skip
         run = program.Run(name, scenes, args)
         run.prepare()
@@ -105,7 +110,7 @@ class TestParts(BaseTester):
     def test_feature_the_loss_is_that_of_the_package_in_value_and_gradient(self):
         loss = program.PsnrSsim(torch.device("cpu"))
         estimate, wanted = torch.rand(2, 3, 3, 24, 31, dtype=torch.float64)
-        loss.window = loss.window.double()
+        loss.window, loss.matrices = loss.window.double(), {}
         slopes = []
         for of in (loss, lambda one, two: psnr_ssim_loss(one, two, None)):
             one = estimate.clone().requires_grad_()

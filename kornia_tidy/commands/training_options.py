@@ -55,6 +55,12 @@ def add_network_settings(group: Any) -> None:
     add_setting(group, "refocus", type=int, metavar="D", help="depths that the capture is refocused to for the network")
     add_setting(
         group,
+        "fine",
+        action=argparse.BooleanOptionalAction,
+        help="refocus twice to each depth of --refocus, the second time sharper and with more noise, for --closed-form",
+    )
+    add_setting(
+        group,
         "depth_classes",
         type=int,
         metavar="D",

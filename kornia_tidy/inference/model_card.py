@@ -154,7 +154,10 @@ def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
         ("compositing", settings.compositing),
         ("network", f"{settings.head}, width {settings.width or 'by default'}"),
         ("begins from", _beginning(settings)),
-        ("depths refocused to before the network", str(settings.refocus)),
+        (
+            "depths refocused to before the network",
+            f"{settings.refocus}, each twice" if settings.fine else str(settings.refocus),
+        ),
     ]
 
 

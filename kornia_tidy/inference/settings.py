@@ -64,6 +64,8 @@ class SystemSettings:
             :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         refocus: number of depths that the capture is refocused to before it enters the network, see
             :class:`~kornia_tidy.reconstruction.Refocused`. 0: none.
+        fine: the capture is refocused twice to each of these depths, the second time sharper and with more noise; for
+            ``closed_form`` without ``depth_classes``, see :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         depth_classes: classes of a distribution of depth, for the task ``"joint"``. It begins as the likelihood of
             ``refocus`` depths in closed form; the image begins as with ``closed_form``, see
             :class:`~kornia_tidy.reconstruction.JointClosedFormHead`, or without it as the capture deconvolved for each
@@ -103,6 +105,7 @@ class SystemSettings:
     closed_form: bool = False
     inverse: str = "tikhonov"
     refocus: int = 0
+    fine: bool = False
     depth_classes: int = 0
     refined: bool = False
     seed: int = 0
@@ -131,13 +134,7 @@ class SystemSettings:
         check_head(self.head)
         check_count("repeats", self.repeats)
         check_repeats(self.head, self.repeats)
-        if self.head in CLOSED_FORMS and self.task != "edof":
-            raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
-        if self.residual and (self.closed_form or self.head in CLOSED_FORMS):
-            raise ValueError("residual adds the capture and closed_form its restoration: choose one of them")
-        check_choice("inverse", self.inverse, INVERSES)
-        if self.inverse != INVERSES[0] and not self.closed_form:
-            raise ValueError(f"inverse {self.inverse!r} is the filter of closed_form, which is not asked for")
+        self._check_closed_form()
         if self.depth_classes or self.refined:
             self._check_distribution()
         if self.depth_range is not None:
@@ -150,6 +147,17 @@ class SystemSettings:
             raise ValueError(
                 f"focus must be metres beyond the focal length of {self.focal_length:g} m, got {self.focus}"
             )
+
+    def _check_closed_form(self) -> None:
+        if self.head in CLOSED_FORMS and self.task != "edof":
+            raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
+        if self.residual and (self.closed_form or self.head in CLOSED_FORMS):
+            raise ValueError("residual adds the capture and closed_form its restoration: choose one of them")
+        check_choice("inverse", self.inverse, INVERSES)
+        if self.inverse != INVERSES[0] and not self.closed_form:
+            raise ValueError(f"inverse {self.inverse!r} is the filter of closed_form, which is not asked for")
+        if self.fine and (self.depth_classes or not (self.closed_form and self.refocus)):
+            raise ValueError("fine is for closed_form with refocus and without depth_classes")
 
     def _check_distribution(self) -> None:
         if self.refined and not (self.depth_classes and self.closed_form):

@@ -99,10 +99,11 @@ def build_head(settings: SystemSettings) -> nn.Module:
             settings.refocus,
             encoded=settings.encoded,
         )
-    channels = closed_form_channels(settings.refocus) if settings.closed_form else 3 + settings.refocus
+    layers, fine = settings.refocus, settings.fine
+    channels = closed_form_channels(layers, fine=fine) if settings.closed_form else 3 + layers
     head = _network(settings, channels_of(settings.task), channels)
     if settings.closed_form:
-        return ClosedFormHead(head, settings.refocus, encoded=settings.encoded, inverse=settings.inverse)
+        return ClosedFormHead(head, layers, encoded=settings.encoded, inverse=settings.inverse, fine=fine)
     if settings.refocus:
         head = Refocused(head, layers=settings.refocus)
     return Residual(head) if settings.residual else head

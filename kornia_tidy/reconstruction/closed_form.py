@@ -35,6 +35,7 @@ WINDOW, SPACE = 7, 2.0  # of the bilateral filter, pixels
 COLOR, COLOR_EXPONENT = 0.2, 0.5  # difference of encoded colours
 LEAST_NOISE = 1e-5  # of full scale; its logarithm is finite
 LAYER_WEIGHT = 1e-2  # of the deconvolution for one depth, as an input of a network
+FINE_WEIGHT = 1e-3  # of a second one: with the masks of edof-designed the best in bright light where depth is known
 # Blended by the likelihood of depth, the best weight rises from 0.003 to 0.03 with a noise of 0.002 to 0.03. With one
 # weight the images of joint-5 are 1.8 dB better than by the mean PSF at the one end, .3 dB worse at the other.
 BLEND_WEIGHT = 5e-3
@@ -46,14 +47,14 @@ SHARPNESS = 4.0  # temperature of the likelihood in closed form, which takes pat
 LEAST = -12.0  # of the logarithm of a likelihood: no depth is excluded for certain
 
 
-def closed_form_channels(layers: int = 0, *, likelihood: bool = False) -> int:
+def closed_form_channels(layers: int = 0, *, likelihood: bool = False, fine: bool = False) -> int:
     """Return the number of maps that :class:`ClosedForm` gives to a network for images of three channels.
 
     Example:
         >>> closed_form_channels(), closed_form_channels(layers=5), closed_form_channels(layers=5, likelihood=True)
         (19, 24, 29)
     """
-    return 3 * (2 + len(WEIGHTS)) + 1 + layers * (1 + likelihood)
+    return 3 * (2 + len(WEIGHTS)) + 1 + layers * (1 + likelihood + fine)
 
 
 def with_image(maps: Tensor, image: Tensor) -> Tensor:
@@ -114,6 +115,8 @@ class ClosedForm(nn.Module):
             :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`, and give its logarithm as further
             inputs of a network, as 1 + its quarter / 12, at least 0. The brightness for a depth is then that of the
             image for this depth, of weight 0.005.
+        fine: deconvolve the brightness for each of the ``layers`` a second time, with a weight of 0.001, as inputs that
+            are sharper and have more noise; not with ``likelihood``.
 
     Shape:
         - capture: (B, 3, H, W) in [0, 1].
@@ -124,7 +127,8 @@ class ClosedForm(nn.Module):
 
     Raises:
         TypeError: if the capture is not floating point.
-        ValueError: if shapes do not fit, or no PSFs were given before the first capture.
+        ValueError: if shapes do not fit, no PSFs were given before the first capture, or ``fine`` is asked for without
+            layers or with ``likelihood``.
 
     Convention:
         - Computed in float32 or better, also under autocast, and returned in the capture's dtype.
@@ -161,11 +165,14 @@ class ClosedForm(nn.Module):
         encoded: bool = True,
         likelihood: bool = False,
         inverse: str = "tikhonov",
+        fine: bool = False,
     ) -> None:
         super().__init__()
         check_count("layers", layers, 2 * likelihood)
+        if fine and (likelihood or not layers):
+            raise ValueError(f"fine is for layers without likelihood, got layers={layers}, likelihood={likelihood}")
         check_choice("inverse", inverse, INVERSES)
-        self.inverse = inverse
+        self.inverse, self.fine = inverse, fine
         self.layers, self.bilateral, self.encoded, self.likelihood = layers, bilateral, encoded, likelihood
         self.mean_light: Tensor | None = None
         self.has_stray_light = False
@@ -210,7 +217,8 @@ class ClosedForm(nn.Module):
         if self.likelihood:
             self.filters = tikhonov_kernels(wide.flatten(0, 1), (BLEND_WEIGHT,)).unflatten(1, (-1, 3))[0]
         elif self.layers:
-            self.filters = tikhonov_kernels(wide.mean(1), (LAYER_WEIGHT,)).transpose(0, 1)
+            weights = (LAYER_WEIGHT, FINE_WEIGHT) if self.fine else (LAYER_WEIGHT,)
+            self.filters = tikhonov_kernels(wide.mean(1), weights).flatten(0, 1).unsqueeze(1)
         if self.likelihood:
             beyond = max(0, wide.shape[-1] - LIKELIHOOD_WINDOW) // 2
             middle = slice(beyond, wide.shape[-1] - beyond)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 
 from kornia_tidy.reconstruction.closed_form import ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.head import ReconstructionHead
@@ -26,6 +29,7 @@ class ClosedFormHead(ReconstructionHead):
         encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         likelihood: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         inverse: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
+        fine: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
 
     Shape:
         - image: (B, 3, H, W), captures of the camera, of any size.
@@ -66,15 +70,17 @@ class ClosedFormHead(ReconstructionHead):
         encoded: bool = True,
         likelihood: bool = False,
         inverse: str = "tikhonov",
+        fine: bool = False,
     ) -> None:
         super().__init__(3, 3 if network is None else network.out_channels)
         self.closed_form = ClosedForm(
-            layers, bilateral=bilateral, encoded=encoded, likelihood=likelihood, inverse=inverse
+            layers, bilateral=bilateral, encoded=encoded, likelihood=likelihood, inverse=inverse, fine=fine
         )
         self.network = network
         self.stride = 1 if network is None else network.stride
         if network is not None:
-            if network.in_channels != (wanted := closed_form_channels(layers, likelihood=likelihood)):
+            wanted = closed_form_channels(layers, likelihood=likelihood, fine=fine)
+            if network.in_channels != wanted:
                 raise ValueError(f"the network must take {wanted} channels, got in_channels={network.in_channels}")
             if network.out_channels >= 3:
                 zero_last_convolution(network, 3)
@@ -95,3 +101,25 @@ class ClosedFormHead(ReconstructionHead):
         if others < 0:
             return maps
         return torch.cat([maps[:, :others], maps[:, others:] + restored.image], 1)
+
+
+def with_fine_maps(weights: Mapping[str, Tensor], head: ClosedFormHead) -> dict[str, Tensor]:
+    """Return the weights of a network without the fine maps of the closed form as those of one that takes them.
+
+    Their weights in the first convolution are zero, so that the result is the same.
+
+    Args:
+        weights: state of a :class:`ClosedFormHead` with as many layers, of ``fine`` or not.
+        head: it is not changed.
+
+    Returns:
+        A state for ``head``; other weights stay as they are.
+    """
+    assert head.network is not None
+    name, first = next((n, part) for n, part in head.named_modules() if isinstance(part, nn.Conv2d))
+    found, name = dict(weights), f"{name}.weight"
+    layers = head.closed_form.layers
+    if head.closed_form.fine and name in found and found[name].shape[1] == closed_form_channels(layers):
+        missing = first.in_channels - found[name].shape[1]
+        found[name] = functional.pad(found[name], (0, 0, 0, 0, 0, missing))
+    return found

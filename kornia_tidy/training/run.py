@@ -23,6 +23,7 @@ from kornia_tidy.files import only_here
 from kornia_tidy.inference.heads import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.nafnet import deepened
 from kornia_tidy.seeds import keyed_seed
@@ -190,7 +191,7 @@ def _train(
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
-    """Load the initial weights of a network; those of one for the image alone, or of fewer blocks, are widened.
+    """Load the initial weights of a network; those of one for the image alone, of fewer blocks or maps, are widened.
 
     PSFs and noise of its closed form stay those of this camera, and so does a refiner where the other has none.
     """
@@ -200,7 +201,10 @@ def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
     weights |= {name: value for name, value in head.state_dict().items() if name.startswith(kept)}
     if isinstance(head, JointClosedFormHead) and "temperature" not in weights:
         weights = widened_for_depth(weights, head)
-    load_weights({**state, "state_dict": _as_head(deepened(weights, head))}, head=head, name=str(path))
+    weights = deepened(weights, head)
+    if isinstance(head, ClosedFormHead) and head.network is not None:
+        weights = with_fine_maps(weights, head)
+    load_weights({**state, "state_dict": _as_head(weights)}, head=head, name=str(path))
 
 
 def _begin_refiner(path: str | os.PathLike[str], head: nn.Module) -> None:

@@ -58,6 +58,8 @@ class TestLoadTrained(BaseTester):
             ({"depth_classes": 8, "refocus": 1}, "a distribution of depth needs refocus of at least 2, got 1"),
             ({"depth_classes": 8, "refocus": 2, "residual": True}, "got the task 'joint' with residual"),
             ({"depth_classes": 8, "refocus": 2, "task": "depth"}, "got the task 'depth'"),
+            ({"fine": True, "refocus": 2}, "fine is for closed_form with refocus and without depth_classes"),
+            ({"fine": True, "closed_form": True}, "fine is for closed_form with refocus and without depth_classes"),
         ],
     )
     def test_exception_settings_that_cannot_be(self, changes, sentence, state, tmp_path):

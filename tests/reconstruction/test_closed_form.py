@@ -12,6 +12,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from kornia_tidy import SensorNoise
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form import (
+    FINE_WEIGHT,
     LAYER_WEIGHT,
     NODES,
     NOISE,
@@ -160,6 +161,16 @@ class TestClosedForm(BaseTester):
             expected = linear_rgb_to_rgb(deconvolved.expand(-1, 3, -1, -1))[:, :1] if encoded else deconvolved
             self.assert_close(maps[:, 19 + layer][:, None], expected)
 
+    def test_feature_fine_layers_follow_the_others(self):
+        capture = photo(20, 24)
+        maps = closed_form(layers=3, fine=True, encoded=False)(capture).maps
+        self.assert_close(maps[:, :-3], closed_form(layers=3, encoded=False)(capture).maps)
+        kernels = [tikhonov_kernels(psf, (FINE_WEIGHT,)) for psf in bank(3).psfs.mean(1, keepdim=True)]
+        brightness = capture.mean(1, keepdim=True)
+        expected = torch.cat([convolve_kernels(brightness, each)[:, 0] for each in kernels], 1)
+        self.assert_close(maps[:, -3:], expected.clamp(0, 1))
+        assert maps.shape[1] == closed_form_channels(3, fine=True)
+
     def test_feature_samples_and_pixels_have_their_own_noise(self):
         restore, capture = closed_form(bilateral=False), photo(12, 20)
         both = restore(capture, torch.tensor([0.002, 0.03]).view(2, 1, 1, 1)).image
@@ -276,3 +287,6 @@ class TestClosedForm(BaseTester):
             ClosedForm(inverse="inverse")
         with pytest.raises(ValueError, match=r"needs PSFs of shape \(11, 3, P, P\), got \(4, 3, 5, 5\)"):
             ClosedForm(inverse="wiener").set_psfs(bank())
+        for layers, likelihood in [(0, False), (2, True)]:
+            with pytest.raises(ValueError, match=f"without likelihood, got layers={layers}, likelihood={likelihood}"):
+                ClosedForm(layers, likelihood=likelihood, fine=True)

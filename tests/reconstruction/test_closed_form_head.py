@@ -16,6 +16,7 @@ from kornia_tidy.reconstruction import (
     receptive_field,
     reconstruct_tiled,
 )
+from kornia_tidy.reconstruction.closed_form_head import with_fine_maps
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo
@@ -71,6 +72,19 @@ class TestClosedFormHead(BaseTester):
         with torch.no_grad():
             self.assert_close(head(capture), network(head.closed_form(capture).maps))
 
+    def test_feature_a_network_that_is_given_fine_maps_makes_the_same_of_a_capture(self):
+        plain = head_of(small(layers=4), layers=4, trained=True)
+        fine = head_of(NAFNet(closed_form_channels(4, fine=True), 3, width=2), layers=4, fine=True)
+        fine.load_state_dict(with_fine_maps(plain.state_dict(), fine))
+        capture = photo(20, 24, dtype=torch.float32)
+        with torch.no_grad():
+            self.assert_close(fine(capture, 0.01), plain(capture, 0.01))
+            fine.load_state_dict(with_fine_maps(fine.state_dict(), fine))  # which has them
+            first = fine.network.first.weight
+            assert not first[:, -4:].any()
+            first[:, -4:] += 0.1
+            assert not torch.equal(fine(capture, 0.01), plain(capture, 0.01))
+
     def test_feature_the_network_sees_the_noise(self):
         """Beyond what the closed form makes of it: noises below 0.002 all have its least weight."""
         head, capture = head_of(small(), trained=True), photo(32, 32, dtype=torch.float32)
@@ -121,6 +135,8 @@ class TestClosedFormHead(BaseTester):
         check_onnx(head, (photo(18, 21, dtype=torch.float32)[:1], torch.full((1, 1, 1, 1), 0.02)))
 
     def test_exception(self):
+        with pytest.raises(ValueError, match="the network must take 21 channels, got in_channels=20"):
+            ClosedFormHead(NAFNet(closed_form_channels(1), width=2), 1, fine=True)
         with pytest.raises(ValueError, match="the network must take 19 channels, got in_channels=3"):
             ClosedFormHead(NAFNet(width=2))
         with pytest.raises(ValueError, match="PhaseCam3DUNet ends in Sigmoid"):

@@ -265,7 +265,15 @@ class TestCheckpoint(BaseTester):
         assert TrainingSettings.of(system) == module.settings
         assert system.step == 2
 
-    @pytest.mark.parametrize("options", [{"refocus": 2}, {"closed_form": True}, {"closed_form": True, "refocus": 2}])
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {"refocus": 2},
+            {"closed_form": True},
+            {"closed_form": True, "refocus": 2},
+            {"closed_form": True, "refocus": 2, "fine": True},
+        ],
+    )
     def test_feature_a_network_that_refocuses_looks_through_the_masks_as_they_were_learnt(self, options, tmp_path):
         module, run = made(**options), trainer(tmp_path)
         before = module.optics.masks.phase.detach().clone()
