@@ -157,7 +157,10 @@ class SystemSettings:
         if self.inverse != INVERSES[0] and not self.closed_form:
             raise ValueError(f"inverse {self.inverse!r} is the filter of closed_form, which is not asked for")
         if self.fine and (self.depth_classes or not (self.closed_form and self.refocus)):
-            raise ValueError("fine is for closed_form with refocus and without depth_classes")
+            raise ValueError(
+                "fine is for closed_form with refocus and without depth_classes, got "
+                f"closed_form={self.closed_form}, refocus={self.refocus}, depth_classes={self.depth_classes}"
+            )
 
     def _check_distribution(self) -> None:
         if self.refined and not (self.depth_classes and self.closed_form):

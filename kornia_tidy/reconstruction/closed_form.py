@@ -76,7 +76,7 @@ class Restoration(NamedTuple):
     """All-in-focus image, (B, 3, H, W) in [0, 1], in the colours of the capture."""
     maps: Tensor
     """(B, N, H, W): capture, estimates by rising weight or noise, ``image``, level of the noise, brightness by depth,
-    likelihood of each depth."""
+    with ``fine`` once more, likelihood of each depth."""
     layers: Tensor
     """Linear light deconvolved for each depth, (B, D, 3, H, W); without likelihood D is 0."""
 

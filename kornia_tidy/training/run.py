@@ -195,7 +195,7 @@ def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
 
     PSFs and noise of its closed form stay those of this camera, and so does a refiner where the other has none.
     """
-    state = read_state(path)
+    state = _read_network(path, head)
     weights = below(state["state_dict"], head_prefix(state["state_dict"]))
     kept = ("closed_form.",) if any(name.startswith("refiner.") for name in weights) else ("closed_form.", "refiner.")
     weights |= {name: value for name, value in head.state_dict().items() if name.startswith(kept)}
@@ -210,10 +210,19 @@ def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
 def _begin_refiner(path: str | os.PathLike[str], head: nn.Module) -> None:
     """Load the initial weights of the refiner of a network, from a network for the image of as many blocks or fewer."""
     assert isinstance(head, JointClosedFormHead)
-    state = read_state(path)
+    state = _read_network(path, head)
     weights = as_refiner(below(state["state_dict"], head_prefix(state["state_dict"])), head)
     weights = {**{name: value for name, value in head.state_dict().items() if name not in weights}, **weights}
     load_weights({**state, "state_dict": _as_head(weights)}, head=head, name=str(path))
+
+
+def _read_network(path: str | os.PathLike[str], head: nn.Module) -> dict[str, Any]:
+    """Read a checkpoint whose network begins a head."""
+    state = read_state(path)
+    settings = state.get("settings")
+    if isinstance(head, JointClosedFormHead) and isinstance(settings, Mapping) and settings.get("fine"):
+        raise ValueError(f"{path} takes fine maps, which a network with a distribution of depth cannot begin from")
+    return state
 
 
 def _as_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

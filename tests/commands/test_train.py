@@ -87,7 +87,7 @@ class TestTrain(BaseTester):
         assert not any(map(torch.equal, before.refiner.parameters(), after.refiner.parameters()))
 
     @pytest.mark.takes_seconds
-    def test_feature_a_deeper_network_that_sees_more_begins_as_one_that_was_trained(self, tmp_path):
+    def test_feature_a_deeper_network_that_sees_more_begins_as_one_that_was_trained(self, tmp_path, capsys):
         """A rate of 1e-12 leaves it as it begins."""
         options = [*SMALL, "--head", "nafnet", "--width", "2", "--learn", "network", "--epochs", "1", "--ema", "0"]
         options += ["--fidelity", "draft", "--precision", "32-true", "--refocus", "2"]
@@ -105,6 +105,17 @@ class TestTrain(BaseTester):
         shallow, deep = (load_trained(tmp_path / name / "best.safetensors") for name in ("shallow", "deep"))
         assert len(deep.head.network.encoder[0]) == 2 * len(shallow.head.network.encoder[0])
         assert deep.head.network.in_channels == shallow.head.network.in_channels + 2
+        joint = [
+            "--task",
+            "joint",
+            "--learn",
+            "both",
+            "--closed-form",
+            "--head-from",
+            str(tmp_path / "deep/best.safetensors"),
+        ]
+        assert main(["train", *options, *joint, "-o", str(tmp_path / "joint")]) == 2
+        assert "takes fine maps, which a network with a distribution of depth cannot" in capsys.readouterr().err
         capture = torch.rand(1, 3, 32, 32)
         with torch.no_grad():
             self.assert_close(deep.head(capture), shallow.head(capture), atol=1e-6, rtol=0)
