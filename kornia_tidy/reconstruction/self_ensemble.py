@@ -71,7 +71,7 @@ def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
     """Return a copy of a trained head whose networks average over orientations; it shares the weights.
 
     The closed form is computed once, for the capture as it is; its restorations are then turned. The images of
-    ``edof`` systems gain 0.09 to 0.12 dB by 8 orientations, ``joint-uncertain`` gains in depth alone, see "In several
+    ``edof`` systems gain 0.10 to 0.14 dB by 8 orientations, ``joint-uncertain`` gains in depth alone, see "In several
     orientations" in ``docs/trained_systems.md``.
 
     Args:
