@@ -53,6 +53,8 @@ def closed_form_channels(layers: int = 0, *, likelihood: bool = False, fine: boo
     Example:
         >>> closed_form_channels(), closed_form_channels(layers=5), closed_form_channels(layers=5, likelihood=True)
         (19, 24, 29)
+        >>> closed_form_channels(layers=5, fine=True)
+        29
     """
     return 3 * (2 + len(WEIGHTS)) + 1 + layers * (1 + likelihood + fine)
 

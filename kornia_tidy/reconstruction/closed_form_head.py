@@ -109,17 +109,21 @@ def with_fine_maps(weights: Mapping[str, Tensor], head: ClosedFormHead) -> dict[
     Their weights in the first convolution are zero, so that the result is the same.
 
     Args:
-        weights: state of a :class:`ClosedFormHead` with as many layers, of ``fine`` or not.
-        head: it is not changed.
+        weights: state of a :class:`ClosedFormHead` with as many layers, without fine maps.
+        head: with them; it is not changed.
 
     Returns:
-        A state for ``head``; other weights stay as they are.
+        A state for ``head``; weights of another kind of network stay as they are.
+
+    Raises:
+        ValueError: if the first convolution takes another number of maps.
     """
     assert head.network is not None
     name, first = next((n, part) for n, part in head.named_modules() if isinstance(part, nn.Conv2d))
     found, name = dict(weights), f"{name}.weight"
-    layers = head.closed_form.layers
-    if head.closed_form.fine and name in found and found[name].shape[1] == closed_form_channels(layers):
-        missing = first.in_channels - found[name].shape[1]
-        found[name] = functional.pad(found[name], (0, 0, 0, 0, 0, missing))
+    if name in found:
+        given, wanted = found[name].shape[1], closed_form_channels(head.closed_form.layers)
+        if given != wanted:
+            raise ValueError(f"a network without fine maps must take {wanted} maps to be given them, got {given}")
+        found[name] = functional.pad(found[name], (0, 0, 0, 0, 0, first.in_channels - given))
     return found

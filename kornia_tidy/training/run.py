@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeGuard, cast
 
 import lightning.pytorch as pl
 import torch
@@ -202,7 +202,7 @@ def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
     if isinstance(head, JointClosedFormHead) and "temperature" not in weights:
         weights = widened_for_depth(weights, head)
     weights = deepened(weights, head)
-    if isinstance(head, ClosedFormHead) and head.network is not None:
+    if _is_fine(head) and not state["settings"].get("fine"):
         weights = with_fine_maps(weights, head)
     load_weights({**state, "state_dict": _as_head(weights)}, head=head, name=str(path))
 
@@ -217,12 +217,18 @@ def _begin_refiner(path: str | os.PathLike[str], head: nn.Module) -> None:
 
 
 def _read_network(path: str | os.PathLike[str], head: nn.Module) -> dict[str, Any]:
-    """Read a checkpoint whose network begins a head."""
+    """Read a checkpoint whose network begins a head. Fine maps are not taken for further depths."""
     state = read_state(path)
-    settings = state.get("settings")
-    if isinstance(head, JointClosedFormHead) and isinstance(settings, Mapping) and settings.get("fine"):
-        raise ValueError(f"{path} takes fine maps, which a network with a distribution of depth cannot begin from")
+    if not isinstance(state.get("settings"), Mapping):
+        raise ValueError(f"{path} holds no settings of a system")
+    if state["settings"].get("fine") and not _is_fine(head):
+        raise ValueError(f"the network of {path} takes fine maps, and can begin only one that takes them")
     return state
+
+
+def _is_fine(head: nn.Module) -> TypeGuard[ClosedFormHead]:
+    """Return whether a network takes fine maps."""
+    return isinstance(head, ClosedFormHead) and head.closed_form.fine
 
 
 def _as_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -681,7 +681,7 @@ def main() -> None:
     learner.add_argument(
         "--seconds", type=float, help="for all, from --from-time (default: 500, with --steps no limit)"
     )
-    learner.add_argument("--steps", type=int, default=0, help="of each system, in place of a time, as on a processor")
+    learner.add_argument("--steps", type=int, default=0, help="turns in place of a time, as on a processor")
     learner.add_argument(
         "--mask-share", type=float, help="of the time or steps, in which masks move (default: its own)"
     )

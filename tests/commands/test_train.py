@@ -115,7 +115,7 @@ class TestTrain(BaseTester):
             str(tmp_path / "deep/best.safetensors"),
         ]
         assert main(["train", *options, *joint, "-o", str(tmp_path / "joint")]) == 2
-        assert "takes fine maps, which a network with a distribution of depth cannot" in capsys.readouterr().err
+        assert "takes fine maps, and can begin only one that takes them" in capsys.readouterr().err
         capture = torch.rand(1, 3, 32, 32)
         with torch.no_grad():
             self.assert_close(deep.head(capture), shallow.head(capture), atol=1e-6, rtol=0)

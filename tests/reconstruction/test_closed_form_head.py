@@ -79,11 +79,12 @@ class TestClosedFormHead(BaseTester):
         capture = photo(20, 24, dtype=torch.float32)
         with torch.no_grad():
             self.assert_close(fine(capture, 0.01), plain(capture, 0.01))
-            fine.load_state_dict(with_fine_maps(fine.state_dict(), fine))  # which has them
             first = fine.network.first.weight
             assert not first[:, -4:].any()
             first[:, -4:] += 0.1
             assert not torch.equal(fine(capture, 0.01), plain(capture, 0.01))
+        with pytest.raises(ValueError, match="without fine maps must take 23 maps to be given them, got 27"):
+            with_fine_maps(fine.state_dict(), fine)
 
     def test_feature_the_network_sees_the_noise(self):
         """Beyond what the closed form makes of it: noises below 0.002 all have its least weight."""
