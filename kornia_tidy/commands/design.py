@@ -151,6 +151,13 @@ def add_parser(subparsers: Any) -> None:
         "--masks", type=mask_count, default=default.masks, metavar="K", help="masks in one exposure (default: 5)"
     )
     modulator.add_argument(
+        "--mask-size",
+        type=int,
+        default=default.mask_size,
+        metavar="N",
+        help="its pixels along a side, which spans the aperture: more scatter less light (default: 23, the paper's)",
+    )
+    modulator.add_argument(
         "--bits", type=int, metavar="B", help="of its grey levels over one wave (default: any phase)"
     )
     modulator.add_argument(
@@ -205,6 +212,7 @@ def make_task(args: argparse.Namespace) -> DesignTask:
         masks=args.masks,
         modulator=_modulator(args),
         depth_weight=args.depth_weight,
+        mask_size=args.mask_size,
     )
 
 

@@ -24,7 +24,7 @@ from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 
 Distance = float  # metres, may be infinite
-MOST = 1024  # masks, blocks, or depths to refocus to: more would take days
+MOST = 1024  # masks, their pixels along a side, blocks, or depths to refocus to: more would take days
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +38,7 @@ class SystemSettings:
         masks: number K of learnable masks; 0 is a fixed Fresnel lens.
         start: initial heights of the masks by name, the first K of
             :func:`~kornia_tidy.masks.initial_heights.initial_heights`; ``"noise"`` gives any number of masks.
+        mask_size: pixels along a side of a mask, which spans the aperture.
         focal_length: of the lens in metres.
         pixel_pitch: of the sensor in metres.
         depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default
@@ -86,6 +87,7 @@ class SystemSettings:
     task: str = "edof"
     masks: int = 5
     start: str = "noise"
+    mask_size: int = 23
     focal_length: float = 50e-3
     pixel_pitch: float = 8e-6
     depth_range: tuple[float, float] | None = None
@@ -123,7 +125,8 @@ class SystemSettings:
         self._check_lens()
         for name in ("masks", "refocus", "depth_classes", "seed"):
             check_count(name, getattr(self, name), 0)
-        for name in ("masks", "repeats", "refocus", "depth_classes"):
+        check_count("mask_size", self.mask_size)
+        for name in ("masks", "mask_size", "repeats", "refocus", "depth_classes"):
             if getattr(self, name) > MOST:
                 raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
         check_choice("start", self.start, STARTS)

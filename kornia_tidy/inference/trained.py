@@ -73,8 +73,8 @@ def _masks(settings: SystemSettings) -> PhaseMasks:
         return FresnelLens()
     noise = torch.Generator().manual_seed(settings.seed)
     if settings.start == "noise":
-        return PixelwiseMask(settings.masks, generator=noise)
-    return PixelwiseMask(initial=initial_heights(settings.start, noise)[: settings.masks])
+        return PixelwiseMask(settings.masks, settings.mask_size, generator=noise)
+    return PixelwiseMask(initial=initial_heights(settings.start, noise, settings.mask_size)[: settings.masks])
 
 
 def fix_window(optics: TiDyOptics) -> TiDyOptics:
@@ -189,6 +189,11 @@ def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) 
     masks = state["state_dict"].get("optics.masks.phase")
     if masks is not None and settings.masks and len(masks) != settings.masks:
         raise ValueError(f"{name} does not fit: it holds {len(masks)} masks, and its settings tell of {settings.masks}")
+    if masks is not None and settings.masks and masks.shape[-1] != settings.mask_size:
+        raise ValueError(
+            f"{name} does not fit: its masks have {masks.shape[-1]} pixels along a side, and its settings tell of "
+            f"{settings.mask_size}"
+        )
     try:
         with torch.device("meta"):  # shapes without memory
             head = build_head(settings)

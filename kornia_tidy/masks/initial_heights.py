@@ -62,7 +62,7 @@ def fisher_mask(size: int = 23) -> Tensor:
     return heights - heights.min()
 
 
-def initial_heights(start: str, generator: torch.Generator | None = None) -> Tensor:
+def initial_heights(start: str, generator: torch.Generator | None = None, size: int = 23) -> Tensor:
     """Return the initial heights of a sequence of five masks.
 
     Args:
@@ -80,12 +80,13 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
               with normal noise of standard deviation 6e-8 m.
             - ``"flat"``: zero everywhere, the lens alone.
         generator: source of the noise.
+        size: pixels N along a side.
 
     Returns:
-        Heights in metres, (5, 23, 23), for ``PixelwiseMask(initial=...)``.
+        Heights in metres, (5, N, N), for ``PixelwiseMask(initial=...)``.
 
     Raises:
-        ValueError: if ``start`` is unknown.
+        ValueError: if ``start`` is unknown or the size not positive.
 
     Convention:
         - Rotations by 90 degrees are exact on the grid, but only four differ: the fifth mask equals the first but for
@@ -106,17 +107,18 @@ def initial_heights(start: str, generator: torch.Generator | None = None) -> Ten
     """
     check_choice("start", start, STARTS)
     check_generator(generator)
-    uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(5, 23, 23, generator=generator, dtype=torch.float64)
+    y, x = mask_axes(size)
+    shape = 5, size, size
+    uniform = PixelwiseMask.NOISE_HEIGHT * torch.rand(shape, generator=generator, dtype=torch.float64)
     if start == "noise":
         return uniform
     if start == "flat":
         return torch.zeros_like(uniform)
-    fisher = fisher_mask()
+    fisher = fisher_mask(size)
     if start == "fisher, noise":
         return torch.cat([fisher[None], uniform[1:]])
-    normal = torch.randn(5, 23, 23, generator=generator, dtype=torch.float64)
+    normal = torch.randn(shape, generator=generator, dtype=torch.float64)
     if start == "focal sweep":
-        y, x = mask_axes(23)
         defocus = torch.tensor(SWEEP, dtype=torch.float64)[:, None, None] * (x**2 + y**2)
         return SMALL_NOISE * normal - defocus * REFERENCE_WAVELENGTH / (2 * math.pi * 0.5)  # an index of 1.5
     if start == "like fishers":

@@ -21,9 +21,9 @@ def designed_settings(folder: str | os.PathLike[str]) -> dict[str, Any]:
         folder: that ``kornia-tidy design`` wrote.
 
     Returns:
-        Lens, depth range and number of masks as settings of :class:`~kornia_tidy.training.settings.TrainingSettings`.
-        The masks themselves are in the file of :func:`designed_camera`. A recommended flat lens is one mask of zero
-        height.
+        Lens, depth range, number and size of masks as settings of
+        :class:`~kornia_tidy.training.settings.TrainingSettings`. The masks themselves are in the file of
+        :func:`designed_camera`. A recommended flat lens is one mask of zero height.
 
     Raises:
         FileNotFoundError: if the folder holds no report of a design.
@@ -44,6 +44,7 @@ def designed_settings(folder: str | os.PathLike[str]) -> dict[str, Any]:
             "focus": math.inf if camera["focus_m"] is None else float(camera["focus_m"]),
             "masks": 1 if flat else task["masks"],
             "start": "flat" if flat else "noise",
+            "mask_size": task["mask_size"],
             "reference_f_number": float(task["reference_f_number"]),
         }
     except (KeyError, TypeError, ValueError) as error:

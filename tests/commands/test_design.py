@@ -54,6 +54,7 @@ class TestDesign(BaseTester):
         assert (levels.bits, switching.switching_time, switching.exposure) == (6, 4e-3, 0.05)
         assert isinstance(parsed(["--switching-time", "4e-3"]).modulator, Switching)
         assert isinstance(parsed([]).modulator, DwellTimes)
+        assert (parsed([]).mask_size, parsed(["--mask-size", "92"]).mask_size) == (23, 92)
 
     def test_feature_scenes_of_ones_own(self, tmp_path):
         write_image(tmp_path / "a.png", torch.rand(3, 100, 600))

@@ -81,6 +81,19 @@ class TestInitialHeights(BaseTester):
             sharpest.append(depths[int(psfs.amax((1, 2, 3)).argmax())])
         self.assert_close(torch.tensor(sharpest), torch.tensor(SWEEP), rtol=0, atol=1.0)  # rad; the noise shifts them
 
+    @pytest.mark.parametrize("start", STARTS)
+    def test_cardinality_masks_of_more_pixels(self, start):
+        heights = initial_heights(start, torch.Generator().manual_seed(0), size=46)
+        assert heights.shape == (5, 46, 46)
+        assert bool(heights.isfinite().all())
+
+    def test_feature_a_sweep_of_more_pixels_is_the_same_but_finer(self):
+        coarse, fine = drawn("focal sweep"), initial_heights("focal sweep", torch.Generator().manual_seed(0), size=69)
+        centres = fine[:, 1::3, 1::3]  # of three pixels one has its centre where the coarse one has
+        assert (
+            centres - coarse
+        ).abs().max() < 10 * 6e-8  # m: seven standard deviations of the difference of two noises
+
     def test_exception_unknown_start(self):
         with pytest.raises(ValueError, match=r"start must be one of 'noise', 'fisher, noise', .*, got 'tetrapod'"):
             initial_heights("tetrapod")

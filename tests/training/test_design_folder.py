@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -22,13 +23,16 @@ from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 
 TASK = DesignTask(masks=2, depth_range=(0.5, 4.0), reference_f_number=10.0)
-PHASE = torch.linspace(-3, 3, 2 * 23 * 23).view(2, 23, 23)
+
+
+def phase_of(task):
+    return torch.linspace(-3, 3, task.masks * task.mask_size**2).view(task.masks, task.mask_size, task.mask_size)
 
 
 def folder_of_design(folder, gain, task=TASK):
     """A folder as `kornia-tidy design` writes it, in which masks at f/29 are ahead of a lens at f/41 by some dB."""
     flat = Candidate(FLAT, 41.0, 0.3, 0.02, math.nan, -17.0, None)
-    coded = Candidate("focal sweep", 29.0, 0.0, 0.01, math.nan, -20.0, PHASE)
+    coded = Candidate("focal sweep", 29.0, 0.0, 0.01, math.nan, -20.0, phase_of(task))
     scores = [Finalist(flat, {}, 30.0, (30.0, 31.0), 30.5, math.nan)]
     scores += [Finalist(coded, {}, 31.0, (30.0 + gain, 31.0 + gain), 30.5 + gain, math.nan)]
     verdict = Verdict(scores[0], scores[1], gain, 0.1, 2)
@@ -44,6 +48,7 @@ class TestDesignedSettings(BaseTester):
         assert (settings.masks, settings.f_number, settings.reference_f_number) == (2, 29.0, 10.0)
         assert settings.depth_range == (0.5, 4.0)
         assert settings.camera().focus_distance == pytest.approx(4.0)  # the far end
+        assert settings.mask_size == 23
 
     def test_feature_a_recommended_lens_has_no_masks(self, tmp_path):
         settings = designed_settings(folder_of_design(tmp_path / "a", -0.5))
@@ -73,14 +78,15 @@ class TestTrainBehindADesign(BaseTester):
     SMALL = ("--learn", "network", "--head", "plain", "--width", "4", "--size", "32", "--scenes", "2", "--batch", "2")
     SHORT = ("--validation-scenes", "1", "--epochs", "1", "--fidelity", "draft", "--window", "9")
 
-    @pytest.mark.parametrize("gain", [1.5, -0.5])
-    def test_feature_the_trained_system_is_the_recommended_camera(self, gain, tmp_path):
+    @pytest.mark.parametrize(("gain", "size"), [(1.5, 23), (-0.5, 23), (1.5, 31)])
+    def test_feature_the_trained_system_is_the_recommended_camera(self, gain, size, tmp_path):
         pytest.importorskip("lightning.pytorch")
-        design = folder_of_design(tmp_path / "design", gain)
+        task = replace(TASK, mask_size=size)
+        design = folder_of_design(tmp_path / "design", gain, task)
         given = (*self.SMALL, *self.SHORT, "--electrons", "500", "57000", "--design-from", str(design))
         assert main(["train", *given, "-o", str(tmp_path / "run")]) == 0
         system = load_trained(tmp_path / "run" / "best.safetensors")
         assert system.optics.camera.f_number == pytest.approx(29 if gain > 0 else 41)
-        expected = PHASE if gain > 0 else torch.zeros(1, 23, 23)
+        expected = phase_of(task) if gain > 0 else torch.zeros(1, 23, 23)
         self.assert_close(system.optics.masks.phase.detach(), expected)
         assert TrainingSettings.of(system).electrons == (500, 57e3)
