@@ -17,7 +17,7 @@ import json
 import math
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tqdm import tqdm
@@ -38,15 +38,31 @@ RANGES = {
     "0.149 m to inf": (0.14875, math.inf),
 }
 WEIGHTS = {"image": 0.0, "depth": 1.0, "both": 0.5}
+FINER = (46, 92)  # pixels along a side of masks, where they are not the usual ones
 SIZE, NUMBER = 256, 12  # pixels a side of the scenes, and scenes of each half
 EFFORT = Effort(coarse_steps=20, steps=60, starts=("focal sweep",), scenes=0)
 DEPTH_EFFORT = Effort(coarse_steps=30, steps=100, scenes=0)  # masks that tell depth are far from a focal sweep
 
 
-def cells() -> list[tuple[str, str, int, int]]:
-    """Return what matters, range, number of masks and electrons of each cell, the most wanted first."""
+class Cell(NamedTuple):
+    """A cell of the map."""
+
+    matters: str
+    depths: str
+    masks: int
+    electrons: int
+    mask_size: int = DesignTask.mask_size
+
+    def __str__(self) -> str:
+        """Return its key in the file."""
+        key = f"{self.matters}, {self.depths}, K = {self.masks}, {self.electrons} electrons"
+        return key if self.mask_size == DesignTask.mask_size else f"{key}, {self.mask_size} px"
+
+
+def cells() -> list[Cell]:
+    """Return all cells, the most wanted first."""
     first, less, more = RANGES
-    return [
+    usual = [
         *product(["image"], [first], (5, 1), LIGHTS),
         *product(["image"], [less], [5], LIGHTS),
         *product(["depth"], [first], [5], LIGHTS),
@@ -56,6 +72,8 @@ def cells() -> list[tuple[str, str, int, int]]:
         *product(["image"], [less, more], [1], LIGHTS),
         *product(["image"], [first], [2], LIGHTS),
     ]
+    finer = product(["image"], [first], [5], LIGHTS, FINER)
+    return [Cell(*cell) for cell in (*usual, *finer)]
 
 
 def scenes_for(task: DesignTask) -> list[Scene]:
@@ -90,29 +108,35 @@ def row_of(design: CoDesign) -> dict[str, Any]:
     }
 
 
-def run(path: Path, most: int | None) -> None:
-    """Design the cells that the file does not hold yet."""
+def run(path: Path, most: int | None, named: str) -> None:
+    """Design the cells that the file does not hold yet, of those whose key holds some words."""
     known = read_json(path) if path.exists() else {}
-    todo = [cell for cell in cells() if _key(cell) not in known][:most]
+    todo = [cell for cell in cells() if str(cell) not in known and named in str(cell)][:most]
     for cell in tqdm(todo, desc="cells"):
-        matters, depths, masks, electrons = cell
-        weight = WEIGHTS[matters]
-        task = DesignTask(RANGES[depths], electrons=electrons, masks=masks, depth_weight=weight)
+        weight = WEIGHTS[cell.matters]
+        task = DesignTask(
+            RANGES[cell.depths],
+            electrons=cell.electrons,
+            masks=cell.masks,
+            depth_weight=weight,
+            mask_size=cell.mask_size,
+        )
         design = co_design(task, scenes_for(task), DEPTH_EFFORT if weight else EFFORT)
-        known[_key(cell)] = row_of(design)
+        known[str(cell)] = row_of(design)
         write_bytes(path, (json.dumps(known, indent=1) + "\n").encode())
-        print(_key(cell), known[_key(cell)]["words"], flush=True)
+        print(cell, known[str(cell)]["words"], flush=True)
 
 
 def table(known: dict[str, Any]) -> str:
     """Return the map as a table of Markdown."""
-    lines = ["| matters | depths | K | " + " | ".join(f"{light:,} e-" for light in LIGHTS) + " |", "|---" * 7 + "|"]
-    rows = dict.fromkeys(cell[:3] for cell in cells())
-    for matters, depths, masks in rows:
-        entries = [known.get(_key((matters, depths, masks, light))) for light in LIGHTS]
+    head = "| matters | depths | K | pixels | " + " | ".join(f"{light:,} e-" for light in LIGHTS) + " |"
+    lines = [head, "|---" * 8 + "|"]
+    rows = dict.fromkeys(cell._replace(electrons=0) for cell in cells())
+    for row in rows:
+        entries = [known.get(str(row._replace(electrons=light))) for light in LIGHTS]
         if any(entries):
             told = " | ".join("-" if entry is None else _entry(entry) for entry in entries)
-            lines.append(f"| {matters} | {depths} | {masks} | {told} |")
+            lines.append(f"| {row.matters} | {row.depths} | {row.masks} | {row.mask_size} | {told} |")
     return "\n".join(lines)
 
 
@@ -150,12 +174,8 @@ def plot(known: dict[str, Any], path: Path) -> None:
 
 
 def _of(known: dict[str, Any], matters: str, depths: str, masks: int) -> list[tuple[float, float, float]]:
-    found = ((light, known.get(_key((matters, depths, masks, light)))) for light in LIGHTS)
+    found = ((light, known.get(str(Cell(matters, depths, masks, light)))) for light in LIGHTS)
     return [(light, entry["gain"], entry["standard_error"]) for light, entry in found if entry]
-
-
-def _key(cell: tuple[str, str, int, int]) -> str:
-    return "{}, {}, K = {}, {} electrons".format(*cell)
 
 
 def _finite(value: float) -> float | None:
@@ -169,10 +189,11 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("picture", type=Path, nargs="?")
     parser.add_argument("--cells", type=int, help="stop after so many new cells")
+    parser.add_argument("--named", default="", metavar="WORDS", help="only cells whose key holds them, such as '92 px'")
     options = parser.parse_args()
     if options.action == "run":
         torch.set_num_threads(1)
-        run(options.file, options.cells)
+        run(options.file, options.cells, options.named)
     elif options.action == "table":
         print(table(read_json(options.file)))
     else:
