@@ -58,7 +58,7 @@ blank walls.
 A network fits the camera that it was trained with, so HEAD must be trained with the
 masks and lens of the captures. The library includes, for a 50 mm lens and pixels of 8 um
   edof-5, edof-1, edof-0      picture: five masks, one, a Fresnel element; f/17.6, at 0.6 m
-  edof-designed               picture: five masks; f/24, at 0.99 m
+  edof-designed               picture: five masks; f/22, at 1.98 m
   edof-flat                   picture: no masks; f/48, at 0.74 m
   joint-uncertain             picture, depth and its uncertainty: five masks; f/28.5, at 0.6 m
   joint-5, joint-1, joint-0   picture and depth, by small networks; f/17.6, at 0.6 m

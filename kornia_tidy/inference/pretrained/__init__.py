@@ -22,7 +22,7 @@ PRETRAINED = (
 )  # fmt: skip
 """Names: task and number of masks; 0 masks are a Fresnel element, as in the paper. All have the paper's lens of f/17.6
 but three. The networks of two know light of 500 to 57,000 electrons of white at f/17.6 in the same exposure time:
-``"edof-designed"`` has five masks at f/24, as ``kornia-tidy design`` recommends; ``"edof-flat"`` has none, at f/48.
+``"edof-designed"`` has five masks at f/22, of 92 x 92 pixels; ``"edof-flat"`` has none, at f/48.
 ``"joint-uncertain"`` has five masks at f/28.5, designed for image and depth, and a network that begins with the closed
 form: it returns a distribution of depth, so that it tells how sure it is, and a better image."""
 
