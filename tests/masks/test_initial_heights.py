@@ -5,7 +5,7 @@ import torch
 
 from kornia_tidy import PixelwiseMask
 from kornia_tidy.mask_design.objectives import design_fisher_mask
-from kornia_tidy.masks.initial_heights import CLEAN, STARTS, SWEEP, fisher_mask, initial_heights
+from kornia_tidy.masks.initial_heights import CLEAN, SMALL_NOISE, STARTS, SWEEP, fisher_mask, initial_heights
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
@@ -89,10 +89,8 @@ class TestInitialHeights(BaseTester):
 
     def test_feature_a_sweep_of_more_pixels_is_the_same_but_finer(self):
         coarse, fine = drawn("focal sweep"), initial_heights("focal sweep", torch.Generator().manual_seed(0), size=69)
-        centres = fine[:, 1::3, 1::3]  # of three pixels one has its centre where the coarse one has
-        assert (
-            centres - coarse
-        ).abs().max() < 10 * 6e-8  # m: seven standard deviations of the difference of two noises
+        apart = fine[:, 1::3, 1::3] - coarse  # of three pixels one has its centre where the coarse one has
+        assert apart.abs().max() < 7 * 2**0.5 * SMALL_NOISE  # seven standard deviations of the noise of both
 
     def test_exception_unknown_start(self):
         with pytest.raises(ValueError, match=r"start must be one of 'noise', 'fisher, noise', .*, got 'tetrapod'"):
