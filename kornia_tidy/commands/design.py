@@ -155,7 +155,7 @@ def add_parser(subparsers: Any) -> None:
         type=int,
         default=default.mask_size,
         metavar="N",
-        help="its pixels along a side, which spans the aperture: more scatter less light (default: 23, the paper's)",
+        help="its pixels along a side, 20 of 23 of which span the aperture: more scatter less light (default: 23)",
     )
     modulator.add_argument(
         "--bits", type=int, metavar="B", help="of its grey levels over one wave (default: any phase)"

@@ -142,7 +142,9 @@ def add_parser(subparsers: Any) -> None:
         choices=STARTS,
         help="heights of the masks at first; Fisher suits depth, sweep edof; flat, with --masks 1: a lens alone",
     )
-    add_setting(system, "mask_size", type=int, metavar="N", help="pixels along a side of a mask")
+    add_setting(
+        system, "mask_size", type=int, metavar="N", help="pixels along a side of a mask, 20 of 23 across the aperture"
+    )
     add_setting(system, "design", type=int, metavar="N", help="steps of mask design before training; edof only, 120 do")
     add_network_settings(system)
     add_setting(

@@ -38,7 +38,7 @@ class SystemSettings:
         masks: number K of learnable masks; 0 is a fixed Fresnel lens.
         start: initial heights of the masks by name, the first K of
             :func:`~kornia_tidy.masks.initial_heights.initial_heights`; ``"noise"`` gives any number of masks.
-        mask_size: pixels along a side of a mask, which spans the aperture.
+        mask_size: pixels along a side of a mask; 20 of 23 span the aperture.
         focal_length: of the lens in metres.
         pixel_pitch: of the sensor in metres.
         depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default

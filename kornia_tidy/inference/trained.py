@@ -187,13 +187,12 @@ def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None
 def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) -> None:
     """Raise ``ValueError`` if settings and weights are of different sizes, before memory is allocated."""
     masks = state["state_dict"].get("optics.masks.phase")
-    if masks is not None and settings.masks and len(masks) != settings.masks:
-        raise ValueError(f"{name} does not fit: it holds {len(masks)} masks, and its settings tell of {settings.masks}")
-    if masks is not None and settings.masks and masks.shape[-1] != settings.mask_size:
-        raise ValueError(
-            f"{name} does not fit: its masks have {masks.shape[-1]} pixels along a side, and its settings tell of "
-            f"{settings.mask_size}"
-        )
+    if masks is not None and settings.masks:
+        told = f"{name} does not fit: it holds"
+        if len(masks) != settings.masks:
+            raise ValueError(f"{told} {len(masks)} masks, and its settings tell of {settings.masks}")
+        if (side := masks.shape[-1]) != settings.mask_size:
+            raise ValueError(f"{told} masks of {side} pixels along a side, its settings tell of {settings.mask_size}")
     try:
         with torch.device("meta"):  # shapes without memory
             head = build_head(settings)

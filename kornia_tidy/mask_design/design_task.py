@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_metres, check_part, check_positive
+from kornia_tidy.checks import check_metres, check_part
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
@@ -20,6 +20,7 @@ from kornia_tidy.sensor.exposure import exposed_sensor
 from kornia_tidy.sensor.noise import SensorNoise
 
 MOST_MASKS = 64
+LARGEST_MASK = 1024  # pixels along a side: a search with more would take days
 SLOWEST_LENS = 2.0  # the best f-number of a plain lens below which nothing is out of focus to speak of
 _PER_FOCAL_LENGTH = 1.22 * 2  # Airy disc: diameter / (wavelength * f-number)
 
@@ -74,7 +75,8 @@ class DesignTask:
         check_part("statistics", self.statistics, SceneStatistics, "SceneStatistics such as PHOTOGRAPHS")
         if not isinstance(self.masks, int) or not 1 <= self.masks <= MOST_MASKS:
             raise ValueError(f"masks must be a whole number from 1 to {MOST_MASKS}, got {self.masks}")
-        check_positive("mask_size", self.mask_size)
+        if not isinstance(self.mask_size, int) or not 1 <= self.mask_size <= LARGEST_MASK:
+            raise ValueError(f"mask_size must be a whole number from 1 to {LARGEST_MASK}, got {self.mask_size}")
         timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
         if not 0 <= self.depth_weight <= 1:
             raise ValueError(f"depth_weight must be from 0 (image alone) to 1 (depth alone), got {self.depth_weight}")

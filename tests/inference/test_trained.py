@@ -44,7 +44,7 @@ class TestLoadTrained(BaseTester):
             ({"masks": True}, "masks must be a whole number, got True"),
             ({"masks": 900}, "it holds 2 masks, and its settings tell of 900"),
             ({"masks": 10**9}, "masks must be 1024 or fewer"),
-            ({"mask_size": 46}, "its masks have 23 pixels along a side, and its settings tell of 46"),
+            ({"mask_size": 46}, "it holds masks of 23 pixels along a side, its settings tell of 46"),
             ({"mask_size": 10**9}, "mask_size must be 1024 or fewer"),
             ({"mask_size": 0}, "mask_size must be a whole number of at least 1, got 0"),
             ({"width": 10**4}, "head does not fit: layers.0.weight is"),

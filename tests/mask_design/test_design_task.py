@@ -22,6 +22,9 @@ class TestDesignTask(BaseTester):
             ({"electrons": 0}, "electrons must be positive"),
             ({"read_noise_electrons": -1}, "sigma must be zero or positive"),
             ({"masks": 0}, "masks must be a whole number from 1 to 64, got 0"),
+            ({"mask_size": 0}, "mask_size must be a whole number from 1 to 1024, got 0"),
+            ({"mask_size": 5000}, "mask_size must be a whole number from 1 to 1024, got 5000"),
+            ({"mask_size": 23.0}, "mask_size must be a whole number from 1 to 1024, got 23.0"),
             ({"depth_weight": 1.5}, r"depth_weight must be from 0 \(image alone\) to 1 \(depth alone\), got 1.5"),
         ],
     )
