@@ -81,6 +81,15 @@ class TestProgram(BaseTester):
         assert torch.equal(run.optics.masks.phase, moved)
         assert len(run.light) == 1  # captures are kept from then on
 
+    def test_feature_captures_may_have_what_near_objects_hide(self, tiny, tmp_path):
+        runs = [self.run_of("edof-flat", tmp_path, compositing) for compositing in ("gather", "occlusion")]
+        assert [run.settings.compositing for run in runs] == ["gather", "occlusion"]
+        image, nearness = torch.rand(1, 3, 80, 80), torch.zeros(1, 1, 80, 80)
+        nearness[..., 40:] = 1.0
+        plain, occluded = (run.captured(image, nearness) for run in runs)
+        assert (plain - occluded)[..., 36:44].abs().max() > 1e-3
+        assert torch.allclose(*(run.captured(image, nearness * 0) for run in runs), atol=1e-5)
+
     def test_feature_a_run_that_fails_with_masks_goes_on_without(self, tiny, tmp_path, monkeypatch, capsys):
         run = self.run_of("edof-designed", tmp_path)
         monkeypatch.setattr(run, "capture", None)
@@ -93,13 +102,14 @@ class TestProgram(BaseTester):
         assert not program._stepped(run, 0.1)
 
     @staticmethod
-    def run_of(name, folder):
+    def run_of(name, folder, compositing="gather"):
         scenes = program.Scenes(folder, torch.device("cpu"))
         images, nearness = torch.rand(2, 3, 80, 80).half(), torch.rand(2, 1, 80, 80).half()
         scenes.parts = [(images, nearness)]
         args = Namespace(
             begin=program.FOLDER, batch=2, lr=1e-4, lr_metres=4e-9, ema=0.9, count=2, seed=1, masks=True, fast=False,
             noise_range=None, electrons=None, output=folder, fine=False, mask_share=None,
+            compositing=compositing,
         )  # fmt: skip
         run = program.Run(name, scenes, args)
         run.prepare()

@@ -235,6 +235,7 @@ class Run:
         self.optics, self.head = system.optics.to(self.device), system.head.to(self.device)
         self.kept = self.optics.sensor, self.optics.color_space
         self.optics.sensor, self.optics.color_space = None, "linear"
+        self.optics.compositing = args.compositing
         self.optics.requires_grad_(requires_grad=False)
         self.head.requires_grad_().to(memory_format=torch.channels_last)  # ty: ignore[no-matching-overload]
         self.average = copy.deepcopy(self.head).requires_grad_(requires_grad=False).eval()
@@ -548,7 +549,7 @@ def _settings(system: Any, recipe: Recipe, args: argparse.Namespace) -> Training
         "learn": "both" if recipe.mask_share and args.masks else "network", "seed": args.seed, "batch": args.batch,
         "lr": args.lr, "lr_metres": args.lr_metres, "ema": args.ema, "scenes": args.count, "epochs": 1, "size": SIZE,
         "root": None, "noise_range": recipe.noise_range, "electrons": recipe.electrons, "data": "photo-collages",
-        "noise_error": recipe.noise_error, "precision": "bf16-mixed", "channels_last": True, "validation_scenes": CHUNK,
+        "noise_error": recipe.noise_error, "compositing": args.compositing, "precision": "bf16-mixed", "channels_last": True, "validation_scenes": CHUNK,
     }  # fmt: skip
     return TrainingSettings.of(system).replace(**changed)
 
@@ -693,6 +694,7 @@ def main() -> None:
     learner.add_argument("--lr", type=float, default=1e-3)
     learner.add_argument("--lr-metres", type=float, default=4e-9)
     learner.add_argument("--masks", action=argparse.BooleanOptionalAction, default=True, help="let masks learn, too")
+    learner.add_argument("--compositing", choices=("gather", "occlusion"), default="gather", help="of the captures")
     learner.add_argument("--noise-range", type=float, nargs=2, metavar=("LEAST", "LARGEST"), help="(default: its own)")
     learner.add_argument("--electrons", type=float, nargs=2, metavar=("LEAST", "LARGEST"), help="(default: its own)")
     learner.add_argument("--ema", type=float, default=0.999)

@@ -23,6 +23,7 @@ from kornia_tidy.systems.presets import SYSTEMS
 WINDOW = 129  # pixels; smaller windows that are scaled to sum one flatter coded apertures by 0.4 to 0.7 dB
 FIDELITY = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
 FLAT = (17.6, 22.0, 25.0, 30.0, 35.0, 42.0, 50.0, 60.0, 71.0, 100.0)  # f-numbers, a factor of about 2^(1/4) apart
+OCCLUDED = ("edof-5", "edof-designed", "edof-flat")  # their captures can have what near objects hide
 FOCAL_LENGTH = 50e-3  # m, of the flat lenses as of the shipped cameras
 
 
@@ -32,7 +33,7 @@ class System:
 
     name: str
     kind: str
-    """``"coded"``, ``"flat"``, ``"Fresnel"``, ``"published"`` or ``"as trained"``."""
+    """``"coded"``, ``"flat"``, ``"Fresnel"``, ``"published"``, ``"as trained"`` or ``"with occlusion"``."""
     optics: TiDyOptics
     """From linear light to linear light."""
     head: nn.Module | None
@@ -55,6 +56,7 @@ class System:
             "Fresnel": "Fresnel element of 10 rad, as in the paper",
             "published": f"{count} mask{'s' * (count > 1)} as before training",
             "as trained": f"K = {count}, PSFs of {self.optics.window} px of sum one",
+            "with occlusion": f"{'flat lens' if self.optics.masks.is_flat() else f'K = {count}'}, with occlusion",
             "coded": f"K = {count}",
         }
         return f"{words[self.kind]}, f/{self.f_number:.3g}"
@@ -65,6 +67,7 @@ def available() -> dict[str, Callable[[], System]]:
     known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in PRETRAINED}
     small = [name for name in PRETRAINED if pretrained_settings(name).stray_light is None and not name.endswith("-0")]
     known |= {f"{name} as trained": _as_trained(name) for name in small}
+    known |= {f"{name} with occlusion": _with_occlusion(name) for name in OCCLUDED}
     known |= {f"flat f/{number:g}": _flat(number) for number in FLAT}
     return known | {f"preset {name}": _published(name) for name in SYSTEMS}
 
@@ -99,6 +102,19 @@ def _as_trained(name: str) -> Callable[[], System]:
         fidelity = trained.optics.fidelity
         return _system(
             f"{name} as trained", "as trained", trained.optics, trained.head, trained.settings.task, fidelity
+        )
+
+    return make
+
+
+def _with_occlusion(name: str) -> Callable[[], System]:
+    """A shipped system, trained on captures by gather, whose captures are rendered layer over layer."""
+
+    def make() -> System:
+        trained = load_pretrained(name)
+        trained.optics.compositing = "occlusion"
+        return _system(
+            f"{name} with occlusion", "with occlusion", trained.optics, trained.head, trained.settings.task
         )
 
     return make
