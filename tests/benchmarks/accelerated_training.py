@@ -549,7 +549,8 @@ def _settings(system: Any, recipe: Recipe, args: argparse.Namespace) -> Training
         "learn": "both" if recipe.mask_share and args.masks else "network", "seed": args.seed, "batch": args.batch,
         "lr": args.lr, "lr_metres": args.lr_metres, "ema": args.ema, "scenes": args.count, "epochs": 1, "size": SIZE,
         "root": None, "noise_range": recipe.noise_range, "electrons": recipe.electrons, "data": "photo-collages",
-        "noise_error": recipe.noise_error, "compositing": args.compositing, "precision": "bf16-mixed", "channels_last": True, "validation_scenes": CHUNK,
+        "noise_error": recipe.noise_error, "precision": "bf16-mixed", "channels_last": True, "validation_scenes": CHUNK,
+        "compositing": args.compositing,
     }  # fmt: skip
     return TrainingSettings.of(system).replace(**changed)
 

@@ -113,9 +113,7 @@ def _with_occlusion(name: str) -> Callable[[], System]:
     def make() -> System:
         trained = load_pretrained(name)
         trained.optics.compositing = "occlusion"
-        return _system(
-            f"{name} with occlusion", "with occlusion", trained.optics, trained.head, trained.settings.task
-        )
+        return _system(f"{name} with occlusion", "with occlusion", trained.optics, trained.head, trained.settings.task)
 
     return make
 
