@@ -84,11 +84,11 @@ class TestProgram(BaseTester):
     def test_feature_captures_may_have_what_near_objects_hide(self, tiny, tmp_path):
         runs = [self.run_of("edof-flat", tmp_path, compositing) for compositing in ("gather", "occlusion")]
         assert [run.settings.compositing for run in runs] == ["gather", "occlusion"]
-        image, nearness = torch.rand(1, 3, 80, 80), torch.zeros(1, 1, 80, 80)
-        nearness[..., 40:] = 1.0
+        nearness = (torch.arange(80) < 40).float().expand(1, 1, 80, 80)
+        image = nearness.expand(1, 3, 80, 80)  # a white object before a black ground
         plain, occluded = (run.captured(image, nearness) for run in runs)
-        assert (plain - occluded)[..., 36:44].abs().max() > 1e-3
-        assert torch.allclose(*(run.captured(image, nearness * 0) for run in runs), atol=1e-5)
+        assert (plain - occluded)[..., 38:42].abs().max() > 0.01  # 500 times the rounding
+        assert torch.allclose(*(run.captured(image, nearness * 0) for run in runs), atol=2e-5)
 
     def test_feature_a_run_that_fails_with_masks_goes_on_without(self, tiny, tmp_path, monkeypatch, capsys):
         run = self.run_of("edof-designed", tmp_path)

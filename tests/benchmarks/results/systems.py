@@ -23,7 +23,7 @@ from kornia_tidy.systems.presets import SYSTEMS
 WINDOW = 129  # pixels; smaller windows that are scaled to sum one flatter coded apertures by 0.4 to 0.7 dB
 FIDELITY = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
 FLAT = (17.6, 22.0, 25.0, 30.0, 35.0, 42.0, 50.0, 60.0, 71.0, 100.0)  # f-numbers, a factor of about 2^(1/4) apart
-OCCLUDED = ("edof-5", "edof-designed", "edof-flat")  # their captures can have what near objects hide
+OCCLUDED = ("edof-5", "edof-designed", "edof-flat")  # these are measured on captures with occlusion, too
 FOCAL_LENGTH = 50e-3  # m, of the flat lenses as of the shipped cameras
 
 
@@ -108,7 +108,7 @@ def _as_trained(name: str) -> Callable[[], System]:
 
 
 def _with_occlusion(name: str) -> Callable[[], System]:
-    """A shipped system, trained on captures by gather, whose captures are rendered layer over layer."""
+    """A shipped system whose captures have occlusion; its network learnt from captures without."""
 
     def make() -> System:
         trained = load_pretrained(name)
