@@ -223,6 +223,13 @@ class TestEveryPage(BaseTester):
         assert gone == []
 
     @pytest.mark.parametrize("name", NAMES)
+    def test_feature_links_to_headings_lead_to_pages(self, name):
+        """Sphinx finds a heading only in a page of the site, and says so only once the whole site is built."""
+        linked = LINK.findall(FENCE.sub("", (ROOT / name).read_text(encoding="utf-8")))
+        aimed = {(ROOT / name).parent / file for file, anchor in linked if file and "://" not in file and anchor}
+        assert {path.resolve() for path in aimed} <= set(PAGES)
+
+    @pytest.mark.parametrize("name", NAMES)
     def test_feature_commands_in_sentences_are_there(self, name):
         """They read their arguments if they have any; how they are told to start is enough of the others."""
         for line in COMMAND.findall(FENCE.sub("", (ROOT / name).read_text(encoding="utf-8"))):
