@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -116,6 +117,7 @@ def with_noise_of(head: LightHead, sensor: SensorNoise | None) -> LightHead:
     return copied
 
 
+@torch.no_grad()
 def reconstruct_light(
     head: LightHead,
     light: Tensor,
@@ -140,6 +142,9 @@ def reconstruct_light(
     Raises:
         TypeError: if the light is not a floating-point tensor.
         ValueError: if it is of another shape, or the network cannot be tiled within the memory.
+
+    Convention:
+        Gradients are not computed.
     """
     check_float_tensor("light", light, 3, "(3, H, W) or (1, H, W)")
     if light.shape[0] not in {1, 3} or 0 in light.shape:

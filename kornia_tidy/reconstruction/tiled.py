@@ -229,6 +229,7 @@ def _sides_that_fit(head: nn.Module, grid: TileGrid, image: Tensor, memory_budge
     return sides
 
 
+@torch.no_grad()
 def check_seamless(head: nn.Module) -> None:
     """Raise ``ValueError`` unless tiles of a noise image give the result of the whole image.
 

@@ -135,6 +135,18 @@ class TestReconstructLight(BaseTester):
         dark = head(optics.encode(light[None, ..., :60]))[0]
         assert (dark - whole[..., :60])[..., :30].abs().max() > 0.01
 
+    def test_feature_no_graph_is_kept(self):
+        """Of the check that tiles equal the whole it would take gigabytes."""
+        settings = SystemSettings(task="edof", masks=1, window=9, head="plain", width=2)
+        optics, head, seen, tiles = build_optics(settings), build_head(settings), [], []
+        light_head = LightHead(TrainedSystem(optics, head, settings, 0))
+        head.register_forward_pre_hook(lambda *_: seen.append(torch.is_grad_enabled()))  # copies have it, too
+        light = torch.rand(3, 40, 300)
+        reconstruct_light(light_head, light, memory_budget=1 << 19, progress=lambda *counts: tiles.append(counts))
+        assert len(tiles) > 1
+        assert len(seen) > len(tiles)
+        assert not any(seen)
+
     def test_feature_an_overlap_below_the_receptive_field_is_not_exact(self):
         settings = SystemSettings(task="edof", masks=1, window=9, head="nafnet", width=2)
         optics, head = build_optics(settings), build_head(settings)
