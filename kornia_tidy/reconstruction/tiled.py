@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
+from kornia_tidy.reconstruction.freed_memory import give_back
 from kornia_tidy.reconstruction.head import sharing_weights
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import (
@@ -184,6 +185,8 @@ def _run(
         del output, part, whole  # else this tile's output would be held beside the next one's
         if progress is not None:
             progress(done + 1, len(tiles))
+    if len(tiles) > 1:
+        give_back()
     return result
 
 

@@ -322,9 +322,11 @@ class TestRawReconstruct(BaseTester):
         folder = tmp_path / "out"
         command = [sys.executable, "-m", "kornia_tidy.cli", "raw", "reconstruct", *map(str, files), "--head"]
         command += [checkpoint(tmp_path / "joint.safetensors", task="joint"), "-o", str(folder), "--jobs", "2"]
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
         process = subprocess.Popen(
             [*command, "--resume"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
         )
+        signal.signal(signal.SIGINT, before)
         deadline = time.monotonic() + 120
         while not list(folder.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)

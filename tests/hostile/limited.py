@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from kornia_tidy import cli
 from tests.forks import fork, wait
@@ -61,3 +63,19 @@ def command(argv: Sequence[str], folder: Path, before: Callable[[], object] = bo
     status = wait(fork(child))
     printed, told = (path.read_text(errors="replace") for path in outputs)
     return Outcome(status, told, printed)
+
+
+def apart(function: Callable[..., Any], *arguments: object) -> Any:
+    """Call a function of a test module in a new process, with arguments and a result that JSON holds.
+
+    Gradients are refused in forks of a process that computed some, as one of pytest may have done before.
+    """
+    name, module = function.__name__, function.__module__
+    script = (
+        f"import json, sys, torch; from {module} import {name}; torch.set_num_threads(1); "
+        f"print(json.dumps({name}(*json.loads(sys.argv[1]))))"
+    )
+    run = [sys.executable, "-c", script, json.dumps(arguments)]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])

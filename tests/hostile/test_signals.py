@@ -12,6 +12,7 @@ import random
 import shutil
 import signal
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ from kornia_tidy.files import replacing
 from tests.base import BaseTester
 from tests.coded_datasets.samples import contents
 from tests.forks import fork, wait
-from tests.hostile.limited import command
+from tests.hostile.limited import apart, command
 
 RENDER = ("render", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--masks", "1", "--fidelity", "draft")
 TRAIN = ("train", "--resume", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--validation-scenes", "2",
@@ -83,6 +84,11 @@ def disturb(argv, folder, moments, seed):
     return stopped
 
 
+def stopped_trainings(folder):
+    """Disturb a training; return how often it was stopped."""
+    return disturb(TRAIN, Path(folder), 20, seed=3)
+
+
 class TestSignals(BaseTester):
     @pytest.mark.takes_seconds
     @pytest.mark.parametrize("shards", [(), ("--shard-items", "2")])
@@ -99,7 +105,7 @@ class TestSignals(BaseTester):
     @pytest.mark.slow
     def test_feature_training_stopped_at_twenty_moments_ends_bit_for_bit_where_an_undisturbed_one_does(self, tmp_path):
         pytest.importorskip("lightning.pytorch")
-        assert disturb(TRAIN, tmp_path, 20, seed=3) > 0
+        assert apart(stopped_trainings, str(tmp_path)) > 0
         one, other = ((tmp_path / name / "out" / "last.safetensors").read_bytes() for name in ("whole", "stopped"))
         assert one == other
 
