@@ -67,18 +67,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             args.run(args)
             sys.stdout.flush()  # raises here if the disk is full or the pipe is closed
-        except _Terminated:
-            print("kornia-tidy: terminated", file=sys.stderr)
-            return TERMINATED
-        except KeyboardInterrupt:
-            print("kornia-tidy: interrupted", file=sys.stderr)
-            return INTERRUPTED
+        except KeyboardInterrupt as stop:
+            return _stopped(stop)
         except BrokenPipeError:
             _forget_stdout()
             return NOBODY_READS
         except Exception as error:
-            return _told(error)
+            stop = _interruption_behind(error)
+            return _told(error) if stop is None else _stopped(stop)
     return DONE
+
+
+def _stopped(stop: KeyboardInterrupt) -> int:
+    """Say that a signal ended the command; return its exit status."""
+    terminated = isinstance(stop, _Terminated)
+    print(f"kornia-tidy: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
+    return TERMINATED if terminated else INTERRUPTED
+
+
+def _interruption_behind(error: BaseException | None) -> KeyboardInterrupt | None:
+    """Return the signal that an error comes from: in the middle of an import it may be told as an ``ImportError``."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 def _print_any_name() -> None:

@@ -7,6 +7,7 @@ processor. SIGKILL is in tests/coded_datasets/test_resume.py and tests/training/
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import random
 import shutil
@@ -85,7 +86,8 @@ def disturb(argv, folder, moments, seed):
 
 
 def stopped_trainings(folder):
-    """Disturb a training; return how often it was stopped."""
+    """Disturb a training; return how often it was stopped. Its imports are none of what is disturbed."""
+    importlib.import_module("kornia_tidy.training.run")
     return disturb(TRAIN, Path(folder), 20, seed=3)
 
 
@@ -124,6 +126,26 @@ class TestSignals(BaseTester):
         run_instead(monkeypatch, write)
         assert wait(fork(command)) == STATUS[number]
         assert os.listdir(tmp_path) == []
+
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+    @pytest.mark.parametrize("hidden", [False, True])
+    def test_feature_a_signal_that_an_import_took_for_its_failure_is_told(self, hidden, number, monkeypatch, capsys):
+        """As modules of C++ do, and our own sentence of a package that is missing."""
+
+        def load(_):
+            try:
+                os.kill(os.getpid(), number)
+                time.sleep(60)
+            except KeyboardInterrupt as stop:
+                raise ImportError("initialization failed") from (None if hidden else stop)
+
+        run_instead(monkeypatch, load)
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
+        try:
+            assert cli.main([]) == STATUS[number]
+        finally:
+            signal.signal(signal.SIGINT, before)
+        assert capsys.readouterr().err == f"kornia-tidy: {WORD[number]}\n"
 
     def test_convention_a_handler_of_the_caller_stays(self, monkeypatch):
         run_instead(monkeypatch, bool)
