@@ -62,7 +62,7 @@ def decode_map(name: str, data: bytes, path: str) -> Tensor:
     Raises:
         ValueError: if the bytes are damaged.
     """
-    stored = decode_stored(data, path).transpose(2, 0, 1)
+    stored = decode_stored(data, path).values.transpose(2, 0, 1)
     if name == "mask":
         return torch.from_numpy(stored > 0)
     if stored.dtype.kind == "u":

@@ -86,7 +86,8 @@ def read_depth(
     """
     calibration: dict[str, Any] = {"focal_px": focal_px, "baseline_m": baseline_m, "doffs_px": doffs_px}
     check_depth_options(scale, kind=kind, **calibration, rotated_bits=rotated_bits)
-    stored = read_stored(path)
+    file = read_stored(path)
+    stored = file.values
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
     stored = stored[..., 0]
@@ -96,6 +97,8 @@ def read_depth(
         stored = (stored >> int(rotated_bits)) | (stored << (16 - int(rotated_bits)))
     _tell_of_unknown(path, stored, kind, invalid)
     known = stored != 0 if stored.dtype.kind in "ui" else ~np.isnan(stored)
+    if file.unknown is not None:
+        known &= ~file.unknown
     for value in invalid:
         known &= stored != value
     metres = stored.astype(np.float64) * scale

@@ -10,13 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.metadata import with_exif
 from kornia_tidy.data.opencv_arrays import to_opencv
-from kornia_tidy.data.stored import read_stored
+from kornia_tidy.data.stored import Stored, read_stored
 from kornia_tidy.files import write_bytes
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -55,13 +54,14 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         raise ValueError(f"cannot read {path}: it needs more memory than there is") from error
 
 
-def _as_image(stored: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
+def _as_image(file: Stored, path: str | os.PathLike[str]) -> Tensor:
     """Return stored pixels (H, W, C) as floats in [0, 1], (C, H, W)."""
+    stored = file.values
     channels = stored.shape[2]
     if channels not in {1, 3}:
         raise ValueError(f"cannot read {path}: an image has 1, 3 or 4 channels, this has {channels}")
     if stored.dtype in {np.dtype(np.uint8), np.dtype(np.uint16)}:
-        values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+        values = stored.astype(np.float32) / np.float32(file.white or np.iinfo(stored.dtype).max)
     elif stored.dtype.kind == "f":
         if not (stored.min() >= 0 and stored.max() <= 1):  # False for NaN too
             raise ValueError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +23,20 @@ _DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent p
 _HARMLESS = "extraneous bytes before marker 0xd9"
 
 
-def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
+class Stored(NamedTuple):
+    """Numbers of an image file, without any conversion, and what the file says of them."""
+
+    values: NDArray[Any]
+    """(H, W, C) in the data type of the file, rows and columns as they are stored; channels are grey or R, G, B."""
+    white: float | None = None
+    """Number that means 1 in a picture of integers; None: the largest of the data type."""
+    unknown: NDArray[np.bool_] | None = None
+    """(H, W), True where the file marks a pixel as missing; None: it marks none."""
+    orientation: int = 1
+    """How the picture is to be turned for display, 1 to 8 as in EXIF; 1: not at all. The values are not turned."""
+
+
+def read_stored(path: str | os.PathLike[str]) -> Stored:
     """Read the numbers in a PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP, NPY or HDF5 file, without any conversion.
 
     The format is recognised by content, not by name. The size in the header is checked before decoding, see
@@ -34,7 +47,7 @@ def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
         path: the file.
 
     Returns:
-        (H, W, C) in the data type of the file; channels are grey or R, G, B; alpha is dropped.
+        The numbers, and what the file says of them; alpha is dropped.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -43,32 +56,34 @@ def read_stored(path: str | os.PathLike[str]) -> NDArray[Any]:
     return decode_stored(read_bytes(path), path)
 
 
-def decode_stored(data: bytes, path: str | os.PathLike[str]) -> NDArray[Any]:
+def decode_stored(data: bytes, path: str | os.PathLike[str]) -> Stored:
     """Decode the bytes of an image file as :func:`read_stored` does; error messages name the path.
 
     Raises:
         ValueError: if the file is cut short, damaged or of no known format.
     """
     try:
-        if data.startswith(NPY):
-            stored = decode_npy(data)
-        elif data.startswith(HDF5):
-            stored = decode_hdf5(data)
-        elif data.startswith((b"PF", b"Pf")):
-            stored = decode_pfm(data)
-        else:
-            stored = _decode_with_opencv(data)
+        stored = _decode(data)
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     except MemoryError:
         raise ValueError(f"cannot read {path}: the memory that it needs is not there") from None
-    if stored.ndim == 2:
-        stored = stored[..., None]
-    if stored.ndim != 3 or 0 in stored.shape:
-        raise ValueError(f"cannot read {path}: an image has rows, columns and channels, this is {stored.shape}")
-    if stored.dtype.kind not in "uif":
-        raise ValueError(f"cannot read {path}: its values must be integers or real numbers, not {stored.dtype}")
-    return stored[..., :3] if stored.shape[2] == 4 else stored
+    values = stored.values[..., None] if stored.values.ndim == 2 else stored.values
+    if values.ndim != 3 or 0 in values.shape:
+        raise ValueError(f"cannot read {path}: an image has rows, columns and channels, this is {values.shape}")
+    if values.dtype.kind not in "uif":
+        raise ValueError(f"cannot read {path}: its values must be integers or real numbers, not {values.dtype}")
+    return stored._replace(values=values[..., :3] if values.shape[2] == 4 else values)
+
+
+def _decode(data: bytes) -> Stored:
+    if data.startswith(NPY):
+        return Stored(decode_npy(data))
+    if data.startswith(HDF5):
+        return Stored(decode_hdf5(data))
+    if data.startswith((b"PF", b"Pf")):
+        return Stored(decode_pfm(data))
+    return Stored(_decode_with_opencv(data))
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[Any]:

@@ -228,7 +228,7 @@ def _check_sidecar(names: Any, level_phases: Tensor, wavelength: float, per_metr
 
 
 def _read_frame(path: Path, depth: int, levels: int, placement: PanelPlacement, size: tuple[int, int]) -> Tensor:
-    codes = read_stored(path)
+    codes = read_stored(path).values
     if codes.dtype.kind != "u" or codes.dtype.itemsize * 8 != depth or codes.shape[2] != 1:
         raise ValueError(f"{path} must be a grey picture of {depth} bits, got {codes.dtype} in {codes.shape[2]} planes")
     picture = torch.from_numpy(codes[..., 0].astype(np.int16 if depth == 16 else np.uint8))

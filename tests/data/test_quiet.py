@@ -56,7 +56,9 @@ class TestCaught(BaseTester):
         def work(number):
             for _ in range(30):
                 try:
-                    outcomes.append((number % 2, decode_stored(bad if number % 2 else whole, "a").shape == (40, 60, 1)))
+                    outcomes.append(
+                        (number % 2, decode_stored(bad if number % 2 else whole, "a").values.shape == (40, 60, 1))
+                    )
                 except ValueError:
                     outcomes.append((number % 2, "refused"))
 
