@@ -1,18 +1,20 @@
-"""File input and output: errors of one sentence, atomic writes, and locks of folders.
+"""File input and output: errors of one sentence, text in any Unicode form, atomic writes, and locks of folders.
 
 No package is used for atomic writes: atomicwrites is no longer maintained, and writes no folders.
 """
 
 from __future__ import annotations
 
+import codecs
 import errno
 import json
 import os
 import re
 import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePath
 from typing import Any
 from uuid import uuid4
 
@@ -21,6 +23,16 @@ try:
 except ImportError:  # missing on Windows, where nothing is locked
     fcntl = None
 
+# By the mark at the beginning of a file. Excel and old editors of Windows write the first, a > of PowerShell 5 the last
+# but one. The marks of UTF-32 are looked for before those of UTF-16, which they begin with.
+_ENCODINGS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+_HIDDEN = ("__macosx", "thumbs.db", "ehthumbs.db", "desktop.ini")  # besides names that begin with a dot
 _LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of files and folders until they are complete
 
 
@@ -65,6 +77,47 @@ def check_file(path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
+    r"""Read a text file in UTF-8, or in UTF-8, UTF-16 or UTF-32 with a byte order mark, which is left out.
+
+    Args:
+        path: of the file.
+        errors: of what is no text, as for ``bytes.decode``.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is no text.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "list.txt").write_text("rgb/1.png", encoding="utf-16")
+        ...     read_text(f"{folder}/list.txt")
+        'rgb/1.png'
+    """
+    data = read_bytes(path)
+    encoding = next((name for mark, name in _ENCODINGS.items() if data.startswith(mark)), "utf-8")
+    try:
+        return data.decode(encoding, errors)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"cannot read {path}: it is no text in {encoding[:6].strip('-').upper()} ({error})") from None
+
+
+def find_files(root: str | os.PathLike[str], pattern: str) -> Iterator[Path]:
+    """Yield the files below a folder that a pattern of ``Path.glob`` names, in any order.
+
+    Convention:
+        Hidden files and those in hidden folders are passed by, as a shell's ``*`` does: names that begin with a dot,
+        unless the pattern has the dot. macOS leaves ``._name`` beside each file on drives of other systems, and in the
+        folder ``__MACOSX`` of archives. That and what Windows hides, such as ``Thumbs.db``, are passed by too.
+    """
+    dotted = [part for part in PurePath(pattern).parts if part.startswith(".")]
+    for path in Path(root).glob(pattern):
+        hidden = [part for part in path.relative_to(root).parts if part.startswith(".") or part.lower() in _HIDDEN]
+        if all(any(fnmatchcase(part, wanted) for wanted in dotted) for part in hidden) and path.is_file():
+            yield path
+
+
 def read_json(path: str | os.PathLike[str]) -> Any:
     """Read a file of JSON.
 
@@ -72,9 +125,9 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: if there is none.
         ValueError: if it is not JSON, or is nested too deep; the path is named.
     """
-    data = read_bytes(path)
+    text = read_text(path)
     try:
-        return parse_json(data)
+        return parse_json(text)
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from kornia_tidy.coded_datasets.item_files import ABOUT
 from kornia_tidy.coded_datasets.layout import Layout, Part
-from kornia_tidy.files import check_file, parse_json, read_bytes, read_json
+from kornia_tidy.files import check_file, parse_json, read_bytes, read_json, read_text
 
 INDEX = "index.csv"
 Entry = dict[str, str]
@@ -48,8 +48,9 @@ def read_index(folder: Path) -> list[Entry]:
         raise FileNotFoundError(
             f"{folder} has no {INDEX}, which rendering writes last: it has not ended, or is no such"
         )
+    text = read_text(path)
     try:
-        entries = list(csv.DictReader(io.StringIO(read_bytes(path).decode()), strict=True))
+        entries = list(csv.DictReader(io.StringIO(text), strict=True))
     except (csv.Error, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     if not entries or not {"key", "name", "coded"} <= set(entries[0]) or any(map(_is_ragged, entries)):

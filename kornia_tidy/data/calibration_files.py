@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from kornia_tidy.files import read_bytes, read_json
+from kornia_tidy.files import read_json, read_text
 
 OPTIONS = ("focal_px", "baseline_m", "doffs_px", "scale")
 _ENTRY = re.compile(r"^\s*(\w+)\s*=\s*(\[[^\]]*\]|[-+.\deE]+)\s*$", re.MULTILINE)
@@ -43,7 +43,7 @@ def read_calibration(path: str | os.PathLike[str]) -> dict[str, float]:
         if not isinstance(values, dict) or not values or not set(values) <= set(OPTIONS):
             raise ValueError(f"cannot read {path}: a calibration holds some of {', '.join(OPTIONS)}, and nothing else")
     else:
-        entries = dict(_ENTRY.findall(read_bytes(path).decode("utf-8", "replace")))
+        entries = dict(_ENTRY.findall(read_text(path, "replace")))
         camera = re.findall(r"[-+.\deE]+", entries.get("cam0", ""))
         if len(camera) != 9 or not {"baseline", "doffs"} <= set(entries):
             raise ValueError(

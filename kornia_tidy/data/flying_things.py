@@ -13,6 +13,7 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.data.patches import Patches
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.files import find_files
 
 FOCAL_PX = 1050.0  # 35 mm on a sensor 32 mm and 960 pixels wide
 NEAREST = 160.0  # px of disparity; values found range from 1.1 to 152
@@ -217,5 +218,5 @@ def _list_names(folder: Path, part: str, view: str, suffix: str) -> list[str]:
         raise FileNotFoundError(
             f"{folder} has no {part}: unpack the whole archive, or name the parts that are there with subsets="
         )
-    files = (folder / part).glob(f"[0-9]*/{view}/[0-9]*{suffix}")
+    files = find_files(folder / part, f"[0-9]*/{view}/[0-9]*{suffix}")
     return sorted(file.relative_to(folder).with_suffix("").as_posix() for file in files)

@@ -14,7 +14,7 @@ from kornia_tidy.data.depth_files import fill_holes
 from kornia_tidy.data.hdf5 import DAMAGE, stored_numbers
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import read_bytes
+from kornia_tidy.files import read_text
 
 LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 SOURCES = {
@@ -143,11 +143,13 @@ def _read_split(root: Path, split: str | os.PathLike[str]) -> list[int]:
     else:
         path = Path(split)
         try:
-            numbers = np.array([int(word) for word in read_bytes(path).decode().split()])
+            words = read_text(path, "replace").split()
         except FileNotFoundError as error:
             raise FileNotFoundError(
                 f"split must be 'train', 'test', 'all' or a text file of numbers: {error}"
             ) from error
+        try:
+            numbers = np.array([int(word) for word in words])
         except ValueError as error:
             raise ValueError(
                 f"cannot read {path}: it should hold the numbers of frames, one a line: {error}"

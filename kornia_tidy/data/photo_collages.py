@@ -22,6 +22,7 @@ from kornia_tidy.data.image_files import SUFFIXES, read_image
 from kornia_tidy.data.photographic_leaves import LARGEST_RADIUS, ZOOM, of_most, photographed
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.files import find_files
 from kornia_tidy.seeds import keyed_seed
 
 PIXELS_A_LEAF = (300.0, 40_000.0)  # of the final picture, uniform in its logarithm over the scenes
@@ -179,7 +180,7 @@ def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:
     """Return the PNG, TIFF and JPEG files in a folder and the folders in it, in the order of their paths.
 
     Args:
-        folder: where to look.
+        folder: where to look; hidden files are passed by.
 
     Raises:
         FileNotFoundError: if there is no such folder, or none of these files in it.
@@ -187,7 +188,7 @@ def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:
     root = Path(folder)
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder {root}: it must hold photographs ({', '.join(SUFFIXES)})")
-    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    found = sorted(path for path in find_files(root, "**/*") if path.suffix.lower() in SUFFIXES)
     if not found:
         raise FileNotFoundError(f"{root} holds no photographs ({', '.join(SUFFIXES)})")
     return found

@@ -13,6 +13,7 @@ from kornia_tidy.data.depth_files import ray_cosine
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.rgbd_folder import RGBDFolder
 from kornia_tidy.data.scene_dataset import Transform
+from kornia_tidy.files import find_files
 
 HYPERSIM_FOCAL_PX, HYPERSIM_SIZE = 886.81, (768, 1024)  # of all its images as published
 
@@ -156,7 +157,7 @@ def _folder(
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder {root}")
     for image, depth in layouts:
-        if any(root.glob(image)) and any(root.glob(depth)):
+        if any(find_files(root, image)) and any(find_files(root, depth)):
             return made(root, image, depth, transform=transform, **options)
     wanted = " or ".join(f"{image} with {depth}" for image, depth in layouts)
     raise FileNotFoundError(f"{name} is not in {root}: there should be {wanted}")

@@ -12,7 +12,7 @@ from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.data.depth_files import check_depth_options
 from kornia_tidy.data.rgbd import Scene, check_pairing_options, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import read_json
+from kornia_tidy.files import find_files, read_json
 
 ABOUT = "rgbd.json"
 KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m", "doffs_px")
@@ -26,7 +26,7 @@ class RGBDFolder(SceneDataset):
     Args:
         root: the folder.
         image: pattern of the images' paths in the folder. Each ``*`` matches one or more characters other than ``/``;
-            everything else is literal.
+            everything else is literal. Hidden files, whose names begin with a dot, are passed by.
         depth: pattern of the depth files. Image and depth are a pair if every ``*`` matches the same in both.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
         calibration: pattern of the file with the calibration of each pair, see
@@ -210,7 +210,6 @@ def _matches(root: Path, pattern: str) -> dict[tuple[str, ...], str]:
     """Return the files that match a pattern: path relative to the root by the parts that ``*`` matches."""
     parts = pattern.split("*")
     fits = re.compile("([^/]+)".join(map(re.escape, parts)))
-    found = (
-        file.relative_to(root).as_posix() for file in root.glob("*".join(map(glob.escape, parts))) if file.is_file()
-    )
+    pattern = "*".join(map(glob.escape, parts))
+    found = (file.relative_to(root).as_posix() for file in find_files(root, pattern))
     return {match.groups(): match.string for match in map(fits.fullmatch, found) if match}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from itertools import chain
 from pathlib import Path
 
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.files import find_files
 
 ROTATED_BITS = 3  # to the left, in the published files
 
@@ -39,7 +41,9 @@ class SUNRGBD(SceneDataset):
         part = "depth" if raw else "depth_bfx"
         if not self.root.is_dir():
             raise FileNotFoundError(f"there is no folder {self.root}")
-        frames = sorted(Path(at) for at, folders, _ in os.walk(self.root) if {"image", part} <= set(folders))
+        files = chain.from_iterable(find_files(self.root, f"**/{name}/*") for name in ("image", part))
+        folders = sorted({file.parent.parent for file in files})
+        frames = [folder for folder in folders if (folder / "image").is_dir() and (folder / part).is_dir()]
         if not frames:
             raise FileNotFoundError(f"SUN RGB-D is not in {self.root}: a frame is a folder with image/ and {part}/")
         self.pairs = [(_only_file(frame / "image"), _only_file(frame / part)) for frame in frames]
@@ -58,7 +62,7 @@ class SUNRGBD(SceneDataset):
 
 
 def _only_file(folder: Path) -> Path:
-    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    files = list(find_files(folder, "*"))
     if len(files) != 1:
         raise ValueError(f"{folder} should hold one file, found {len(files)}")
     return files[0]

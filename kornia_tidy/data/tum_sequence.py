@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from kornia_tidy.checks import check_positive
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import read_bytes
+from kornia_tidy.files import read_text
 
 SCALE = 1 / 5000  # m; a stored 5000 is one metre
 ASSOCIATIONS = ("associations.txt", "associate.txt")
@@ -62,7 +62,7 @@ class TUMSequence(SceneDataset):
 
 def _lines(path: Path, columns: int) -> list[list[str]]:
     """Return the columns of a list; comments begin with #."""
-    lines = [line.split() for line in read_bytes(path).decode("utf-8", "replace").splitlines()]
+    lines = [line.split() for line in read_text(path, "replace").splitlines()]
     lines = [line for line in lines if line and not line[0].startswith("#")]
     if not lines or any(len(line) < columns for line in lines):
         raise ValueError(f"cannot read {path}: it should list {'pairs of ' if columns == 4 else ''}times and files")

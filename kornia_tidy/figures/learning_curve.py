@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, open_chart, require_matplotlib
+from kornia_tidy.files import read_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -110,10 +111,9 @@ def _decibels(scores: list[dict[str, str]]) -> tuple[str, list[float]]:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    if not path.exists():
-        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    text = read_text(path)
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(), newline="")))
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
     except (csv.Error, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     return [row for row in rows if None not in row and None not in row.values()]

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, get_args, get_type_hints
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.files import parse_json, read_bytes, write_bytes
+from kornia_tidy.files import parse_json, read_bytes, read_text, write_bytes
 from kornia_tidy.tradeoff.conditions import Conditions
 from kornia_tidy.tradeoff.measure import TradeRow, pareto
 from kornia_tidy.tradeoff.sweep_settings import PLAN, PRESET
@@ -86,9 +86,9 @@ def read_csv(path: str | os.PathLike[str]) -> list[TradeRow]:
         FileNotFoundError: if there is no such file.
         ValueError: if its columns or values are not those of a sweep.
     """
-    data = read_bytes(path)
+    text = read_text(path)
     try:
-        reader = csv.DictReader(io.StringIO(data.decode()))
+        reader = csv.DictReader(io.StringIO(text))
         _check_names("the header", dict.fromkeys(reader.fieldnames or ()), set(_columns()))
         return [_row(_typed(cells)) for cells in map(_whole, reader)]
     except (ValueError, csv.Error) as error:

@@ -14,7 +14,7 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from kornia_tidy.files import write_bytes
+from kornia_tidy.files import read_text, write_bytes
 from kornia_tidy.training.pictures import draw_pictures
 from kornia_tidy.training.random_state import own_random_state, random_states, set_random_state
 
@@ -181,10 +181,10 @@ def append_row(path: Path, row: Mapping[str, float]) -> None:
 
 def drop_rows_after(path: Path, step: int) -> None:
     """Drop lines of later steps, and incomplete lines, from a CSV file."""
-    if not path.exists():
+    if not path.exists() or not path.stat().st_size:
         return
     # Of numbers alone, without quotes; csv.reader stops at a block of zeros, as a power cut may leave.
-    heading, *rows = [line.split(",") for line in path.read_text(errors="replace").splitlines()] or [[]]
+    heading, *rows = [line.split(",") for line in read_text(path, "replace").splitlines()] or [[]]
     place = heading.index("step") if "step" in heading else 0
     kept = [row for row in rows if len(row) == len(heading) and row[place].isdigit() and int(row[place]) <= step]
     text = io.StringIO(newline="")

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from kornia_tidy.files import read_bytes, read_json
+from kornia_tidy.files import read_json, read_text
 
 EVALUATION, VALIDATION = "evaluation/summary.json", "validation.csv"
 
@@ -46,8 +46,9 @@ def training_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"cannot read {summary}: it is no summary of an evaluation: {error!r:.80}") from error
     if (validation := folder / VALIDATION).exists():
+        text = read_text(validation)
         try:
-            record["validation"] = list(csv.DictReader(io.StringIO(read_bytes(validation).decode()), strict=True))
+            record["validation"] = list(csv.DictReader(io.StringIO(text), strict=True))
         except (csv.Error, ValueError) as error:
             raise ValueError(f"cannot read {validation}: {error}") from error
     if not record:
