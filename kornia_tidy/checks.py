@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,6 +52,28 @@ def check_part(name: str, value: Any, kind: type | tuple[type, ...], example: st
     """
     if not isinstance(value, kind) or (needs and not hasattr(type(value), needs)):
         raise TypeError(f"{name} must be {example}, got {described(value)}")
+
+
+def unmasked(name: str, value: Any) -> Any:
+    """Return a masked array of NumPy as a plain one, and anything else as it is.
+
+    Raises:
+        ValueError: if a value is masked.
+
+    Example:
+        >>> unmasked("image", np.ma.masked_equal([[3, 9]], 9))
+        Traceback (most recent call last):
+        ValueError: image must be known at every pixel, and 1 of its 2 values are masked: fill them first, such as with \
+image.filled(0)
+    """
+    if not isinstance(value, np.ma.MaskedArray):
+        return value
+    if masked := np.ma.count_masked(value):
+        raise ValueError(
+            f"{name} must be known at every pixel, and {masked} of its {value.size} values are masked: fill them first, "
+            f"such as with {name}.filled(0)"
+        )
+    return value.data
 
 
 def check_generator(generator: Any) -> None:

@@ -17,7 +17,7 @@ from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.holes import fill_holes
 from kornia_tidy.camera.image_types import depth_tensor, image_tensor, like_image
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_part
+from kornia_tidy.checks import check_part, unmasked
 
 try:
     import albumentations as A  # ty: ignore[import-not-found]
@@ -44,12 +44,13 @@ class OpticsTransform(A.DualTransform):
 
     Raises:
         ValueError: if there is no depth, the ``Compose`` does not warp depth as a mask or interpolates masks, or the
-            camera's border is ``"valid"``; as the camera.
+            camera's border is ``"valid"``; if image or depth have masked values; as the camera.
 
     Convention:
         - Give ``additional_targets={"depth": "mask"}`` to ``Compose``: else its flips would flip the image and not the
           depth. That is refused.
-        - Holes of the depth, which are 0, are filled for the capture. The depth that comes out still has them.
+        - Holes of the depth, which are 0, are filled for the capture. The depth that comes out still has them. Give
+          ``Compose`` no masked arrays of NumPy, whose mask it drops, but ``depth.filled(0)``.
         - Noise and draws follow from the seed of ``Compose``. The generator of torch is left as it is.
 
     Example:
@@ -80,6 +81,8 @@ class OpticsTransform(A.DualTransform):
         """Apply the transform; depth that others would not warp is refused whether or not the picture is taken."""
         if "depth" in kwargs and self._additional_targets.get("depth") != "mask":
             raise ValueError(f"depth passes through other transforms unwarped: tell them of it with {_REMEDY}")
+        for name in ("image", "depth"):  # albumentations would drop the mask of a masked array
+            unmasked(name, kwargs.get(name))
         return super().__call__(*args, force_apply=force_apply, **kwargs)
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_part, check_positive, described
+from kornia_tidy.checks import check_choice, check_part, check_positive, described, unmasked
 from kornia_tidy.data.depth_files import fill_holes
 from kornia_tidy.inference.hub import from_pretrained
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
@@ -49,7 +49,8 @@ def simulate(
     Args:
         image: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8 or uint16 in the range of the type,
             or float32 in [0, 1]. Encoded as sRGB, or as the camera's colour space has it.
-        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. 0 and NaN are unknown.
+        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. 0, NaN and what
+            is masked in a masked array are unknown.
         depth_scale: metres per unit of the depth; 0.001 for millimetres. Integers need it; default of floats: 1.
         optics: the camera. Default: ``TiDyOptics`` with five random masks, the same ones in every call.
         color: order of the three channels of image and capture; ``cv2.imread`` gives ``"bgr"``.
@@ -152,6 +153,7 @@ def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) ->
     if not isinstance(image, np.ndarray) or image.dtype not in IMAGES:
         kind = image.dtype if isinstance(image, np.ndarray) else described(image)
         raise TypeError(f"image must be an array of uint8, uint16 or float32, got {kind}")
+    image = unmasked("image", image)
     planes = {2: lambda: image[None, ..., None], 3: lambda: image[None], 4: lambda: image}
     pixels = planes[image.ndim]() if image.ndim in planes else image
     if pixels.ndim != 4 or pixels.shape[3] not in {1, 3} or 0 in pixels.shape[1:]:
@@ -188,6 +190,7 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
     if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "uif":
         kind = depth.dtype if isinstance(depth, np.ndarray) else described(depth)
         raise TypeError(f"depth must be an array of integers or floats, got {kind}")
+    depth = np.ma.filled(depth, 0)
     if depth.ndim not in {2, 3, 4} or 0 in depth.shape[-2:] or (depth.ndim == 4 and depth.shape[3] != 1):
         raise ValueError(f"depth must have shape (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1), got {depth.shape}")
     if depth_scale is None and depth.dtype.kind != "f":
@@ -204,7 +207,8 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
     for i, one in enumerate(known):
         if not one.any():
             raise ValueError(
-                f"depth must be known at one pixel or more, and map {i} of {len(known)} holds 0 or NaN alone"
+                f"depth must be known at one pixel or more, and map {i} of {len(known)} holds 0, NaN or masked "
+                f"pixels alone"
             )
     filled = [fill_holes(one, where) for one, where in zip(metres, known, strict=True)]
     return torch.from_numpy(np.stack(filled)[:, None] if filled else metres[:, None])

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive, described
+from kornia_tidy.checks import check_positive, described, unmasked
 
 
 def image_tensor(image: Any) -> Tensor:
@@ -24,7 +24,7 @@ def image_tensor(image: Any) -> Tensor:
 
     Raises:
         TypeError: if it is none of these, or holds other numbers.
-        ValueError: if an array has another number of axes, or a PIL image another mode.
+        ValueError: if an array has another number of axes or masked values, or a PIL image another mode.
 
     Example:
         >>> image_tensor(np.full((4, 5, 3), 51, np.uint8))[:, 0, 0]
@@ -33,7 +33,7 @@ def image_tensor(image: Any) -> Tensor:
     if type(image) is not Tensor and isinstance(image, Tensor):
         image = image.as_subclass(Tensor)  # MONAI's MetaTensor lacks operators that a capture needs
     if not isinstance(image, Tensor):
-        image = torch.from_numpy(_planes(_array("image", image)))
+        image = torch.from_numpy(_planes(unmasked("image", _array("image", image))))
     if image.is_floating_point():
         return image
     if image.dtype not in (torch.uint8, torch.uint16):
@@ -72,7 +72,7 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
         scale: metres in one stored unit; 0.001 for millimetres.
 
     Returns:
-        Float32, or float64 where it came so.
+        Float32, or float64 where it came so; 0 where a masked array is masked.
 
     Raises:
         TypeError: if it is none of these.
@@ -86,7 +86,7 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
     if type(depth) is not Tensor and isinstance(depth, Tensor):
         depth = depth.as_subclass(Tensor)
     if not isinstance(depth, Tensor):
-        depth = torch.from_numpy(_planes(_array("depth", depth)))
+        depth = torch.from_numpy(_planes(np.ma.filled(_array("depth", depth), 0)))
         if depth.shape[-3] != 1:
             raise ValueError(f"depth must have one channel, got {depth.shape[-3]}")
     if depth.is_complex() or depth.dtype == torch.bool:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-from kornia_tidy.checks import check_finite, check_float_tensor
+from kornia_tidy.checks import check_finite, check_float_tensor, unmasked
 
 _ROWS = 256  # converted at a time, so that the float64 copy stays small
 
@@ -25,7 +25,7 @@ def from_opencv(picture: NDArray[Any]) -> Tensor:
 
     Raises:
         TypeError: if it is no array, or of another data type.
-        ValueError: if it is of another shape.
+        ValueError: if it is of another shape, or a masked array with masked values.
 
     Example:
         >>> from_opencv(np.array([[[0, 51, 255]]], np.uint8))
@@ -38,6 +38,7 @@ def from_opencv(picture: NDArray[Any]) -> Tensor:
     if not isinstance(picture, np.ndarray) or picture.dtype not in (np.uint8, np.uint16):
         kind = picture.dtype if isinstance(picture, np.ndarray) else type(picture).__name__
         raise TypeError(f"a picture of OpenCV's must be an array of uint8 or uint16, got {kind}")
+    picture = unmasked("picture", picture)
     planes = picture[..., None] if picture.ndim == 2 else picture
     if planes.ndim != 3 or planes.shape[2] not in {1, 3, 4} or 0 in planes.shape:
         raise ValueError(f"a picture of OpenCV's must have shape (H, W), (H, W, 3) or (H, W, 4), got {picture.shape}")

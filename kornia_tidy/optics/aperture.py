@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.checks import check_choice, check_positive, unmasked
 
 Edges = Literal["binary", "area"]
 
@@ -154,7 +154,7 @@ def check_aperture(aperture: Any, size: int) -> Tensor:
         tensor([[1., 0.],
                 [1., 1.]], dtype=torch.float64)
     """
-    aperture = torch.as_tensor(aperture)
+    aperture = torch.as_tensor(unmasked("aperture", aperture))
     if aperture.is_complex():
         raise TypeError(f"aperture must be a real amplitude (its phase belongs to the mask), got {aperture.dtype}")
     if tuple(aperture.shape) != (size, size):

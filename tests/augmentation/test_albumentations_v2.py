@@ -124,6 +124,13 @@ class TestOpticsTransform(BaseTester):
         with pytest.raises(ValueError, match="got a Compose with another mask_interpolation"):
             chain(**arrays())
 
+    @pytest.mark.parametrize("name", ["image", "depth"])
+    def test_exception_masked_values(self, name):
+        given = arrays()
+        given[name] = np.ma.masked_greater(given[name], np.median(given[name]))
+        with pytest.raises(ValueError, match=rf"{name} must be known .* masked: fill them .* {name}\.filled\(0\)"):
+            A.Compose([OpticsTransform(camera())], **DEPTH)(**given)
+
     def test_exception_no_depth(self):
         with pytest.raises(ValueError, match=r"missing keys: {'depth'}"):
             A.Compose([OpticsTransform(camera())], **DEPTH)(image=arrays()["image"])

@@ -193,6 +193,29 @@ class TestConversion(BaseTester):
         assert found[3, 3] in depth[0, 2:5, 2:5]
         assert found[0, 0] in depth[0, :2, :2]
 
+    @pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float32, np.float64])
+    @pytest.mark.parametrize("beneath", [0, 9, 65000, np.nan, -1, 1e20])
+    def test_feature_masked_depth_is_a_hole_whatever_lies_beneath_the_mask(self, kind, beneath):
+        """As rasterio and netCDF4 return unknown values; the fill value is another number again."""
+        if not np.issubdtype(kind, np.floating) and not 0 <= beneath <= 65000:
+            beneath = np.iinfo(kind).max
+        values = np.array([[500, 0, 2000], [500, 500, 2000]], np.float64)
+        values[0, 1] = beneath
+        depth = np.ma.masked_array(values.astype(kind), mask=[[0, 1, 0], [0, 0, 0]], fill_value=777)
+        expected = torch.tensor([[[[0.5, 0.5, 2.0], [0.5, 0.5, 2.0]]]])
+        self.assert_close(depth_to_tensor(depth, 0.001), expected)
+        self.assert_close(depth_to_tensor(np.ma.masked_array(expected[0, 0].numpy())), expected)  # nothing is masked
+        with pytest.raises(ValueError, match="map 0 of 1 holds 0, NaN or masked pixels alone"):
+            depth_to_tensor(np.ma.masked_all((2, 3), kind), 0.001)
+
+    def test_feature_masked_images_are_divided_whole_or_refused(self):
+        image = np.ma.masked_array(picture("uint8", 4, 5, 3))
+        assert torch.equal(to_tensor(image), to_tensor(image.data))
+        image[1, 2] = np.ma.masked
+        for call in (to_tensor, kornia_tidy.reconstruct, lambda image: kornia_tidy.simulate(image, np.ones((4, 5)))):
+            with pytest.raises(ValueError, match=r"image must be known at every pixel, and 3 of its 60 values are"):
+                call(image)
+
     def test_feature_the_names_are_there_and_others_are_not(self):
         assert {"simulate", "reconstruct"} <= set(kornia_tidy.__all__)
         with pytest.raises(AttributeError, match="has no attribute 'simulat'"):

@@ -73,6 +73,13 @@ class TestImageTypes(BaseTester):
         assert cropped_image(image, 0) is image
         assert image_tensor(cropped_image(image, 2)).shape[-2:] == (3, 5)
 
+    def test_feature_masked_pixels_of_depth_are_holes_and_those_of_images_are_refused(self):
+        depth = np.ma.masked_array(np.array([[500, 999999]], np.int32), mask=[[0, 1]], fill_value=999999)
+        self.assert_close(depth_tensor(depth, 0.001), torch.tensor([[[0.5, 0.0]]]))
+        assert torch.equal(image_tensor(np.ma.masked_array(codes())), image_tensor(codes()))
+        with pytest.raises(ValueError, match=r"image must be known .* 1 of its 2 values are masked: fill them first"):
+            image_tensor(np.ma.masked_equal(np.array([[3, 9]], np.uint8), 9))
+
     def test_exception(self):
         with pytest.raises(TypeError, match=r"image must be a tensor, a NumPy array or a PIL image, got 'a\.png'"):
             image_tensor("a.png")

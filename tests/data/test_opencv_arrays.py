@@ -48,6 +48,8 @@ class TestOpenCVArrays(BaseTester):
         assert image.tolist() == [[[-1.0, 0.5, 3.0]]]
 
     def test_exception_names_what_is_wrong(self):
+        with pytest.raises(ValueError, match="picture must be known at every pixel, and 1 of its 4 values are masked"):
+            from_opencv(np.ma.masked_equal(np.arange(4, dtype=np.uint8).reshape(2, 2), 3))
         with pytest.raises(TypeError, match="must be an array of uint8 or uint16, got float32"):
             from_opencv(np.zeros((2, 2, 3), np.float32))
         with pytest.raises(TypeError, match="must be an array of uint8 or uint16, got list"):
