@@ -63,15 +63,15 @@ def unmasked(name: str, value: Any) -> Any:
     Example:
         >>> unmasked("image", np.ma.masked_equal([[3, 9]], 9))
         Traceback (most recent call last):
-        ValueError: image must be known at every pixel, and 1 of its 2 values are masked: fill them first, such as with \
-image.filled(0)
+        ValueError: image must be known at every pixel, and 1 of its 2 values are masked: fill them first, such as \
+with image.filled(0)
     """
     if not isinstance(value, np.ma.MaskedArray):
         return value
     if masked := np.ma.count_masked(value):
         raise ValueError(
-            f"{name} must be known at every pixel, and {masked} of its {value.size} values are masked: fill them first, "
-            f"such as with {name}.filled(0)"
+            f"{name} must be known at every pixel, and {masked} of its {value.size} values are masked: fill them "
+            f"first, such as with {name}.filled(0)"
         )
     return value.data
 

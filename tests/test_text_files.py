@@ -101,7 +101,7 @@ def _noise(folder):
     (folder / "noise.json").write_text(json.dumps({"format": "nothing"}))
 
     def sentence():
-        with pytest.raises(ValueError, match="noise.json") as told:
+        with pytest.raises(ValueError, match=r"noise\.json") as told:
             read_noise(folder / "noise.json")
         return str(told.value)
 

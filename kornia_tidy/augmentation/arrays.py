@@ -20,6 +20,7 @@ from kornia_tidy.inference.light_head import LightHead, reconstruct_light
 from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.units import check_depth_scale
 
 Color = Literal["bgr", "rgb"]
 IMAGES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -51,7 +52,8 @@ def simulate(
             or float32 in [0, 1]. Encoded as sRGB, or as the camera's colour space has it.
         depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. 0, NaN and what
             is masked in a masked array are unknown.
-        depth_scale: metres per unit of the depth; 0.001 for millimetres. Integers need it; default of floats: 1.
+        depth_scale: metres per unit of the depth; 0.001 for millimetres, where Open3D and ROS say 1000. Integers need
+            it; default of floats: 1.
         optics: the camera. Default: ``TiDyOptics`` with five random masks, the same ones in every call.
         color: order of the three channels of image and capture; ``cv2.imread`` gives ``"bgr"``.
         seed: of the sensor's noise. Default: drawn from torch's global generator.
@@ -61,8 +63,8 @@ def simulate(
 
     Raises:
         TypeError: if an argument is no array, or of another data type.
-        ValueError: if shapes do not fit, a value is out of range, no depth is known, or integers come without
-            ``depth_scale``.
+        ValueError: if shapes do not fit, a value is out of range, no depth is known, integers come without
+            ``depth_scale``, it is units per metre, or the image is a masked array with masked values.
 
     Convention:
         - Unknown depth is taken from the nearest known pixel.
@@ -77,7 +79,7 @@ def simulate(
     """
     optics = _default_optics() if optics is None else optics
     check_part("optics", optics, TiDyOptics, "a TiDyOptics")
-    pixels = to_tensor(image, color, light=optics.color_space == "linear")
+    pixels = to_tensor(unmasked("image", image), color, light=optics.color_space == "linear")
     metres = depth_to_tensor(depth, depth_scale)
     if metres.shape[0] != pixels.shape[0] or metres.shape[-2:] != pixels.shape[-2:]:
         raise ValueError(f"depth must have the rows, columns and batch of the image {image.shape}, got {depth.shape}")
@@ -119,7 +121,7 @@ def reconstruct(
         >>> image.shape, image.dtype, depth.shape, depth.dtype
         ((32, 48, 3), dtype('uint16'), (32, 48), dtype('float32'))
     """
-    pixels = to_tensor(capture, color)
+    pixels = to_tensor(unmasked("capture", capture), color)
     head = _light_head(system)
     light = pixels if linear else rgb_to_linear_rgb(pixels.expand(-1, 3, -1, -1))
     found = [reconstruct_light(head, one, memory_budget=memory_budget) for one in light]
@@ -153,7 +155,7 @@ def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) ->
     if not isinstance(image, np.ndarray) or image.dtype not in IMAGES:
         kind = image.dtype if isinstance(image, np.ndarray) else described(image)
         raise TypeError(f"image must be an array of uint8, uint16 or float32, got {kind}")
-    image = unmasked("image", image)
+    image = np.asarray(image)  # of a masked array, whose masked values a division in place would pass by
     planes = {2: lambda: image[None, ..., None], 3: lambda: image[None], 4: lambda: image}
     pixels = planes[image.ndim]() if image.ndim in planes else image
     if pixels.ndim != 4 or pixels.shape[3] not in {1, 3} or 0 in pixels.shape[1:]:
@@ -195,14 +197,16 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
         raise ValueError(f"depth must have shape (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1), got {depth.shape}")
     if depth_scale is None and depth.dtype.kind != "f":
         raise ValueError(f"a depth of {depth.dtype} needs depth_scale, metres per unit, such as 0.001 for millimetres")
-    check_positive("depth_scale", 1.0 if depth_scale is None else depth_scale, "metres per unit")
+    scale = 1.0 if depth_scale is None else depth_scale
+    check_positive("depth_scale", scale, "metres per unit")
     if depth.ndim == 2 or (depth.ndim == 3 and depth.shape[2] == 1):
         maps = depth.reshape(1, *depth.shape[:2])
     else:
         maps = depth.reshape(depth.shape[:3])
     if (bad := maps < 0).any():
         raise ValueError(f"depth must not be negative, got {maps[bad][0]}")
-    metres = (maps.astype(np.float64) * (1.0 if depth_scale is None else depth_scale)).astype(np.float32)
+    check_depth_scale(scale, maps)
+    metres = (maps.astype(np.float64) * scale).astype(np.float32)
     known = metres > 0  # False for NaN too
     for i, one in enumerate(known):
         if not one.any():

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_positive, described, unmasked
+from kornia_tidy.optics.units import check_depth_scale
 
 
 def image_tensor(image: Any) -> Tensor:
@@ -76,7 +77,8 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
 
     Raises:
         TypeError: if it is none of these.
-        ValueError: if an array has another number of axes or several channels, or the scale is not positive.
+        ValueError: if an array has another number of axes or several channels, or the scale is not positive or
+            is units per metre.
 
     Example:
         >>> depth_tensor(np.array([[500, 2000]], np.uint16), 0.001)
@@ -92,6 +94,8 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
     if depth.is_complex() or depth.dtype == torch.bool:
         raise TypeError(f"depth must hold numbers, got {depth.dtype}")
     wide = depth if depth.is_floating_point() else depth.to(torch.float32)
+    if scale > 1:
+        check_depth_scale(scale, wide.detach().double().cpu().numpy())
     return wide if scale == 1 else wide.to(torch.promote_types(wide.dtype, torch.float32)) * scale
 
 

@@ -30,7 +30,8 @@ def add_depth_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar="S",
-        help="metres (or pixels of disparity) per stored unit; 0.001 for a 16-bit file in millimetres (default: 1)",
+        help="metres (or pixels of disparity) per stored unit; 0.001 for a 16-bit file in millimetres, 0.0002 "
+        "for TUM's 5000 units per metre (default: 1)",
     )
     group.add_argument(
         "--depth-kind", choices=("depth", "disparity"), default="depth", help="what is stored (default: depth)"

@@ -18,7 +18,7 @@ from kornia_tidy.data.metadata import with_text
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
-from kornia_tidy.optics.units import tell_once
+from kornia_tidy.optics.units import check_depth_scale, tell_once
 
 UNKNOWN = 65535  # the largest 16-bit number, by which many data sets mark unknown depth
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
@@ -51,7 +51,8 @@ def read_depth(
 
     Args:
         path: a PNG, TIFF, PGM, PFM, NPY or HDF5 file with one channel; an NPY file is (H, W) and is never unpickled.
-        scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres.
+        scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres, where other programs say 1000
+            units per metre.
         kind: quantity that is stored.
         invalid: stored values that mean *unknown*, besides those under Convention.
         focal_px: f, focal length in pixels; disparity and distance only.
@@ -65,7 +66,8 @@ def read_depth(
     Raises:
         FileNotFoundError: if there is no file.
         ValueError: if the file is no image, cut short or damaged, or has several channels or no valid pixel; if
-            disparity comes without calibration or depth with one; or if a number is not positive.
+            disparity comes without calibration or depth with one; if a number is not positive; or if the scale is
+            units per metre.
 
     Convention:
         - Always unknown: NaN, a stored integer 0 (as Kinect, KITTI and Middlebury mean it), depth of 0 or less, and
@@ -101,6 +103,8 @@ def read_depth(
         known &= ~file.unknown
     for value in invalid:
         known &= stored != value
+    if kind != "disparity":
+        check_depth_scale(scale, stored[known])
     metres = stored.astype(np.float64) * scale
     if kind == "distance" and focal_px is not None:
         metres *= ray_cosine(metres.shape, focal_px)

@@ -210,11 +210,16 @@ class TestConversion(BaseTester):
 
     def test_feature_masked_images_are_divided_whole_or_refused(self):
         image = np.ma.masked_array(picture("uint8", 4, 5, 3))
-        assert torch.equal(to_tensor(image), to_tensor(image.data))
-        image[1, 2] = np.ma.masked
-        for call in (to_tensor, kornia_tidy.reconstruct, lambda image: kornia_tidy.simulate(image, np.ones((4, 5)))):
-            with pytest.raises(ValueError, match=r"image must be known at every pixel, and 3 of its 60 values are"):
-                call(image)
+        plain, depth = to_tensor(image.data), np.ones((4, 5))
+        assert torch.equal(to_tensor(image), plain)
+        image.mask = np.indices(image.shape)[1] == 2
+        assert torch.equal(to_tensor(image), plain)
+        for name, call in (
+            ("image", lambda: kornia_tidy.simulate(image, depth)),
+            ("capture", lambda: kornia_tidy.reconstruct(image)),
+        ):
+            with pytest.raises(ValueError, match=rf"{name} must be known at every pixel, and 12 of its 60 values are"):
+                call()
 
     def test_feature_the_names_are_there_and_others_are_not(self):
         assert {"simulate", "reconstruct"} <= set(kornia_tidy.__all__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import warnings
 
@@ -10,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from kornia_tidy import (
@@ -22,8 +25,11 @@ from kornia_tidy import (
     Spectrum,
     ThinLensCamera,
     TiDyOptics,
+    simulate,
 )
+from kornia_tidy.augmentation.arrays import depth_to_tensor
 from kornia_tidy.camera.burst import burst
+from kornia_tidy.camera.image_types import depth_tensor
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.cli import main
 from kornia_tidy.data import DeadLeaves
@@ -117,6 +123,88 @@ class TestDepth(BaseTester):
         told = capsys.readouterr().err.splitlines()
         assert [line for line in told if "--depth-scale 0.001" in line and line.startswith("kornia-tidy: warning: ")]
         assert not any(".py" in line for line in told)
+
+
+class TestDepthScale(BaseTester):
+    """Units per metre, as Open3D, TUM RGB-D and ROS give them, where metres per unit are asked for."""
+
+    READERS = (
+        lambda stored, scale, folder: depth_to_tensor(stored, scale)[0],
+        lambda stored, scale, folder: depth_tensor(stored, scale),
+        lambda stored, scale, folder: depth_tensor(torch.from_numpy(stored)[None], scale),
+        lambda stored, scale, folder: read_depth(saved(stored, folder), scale).depth,
+    )
+
+    @pytest.mark.parametrize("read", READERS)
+    @settings(max_examples=40)
+    @given(
+        st.sampled_from([100, 256, 1000, 5000]) | st.floats(50, 20_000),
+        st.floats(0.3, 20),
+        st.floats(1.2, 10),
+        st.sampled_from(["<u2", "<i4", "<f4", "<f8"]),
+    )
+    def test_property_whole_numbers_are_refused_and_read_by_the_inverse(
+        self, tmp_path_factory, read, scale, near, span, kind
+    ):
+        metres = near * np.geomspace(1, span, 48).reshape(6, 8)
+        stored = np.rint(metres * scale)
+        stored = (stored.clip(1, 65534) if kind == "<u2" else stored).astype(kind)
+        stored[2, 3] = 0  # a hole, which is not the nearest pixel
+        folder = tmp_path_factory.getbasetemp()
+        with pytest.raises(ValueError, match=re.escape(f"units in a metre give {1 / scale:.6g}, not {scale:g}")):
+            read(stored, scale, folder)
+        found = read(stored, 1 / scale, folder).numpy()[0]
+        np.testing.assert_allclose(found[stored > 0], stored[stored > 0] / scale, rtol=1e-6)
+
+    @pytest.mark.parametrize("read", READERS)
+    @pytest.mark.parametrize(
+        ("stored", "scale"),
+        [
+            (np.linspace(2000.3, 9000, 48, dtype=np.float32), 1.0),  # a landscape in metres
+            (np.linspace(0.31, 40, 48, dtype=np.float32), 1000.0),  # in kilometres
+            (np.linspace(15.0, 255, 48).astype(np.uint8), 10.0),  # eight bits to 2550 m
+            (np.linspace(300, 60_000, 48).astype(np.uint16), 1.0),  # metres, far
+            (np.full(48, np.inf, np.float32), 5.0),
+        ],
+    )
+    def test_feature_far_scenes_are_no_mistake(self, read, stored, scale, tmp_path):
+        found = read(stored.reshape(6, 8), scale, tmp_path).numpy()[0]
+        np.testing.assert_allclose(found, stored.reshape(6, 8) * np.float64(scale), rtol=1e-6)
+
+    @pytest.mark.parametrize("scale", [1.0, 1000.0, 5000.0])
+    def test_feature_each_unit_that_a_caller_may_mean_is_told(self, scale):
+        """Float metres with fractions, which look like kilometres, are told by the camera."""
+        image, metres = np.zeros((48, 64, 3), np.uint8), np.random.default_rng(0).uniform(0.5, 3, (48, 64))
+        for depth in ((1000 * metres).astype(np.uint16), *([metres] if scale == 1000 else [])):
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                try:
+                    simulate(image, depth, scale, optics=camera(sensor=None))
+                except ValueError as error:
+                    told.append(error)
+            assert len(told) == 1
+
+    @pytest.mark.parametrize(
+        ("command", "output"),
+        [
+            ("simulate IN", "out.png"),
+            ("raw simulate --image IN", "out.dng"),
+            ("systems --image IN", "out.png"),
+            ("trade --image IN", "out"),
+        ],
+    )
+    def test_exception_each_command_refuses_it_in_a_line(self, command, output, tmp_path, capsys):
+        cv2.imwrite(str(tmp_path / "rgb.png"), np.full((80, 80, 3), 90, np.uint8))
+        cv2.imwrite(str(tmp_path / "depth.png"), np.full((80, 80), 1100, np.uint16))
+        words = [*command.replace("IN", str(tmp_path / "rgb.png")).split(), "--depth", str(tmp_path / "depth.png")]
+        assert main([*words, "--depth-scale", "1000", "-o", str(tmp_path / output)]) == 2
+        assert not (tmp_path / output).is_file()
+        assert "1000 units in a metre give 0.001, not 1000" in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def saved(stored, folder):
+    np.save(folder / "depth.npy", stored)
+    return folder / "depth.npy"
 
 
 class TestImage(BaseTester):
