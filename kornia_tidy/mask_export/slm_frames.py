@@ -110,6 +110,29 @@ class SLMFrames:
         ascending = self.level_phases.remainder(_WAVE).sort().values
         return float(torch.cat([ascending, ascending[:1] + _WAVE]).diff().max()) / 2
 
+    def phase_error(self, wanted: Tensor, levels: Tensor) -> tuple[float, float]:
+        """Return how far the phase shown by a panel is from the wanted phase of the masks.
+
+        Args:
+            wanted: (K, rows, columns) radians at the working wavelength.
+            levels: (2^b,) radians of the panel's grey levels, from its data or its measurement.
+
+        Returns:
+            The largest difference in radians, and the largest in units of half the distance to the next phase of a
+            level, modulo 2π. A phase that no other level shows better is at 1 or less.
+
+        Example:
+            >>> wanted = torch.tensor([[[0.0, 3.2, 6.2]]]).double()
+            >>> frames = SLMFrames.of(wanted * 530e-9 / math.pi, GreyLevels(2))
+            >>> [round(number, 2) for number in frames.phase_error(wanted, GreyLevels(2).levels)]
+            [0.08, 0.11]
+        """
+        phases, place = levels.double().remainder(_WAVE).unique(return_inverse=True)
+        above = torch.cat([phases, phases[:1] + _WAVE]).diff()
+        half_gap = torch.maximum(above, above.roll(1))[place][self.grey] / 2
+        apart = (levels.double()[self.grey] + _WAVE * self.turns.double() - wanted.double()).abs()
+        return float(apart.max()), float((apart / (half_gap + 1e-9)).max())
+
 
 def checked_heights(heights: Tensor) -> Tensor:
     """Check heights and return them as float64 on the CPU.

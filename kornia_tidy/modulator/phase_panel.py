@@ -9,7 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.checks import check_positive, unmasked
+
+_SLACK = 1e-3  # rad beyond 0 to 4 pi, by rounding in a file
 
 
 def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
@@ -33,6 +35,57 @@ def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
         raise ValueError(f"bits must be a whole number from 1 to 10, got {bits}")
     check_positive("phase_range", phase_range, "radians")
     return torch.arange(2**bits, dtype=torch.float64) * (phase_range / 2**bits)
+
+
+def check_response(response: Sequence[float] | Tensor, bits: int, lines: Sequence[int] | None = None) -> Tensor:
+    """Check the measured phases of a panel's grey levels.
+
+    Args:
+        response: radians of the grey levels 0 to 2^b - 1: from 0 to 4π, rising or falling throughout.
+        bits: bits b of the panel.
+        lines: of the file that has them, for the message.
+
+    Returns:
+        The phases, (2^b,) float64.
+
+    Raises:
+        ValueError: if there is not one phase for each level, or they leave 0 to 4π by more than 1 mrad, are equal, or
+            rise and fall.
+
+    Convention:
+        A constant may be added to all phases: it changes no PSF.
+
+    Example:
+        >>> check_response([0.0, 90.0, 180.0, 270.0], bits=2)
+        Traceback (most recent call last):
+        ValueError: a measured response must lie from 0 to 4 pi rad, got 90 at level 1: multiply degrees by pi / 180, \
+and do not give drive values for phases
+    """
+    curve = torch.as_tensor(unmasked("response", response), dtype=torch.float64).detach().cpu()
+    if curve.shape != (2**bits,):
+        got = len(curve) if curve.ndim == 1 else f"the shape {tuple(curve.shape)}"
+        raise ValueError(
+            f"a measured response must have {2**bits} phases, one for each level of {bits} bits, got {got}"
+        )
+    steps = curve.diff() * (1 if curve[-1] >= curve[0] else -1)
+    outside = ~((curve >= -_SLACK) & (curve <= 4 * math.pi + _SLACK))  # True for NaN
+    back = torch.cat([steps.new_zeros(1, dtype=torch.bool), steps < 0])
+    level = int((outside if bool(outside.any()) else back).long().argmax())
+    got = f"got {float(curve[level]):.6g} at level {level}" + (f" (line {lines[level]})" if lines else "")
+    if bool(outside.any()):
+        if curve[level] < 0:
+            remedy = "add a constant to all phases, which changes no PSF"
+        else:
+            remedy = "multiply degrees by pi / 180, and do not give drive values for phases"
+        raise ValueError(f"a measured response must lie from 0 to 4 pi rad, {got}: {remedy}")
+    if bool(back.any()):
+        raise ValueError(
+            f"a measured response must rise or fall throughout, {got} after {float(curve[level - 1]):.6g}: smooth "
+            f"noise, such as by a fit or np.maximum.accumulate, and undo wraps by np.unwrap"
+        )
+    if curve[-1] == curve[0]:
+        raise ValueError(f"a measured response must rise or fall, got {float(curve[0]):.6g} at every level")
+    return curve
 
 
 def nearest_level(phase: Tensor, levels: Tensor) -> Tensor:
@@ -89,14 +142,14 @@ class GreyLevels(nn.Module):
         bits: bits b of the grey levels, 1 to 10.
         phase_range: phase :math:`\Phi` in radians at 530 nm that the grey levels span. With less than 2π a phase out
             of range gives the nearer end.
-        response: measured phase in radians at 530 nm, at grey levels evenly spaced from 0 to 2^b - 1 and linear
-            between; it replaces ``phase_range``. The frames are assumed to be computed with this curve.
+        response: measured phase of each grey level in radians at 530 nm, see :func:`check_response`; it replaces
+            ``phase_range``. The frames are assumed to be computed with this curve.
 
     Shape:
         - input and output: (K, N, N) radians.
 
     Raises:
-        ValueError: if bits or range are out of range, or a response has fewer than two samples or one not finite.
+        ValueError: if bits or range are out of range, or as :func:`check_response`.
 
     Convention:
         - The phase shown is the level's own, without the multiples of 2π that were removed from the wanted phase.
@@ -109,8 +162,8 @@ class GreyLevels(nn.Module):
         >>> GreyLevels(2)(torch.tensor([[[0.1, 1.5], [3.0, 6.2]]])) / math.pi
         tensor([[[0.0000, 0.5000],
                  [1.0000, 0.0000]]])
-        >>> GreyLevels(8, response=(0.0, 1.0, 2.5, 6.6)).levels.shape
-        torch.Size([256])
+        >>> GreyLevels(2, response=(0.0, 1.0, 2.5, 6.6))
+        GreyLevels(2 bits, 0.00 to 6.60 rad at 530 nm)
     """
 
     levels: Tensor
@@ -122,15 +175,8 @@ class GreyLevels(nn.Module):
         self.bits, self.phase_range, self.response = bits, phase_range, None
         levels = level_phases(bits, phase_range)
         if response is not None:
-            curve = torch.as_tensor(response, dtype=torch.float64)
-            if curve.ndim != 1 or len(curve) < 2 or not bool(torch.isfinite(curve).all()):
-                odd = curve[~curve.isfinite()].flatten()
-                got = odd[0].item() if len(odd) else f"the shape {tuple(curve.shape)}"
-                raise ValueError(f"a measured response must have at least two finite phases in radians, got {got}")
-            position = torch.linspace(0, len(curve) - 1, len(levels), dtype=torch.float64)
-            lower = position.long().clamp(max=len(curve) - 2)
-            levels = torch.lerp(curve[lower], curve[lower + 1], position - lower)
-            self.response = tuple(curve.tolist())
+            levels = check_response(response, bits)
+            self.response = tuple(levels.tolist())
         # Not a buffer, because module.to(float16) must not round the phases of the panel.
         self.levels = levels
 
