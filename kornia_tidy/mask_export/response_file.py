@@ -148,7 +148,7 @@ def _punctuation(rows: Sequence[str], header: Sequence[_Row]) -> tuple[str, str]
     pairs = [row.partition(",") for row in rows]
     levels = sorted(float(first or 0) for first, _, _ in pairs) == list(range(len(rows)))
     degrees = all(re.fullmatch(r"0|[1-9]\d{0,2}", second) for _, _, second in pairs)
-    columns = levels and (degrees or any(re.search(_LEVEL, row.text) for row in header))
+    columns = levels and (degrees or any(re.search(f"({_LEVEL}).*,", row.text) for row in header))
     return (",", ".") if columns else (r"\s+", ",")
 
 

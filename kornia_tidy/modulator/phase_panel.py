@@ -73,10 +73,9 @@ and do not give drive values for phases
     level = int((outside if bool(outside.any()) else back).long().argmax())
     got = f"got {float(curve[level]):.6g} at level {level}" + (f" (line {lines[level]})" if lines else "")
     if bool(outside.any()):
-        if curve[level] < 0:
-            remedy = "add a constant to all phases, which changes no PSF"
-        else:
-            remedy = "multiply degrees by pi / 180, and do not give drive values for phases"
+        remedy = "multiply degrees by pi / 180, and do not give drive values for phases"
+        if not curve[level] > 0:
+            remedy = "add a constant to all phases, which changes no PSF, and interpolate unknown ones"
         raise ValueError(f"a measured response must lie from 0 to 4 pi rad, {got}: {remedy}")
     if bool(back.any()):
         raise ValueError(

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from kornia_tidy import LearnableDwellTimes, PixelwiseMask, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.mask_export import PanelPlacement, SLMFrames, read_slm_frames
+from kornia_tidy.mask_export import PanelPlacement, SLMFrames, read_slm_frames, slm_frames
 from kornia_tidy.modulator import GreyLevels
 from kornia_tidy.optics import NOA61
 from tests.base import BaseTester
@@ -47,7 +47,12 @@ class TestMasks(BaseTester):
     def test_feature_out_and_back(self, folder, capsys):
         assert run("export heights.npy -o slm --panel 90x60 --bits 10 --suffix .tif --rotate 90 --flip up-down") == 0
         told = capsys.readouterr().out
-        for words in ("90 x 60 px, 8 a mask pixel", "2 of 10 bits", "read back, heights differ by up to 0.5", "wrote"):
+        for words in (
+            "90 x 60 px, 8 a mask pixel",
+            "2 of 10 bits",
+            "read back, phase differs by up to 0.003",
+            "wrote",
+        ):
             assert words in told
         assert run("import slm -o back.npy") == 0
         assert np.abs(np.load("back.npy") - np.load("heights.npy")).max() <= 1060e-9 / 2**11 * 1.0001
@@ -58,19 +63,30 @@ class TestMasks(BaseTester):
         assert run("import slm") == 0
 
     def test_feature_every_option_reaches_the_panel(self, folder):
-        (folder / "lut.txt").write_text("0, 1.5\n3.5 7.0\n")
+        curve = 7 * np.linspace(0, 1, 512) ** 1.2
+        (folder / "lut.txt").write_text("Level;Phase\n" + "".join(f"{g};{p!r}\n" for g, p in enumerate(curve.tolist())))
         options = (
             "--bits 9 --wavelength 633e-9 --response lut.txt --panel 100x80 --panel-pitch 1e-5 --pupil-radius 2e-4 "
             "--offset 3 -5 --flip left-right --rotate 270 --material noa61"
         )
         assert run(f"export heights.npy -o slm {options}") == 0
         heights = torch.from_numpy(np.load("heights.npy"))
-        frames = SLMFrames.of(heights, GreyLevels(9, response=(0, 1.5, 3.5, 7)), 633e-9, NOA61)
+        frames = SLMFrames.of(heights, GreyLevels(9, response=curve), 633e-9, NOA61)
         expected = PanelPlacement((80, 100), 1e-5, 2e-4, (3, -5), "left-right", 270).place(frames.grey, 0)
         for k in range(2):
             picture = cv2.imread(f"slm/frame_00{k}.png", cv2.IMREAD_UNCHANGED)
             np.testing.assert_array_equal(picture, expected[k].numpy())
         assert torch.equal(read_slm_frames("slm").heights(), frames.heights())
+
+    @pytest.mark.parametrize("panel", ["--phase-range 3.1416", "--response lut.txt"])
+    def test_exception_frames_that_show_a_wrong_phase(self, panel, folder, capsys, monkeypatch):
+        """A grey level too many, which is less than the widest gap between phases."""
+        (folder / "lut.txt").write_text(" ".join(map(str, 0.5 + 3 * np.linspace(0, 1, 256) ** 2)))
+        assert run(f"export heights.npy -o right --panel 90x60 {panel}") == 0
+        nearest = slm_frames.nearest_level
+        monkeypatch.setattr(slm_frames, "nearest_level", lambda *given: (nearest(*given) + 1).clamp(max=255))
+        assert run(f"export heights.npy -o wrong --panel 90x60 {panel}") == 2
+        assert "wrong does not hold the masks: phase differs by " in capsys.readouterr().err
 
     def test_feature_timing_of_learnt_and_given_dwell_times(self, folder):
         assert run("export camera.safetensors -o learnt --panel 92x92 --exposure 0.2") == 0
@@ -106,10 +122,23 @@ class TestMasks(BaseTester):
             ("export heights.npy -o slm --panel 5x5", "must have pixels at least as large as the panel's"),
             ("export heights.npy -o slm --pupil-radius 1", "the mask must fit on the panel"),
             ("export heights.npy -o slm --phase-range 0", "phase_range must be positive"),
-            ("export heights.npy -o slm --response heights.npy", "cannot read heights.npy: a response is phases"),
-            ("export heights.npy -o slm --response nan.txt", "have at least two finite phases in radians, got nan"),
-            ("export heights.npy -o slm --response one.txt", "two finite phases in radians, got the shape (1,)"),
-            ("export heights.npy -o slm --response long.txt", "cannot read long.txt: a response is phases in radians"),
+            (
+                "export heights.npy -o slm --response heights.npy",
+                "cannot read heights.npy: a response has one phase for",
+            ),
+            ("export heights.npy -o slm --response nan.txt", "cannot read nan.txt: a response has one phase for each"),
+            (
+                "export heights.npy -o slm --response one.txt",
+                "must have 256 phases, one for each level of 8 bits, got 1",
+            ),
+            (
+                "export heights.npy -o slm --response long.txt",
+                "cannot read long.txt: a response has one phase for each",
+            ),
+            (
+                "export heights.npy -o slm --response turn.txt --bits 2",
+                "got 1 at level 2 (line 3) after 2: smooth noise",
+            ),
             ("export heights.npy -o slm --dwell 1 2 3", "there are 3 dwell shares for 2 masks"),
             ("export heights.npy -o slm --switching-time 0.2", "must fit into the exposure of 100 ms"),
             ("export heights.npy -o slm --wavelength 1e-7 --material pmma", "published for 420 to 1620 nm"),
@@ -124,7 +153,7 @@ class TestMasks(BaseTester):
     def test_exception_is_one_sentence_and_nothing_is_written(self, arguments, sentence, folder, capsys):
         (folder / "taken").mkdir()
         (folder / "taken" / "holiday.jpg").write_bytes(b"sun")
-        for name, text in (("nan", 500 * "1.5 " + "nan"), ("one", "1.5"), ("long", 5000 * "x")):
+        for name, text in (("nan", 500 * "1.5 " + "nan"), ("one", "1.5"), ("long", 5000 * "x"), ("turn", "0\n2\n1\n6")):
             (folder / f"{name}.txt").write_text(text)
         before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
         try:

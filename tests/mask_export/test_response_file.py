@@ -77,7 +77,7 @@ def files(draw):
 
 
 class TestReadResponse(BaseTester):
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=60, deadline=None)
     @given(files())
     def test_property_any_curve_in_any_form_comes_back(self, tmp_path_factory, file):
         bits, expected, data = file

@@ -46,9 +46,29 @@ class TestGreyLevels(BaseTester):
                 GreyLevels(bits)
         with pytest.raises(ValueError, match="phase_range must be positive"):
             GreyLevels(8, phase_range=0)
-        for response in ([1.0], [0.0, float("nan")], [[0.0, 1.0]]):
-            with pytest.raises(ValueError, match="at least two finite phases"):
-                GreyLevels(8, response=response)
+
+    @pytest.mark.parametrize(
+        ("response", "sentence"),
+        [
+            ([0.0, 1.0, 2.0], "must have 4 phases, one for each level of 2 bits, got 3$"),
+            ([[0.0, 1.0, 2.0, 6.0]], r"must have 4 phases, one for each level of 2 bits, got the shape \(1, 4\)$"),
+            ([0.0, 1.0, math.nan, 6.0], "from 0 to 4 pi rad, got nan at level 2: .* interpolate unknown ones$"),
+            ([0.0, 1.0, 2.0, math.inf], "from 0 to 4 pi rad, got inf at level 3: "),
+            ([0.0, -1.0, -2.0, -6.0], "got -1 at level 1: add a constant to all phases, which changes no PSF"),
+            ([0.0, 120.0, 240.0, 360.0], "got 120 at level 1: multiply degrees by pi / 180"),
+            ([0.0, 3.0, 2.9, 6.0], "rise or fall throughout, got 2.9 at level 2 after 3: smooth noise, .* np.unwrap$"),
+            ([6.0, 2.9, 3.0, 0.0], "rise or fall throughout, got 3 at level 2 after 2.9: "),
+            ([2.0, 2.0, 2.0, 2.0], "must rise or fall, got 2 at every level$"),
+            (np.ma.masked_equal([0.0, 1.0, 2.0, 9.0], 9), "1 of its 4 values are masked"),
+        ],
+    )
+    def test_exception_responses_that_no_panel_has(self, response, sentence):
+        with pytest.raises(ValueError, match=sentence):
+            GreyLevels(2, response=response)
+
+    def test_feature_responses_may_fall_be_flat_at_places_and_be_rounded(self):
+        for response in ((4.0, 4.0, 2.0, 0.0), (-5e-4, 1.0, 6.0, 12.5668), (1.0, 2.0, 3.0, 3.0)):
+            assert GreyLevels(2, response=response).levels.tolist() == list(response)
 
     @pytest.mark.parametrize("bits", range(1, 11))
     def test_feature_error_variance_and_efficiency_are_those_of_theory(self, bits):
@@ -105,7 +125,7 @@ class TestGreyLevels(BaseTester):
 
     def test_feature_a_measured_response_is_written_through(self):
         """Frames computed with the measured curve show the wanted phase to half the local step."""
-        grey = np.linspace(0, 1, 17)
+        grey = np.linspace(0, 1, 1024)
         curve = 2.2 * math.pi * grey**1.8
         panel = GreyLevels(10, response=curve.tolist())
         wanted = 2 * math.pi * torch.rand(2, 23, 23, dtype=torch.float64)
@@ -113,7 +133,7 @@ class TestGreyLevels(BaseTester):
         assert frames.min() >= 0
         assert frames.max() <= 1023
         shown = np.interp(frames / 1023, grey, curve)
-        widest = 2.2 * math.pi * np.diff(grey**1.8).max() * 16 / 1023  # step between levels, on the steepest piece
+        widest = np.diff(curve).max()  # step between levels, where the curve is steepest
         assert float(turns_apart(torch.from_numpy(shown), wanted).abs().max()) < widest / 2
         self.assert_close(panel(wanted), torch.from_numpy(shown), rtol=0, atol=1e-12)
 
