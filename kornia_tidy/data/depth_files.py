@@ -201,7 +201,8 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
 
     Raises:
         TypeError: if the depth is not a floating-point tensor.
-        ValueError: if its shape, a value, the scale or the suffix is not as above, or a PNG cannot hold a value.
+        ValueError: if its shape, a value, the scale or the suffix is not as above, a PNG cannot hold a value, or its
+            scale is units per metre.
         FileNotFoundError: if the folder does not exist.
 
     Example:
@@ -235,6 +236,7 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
     if outside.any():
         bad = stored[outside][0] * scale
         raise ValueError(f"a 16-bit file with scale {scale} holds {scale} to {65535 * scale:.6g} m, got {bad:.6g}")
+    check_depth_scale(scale, units)
     encoded = cv2.imencode(suffix, units.astype(np.uint16))[1].tobytes()
     write_bytes(path, with_text(encoded, {"depth_scale": f"{scale:g}", "Description": text}))
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from kornia_tidy.files import read_text
 from kornia_tidy.modulator.phase_panel import check_response
 
+LONGEST = 1000  # characters of a line of the header that count
 SHORT = 3.0  # rad; a smaller span is no whole wave, and in units of pi it is what panels have
 RADIANS = {"radians": 1.0, "milliradians": 1e-3, "degrees": math.pi / 180, "pi": math.pi, "waves": 2 * math.pi}
 # Words of a header, in lower case.
@@ -108,7 +109,7 @@ def _rows(path: str | os.PathLike[str]) -> tuple[list[_Row], list[_Row]]:
         elif bad and (found or _NOT_FINITE.fullmatch(bad[0])):
             raise ValueError(f"cannot read {path}: {_FORM}, as numbers, and line {line} has {bad[0]!r:.80}")
         elif not found and whole.strip():
-            header.append(_Row(line, _plain(whole)))
+            header.append(_Row(line, _plain(whole[:LONGEST])))
     if not found:
         raise ValueError(f"cannot read {path}: {_FORM}, as text, and no line has numbers alone")
     separator, decimal = _punctuation([row.text for row in found], header)
@@ -135,7 +136,7 @@ def _punctuation(rows: Sequence[str], header: Sequence[_Row]) -> tuple[str, str]
     """Return the pattern of what separates numbers, and the sign of their decimals."""
     text = "\n".join(rows)
     if ";" in text:
-        return r"\s*;\s*", ","
+        return ";", ","
     if "," not in text:
         return r"\s+", "."
     if "." in text or re.search(r",[ \t]|[ \t],", text):

@@ -199,6 +199,11 @@ class TestWriteDepth(BaseTester):
             write_depth(tmp_path / name, depth, scale=0.001)
         assert list(tmp_path.iterdir()) == []
 
+    def test_exception_a_scale_of_units_per_metre_is_refused_for_saturated_files_too(self, tmp_path):
+        with pytest.raises(ValueError, match=r"for 1000 units in a metre give 0\.001, not 1000"):
+            write_depth(tmp_path / "a.png", torch.full((1, 2, 2), 1.5), 1000, saturate=True)
+        assert not (tmp_path / "a.png").exists()
+
     def test_exception_scale_is_not_positive(self, tmp_path):
         with pytest.raises(ValueError, match="scale must be positive and finite metres, got 0"):
             write_depth(tmp_path / "a.png", torch.ones(1, 2, 2), scale=0)

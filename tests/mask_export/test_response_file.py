@@ -77,7 +77,7 @@ def files(draw):
 
 
 class TestReadResponse(BaseTester):
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=40, deadline=None)
     @given(files())
     def test_property_any_curve_in_any_form_comes_back(self, tmp_path_factory, file):
         bits, expected, data = file
@@ -151,6 +151,14 @@ class TestReadResponse(BaseTester):
         with pytest.raises(ValueError, match=rf"^cannot read .*lut\.csv: .*{sentence}") as told:
             read_response(tmp_path / "lut.csv", bits)
         assert len(str(told.value).replace(str(tmp_path), "")) < 260
+
+    @pytest.mark.timeout(20)
+    @pytest.mark.parametrize(
+        "text", ["lut " * 10**5 + "\n0\n3", "mod" * 10**5 + "\n0\n3", "0;0\n1;3" + " " * 10**5 + ";"]
+    )
+    def test_feature_long_lines_take_no_longer_than_reading_them(self, text, tmp_path):
+        (tmp_path / "lut.csv").write_text(text)
+        assert read_response(tmp_path / "lut.csv", 1) == [0, 3]
 
     @pytest.mark.parametrize("unit", [math.pi, 2 * math.pi])
     def test_feature_units_that_no_header_names_are_told(self, unit, tmp_path):
