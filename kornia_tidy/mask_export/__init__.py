@@ -8,6 +8,7 @@ from kornia_tidy.mask_export.frame_files import SLMFrames, read_slm_frames, writ
 from kornia_tidy.mask_export.mask_files import read_heights, write_heights
 from kornia_tidy.mask_export.placement import PanelPlacement
 from kornia_tidy.mask_export.printing import write_stl
+from kornia_tidy.mask_export.response_file import read_response
 from kornia_tidy.mask_export.timing import FrameTime, frame_times
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "SLMFrames",
     "frame_times",
     "read_heights",
+    "read_response",
     "read_slm_frames",
     "write_heights",
     "write_slm_frames",

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Hashable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.runtime.threads import CaptureNotes
@@ -154,7 +153,7 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
     return None
 
 
-def check_depth_scale(scale: float, stored: NDArray[Any]) -> None:
+def check_depth_scale(scale: float, stored: np.ndarray) -> None:
     """Raise if a scale is probably units for each metre, as in Open3D, TUM RGB-D and ROS, instead of metres per unit.
 
     Two conditions must hold. A unit is more than a metre. The near pixels, of which a hundredth is nearer, are at 500 m
