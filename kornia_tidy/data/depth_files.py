@@ -86,7 +86,7 @@ def read_depth(
     """
     calibration: dict[str, Any] = {"focal_px": focal_px, "baseline_m": baseline_m, "doffs_px": doffs_px}
     check_depth_options(scale, kind=kind, **calibration, rotated_bits=rotated_bits)
-    file = read_stored(path)
+    file = read_stored(path, depth=True)
     stored = file.values
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
