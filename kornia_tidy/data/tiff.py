@@ -28,7 +28,7 @@ _REFUSED = {
     32844: "LogL", 32845: "LogLuv", 51177: "a depth map of a DNG", 52527: "a photometric mask of a DNG",
 }  # fmt: skip
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha by which colours are multiplied, and not
-_SIGNED = 2
+_UNSIGNED, _SIGNED, _FLOAT = 1, 2, 3  # SampleFormat
 _SCALE = re.compile(rb'<Item [^<>]{0,200}role="(scale|offset)"[^<>]{0,200}>([^<>]{1,40})</Item>')
 _CALIBRATION = re.compile(rb"\n(cf|c\d)=([^\n]{1,40})")
 
@@ -64,7 +64,8 @@ def decode_tiff(
     colours, alpha = _channels(directory, layout, photometric)
     missing = _missing_value(directory, layout.dtype)
     stored, absent = decode_segments(data, directory, layout, missing)
-    values, white = stored[..., :colours], 2**layout.bits - 1 if layout.format == 1 else 1
+    values = stored[..., :colours]
+    white = 1 if layout.format == _FLOAT else 2 ** (layout.bits - (layout.format == _SIGNED)) - 1
     if alpha == _ASSOCIATED and (stored[..., -1] != white).any():
         raise ValueError(
             "its colours are multiplied by its transparency (ExtraSamples 1): save it without transparency"
@@ -84,9 +85,9 @@ def decode_tiff(
         values = _palette(directory, layout)[values[..., 0]]
         white = np.iinfo(values.dtype).max
     elif photometric == _WHITE_IS_ZERO and layout.format != _SIGNED:
-        values = white - values if values.dtype.kind == "f" else values ^ values.dtype.type(white)
+        values = white - values if layout.format == _FLOAT else values ^ values.dtype.type(white)
     orientation = directory.number(ORIENTATION, 1)
-    return values, white if layout.format == 1 else None, unknown, orientation if 1 <= orientation <= 8 else 1, scale
+    return values, white if layout.format == _UNSIGNED else None, unknown, orientation if 1 <= orientation <= 8 else 1, scale
 
 
 def _photometric(directory: Directory, layout: Layout) -> int:
@@ -97,9 +98,9 @@ def _photometric(directory: Directory, layout: Layout) -> int:
         raise ValueError(f"its pixels are {name} (photometric interpretation {photometric}), which is not read")
     if photometric == _YCBCR and (layout.compression, layout.planes, layout.samples) != (JPEG, 1, 3):
         raise ValueError(
-            "its pixels are YCbCr (photometric interpretation 6), which is read with JPEG compression alone"
+            "its pixels are YCbCr (photometric interpretation 6), which is read with JPEG in one plane only"
         )
-    if photometric == _PALETTE and (layout.compression == JPEG or layout.format != 1 or layout.bits > 16):
+    if photometric == _PALETTE and (layout.compression == JPEG or layout.format != _UNSIGNED or layout.bits > 16):
         raise ValueError(f"its pixels are indices of a palette, of {layout.bits} bits or with JPEG, which is not read")
     if _COLOURS[photometric] > layout.samples:
         raise ValueError(f"the file is damaged: it is RGB with {layout.samples} samples a pixel")

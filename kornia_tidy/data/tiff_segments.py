@@ -124,7 +124,8 @@ def decode_segments(
     extents = _extents(data, directory, layout, name, places)
     if fill is None and (absent := [number for number, (_, size) in enumerate(extents) if not size]):
         raise ValueError(f"{name} {absent[0] + 1} of {len(places)} is left out of it: its length is 0")
-    pixels, missing = None, np.zeros((layout.rows, layout.columns), bool) if fill is not None else None
+    dtype, pixels = layout.dtype, None
+    missing = np.zeros((layout.rows, layout.columns), bool) if fill is not None else None
     decode = _decoder(directory, layout, data)
     for number, ((plane, row, column, high), (offset, size)) in enumerate(zip(places, extents, strict=True)):
         area = slice(row, row + high), slice(column, column + layout.segment[1])
@@ -133,7 +134,7 @@ def decode_segments(
             continue
         try:
             segment = decode(data[offset : offset + size], high)
-            if segment.dtype != layout.dtype:
+            if segment.dtype != dtype:
                 raise ValueError(f"it holds {segment.dtype}")
         except MemoryError:
             raise
@@ -143,7 +144,7 @@ def decode_segments(
             return segment[: layout.rows, : layout.columns], None
         if pixels is None:
             shape = (layout.rows, layout.columns, layout.samples)
-            pixels = np.empty(shape, layout.dtype) if missing is None else np.full(shape, fill, layout.dtype)
+            pixels = np.empty(shape, dtype) if missing is None else np.full(shape, fill, dtype)
         target = pixels[(*area, slice(plane, plane + 1) if layout.planes > 1 else slice(None))]
         target[...] = segment[: target.shape[0], : target.shape[1]]
     if pixels is None:
