@@ -97,7 +97,7 @@ def read_depth(
             raise ValueError(f"cannot read {path}: rotated_bits is for 16-bit values, these are {stored.dtype}")
         stored = (stored >> int(rotated_bits)) | (stored << (16 - int(rotated_bits)))
     _tell_of_scale(path, file.scale, scale)
-    _tell_of_unknown(path, stored, kind, invalid)
+    _tell_of_unknown(path, stored if file.unknown is None else stored[~file.unknown][:, None], kind, invalid)
     known = stored != 0 if stored.dtype.kind in "ui" else ~np.isnan(stored)
     if file.unknown is not None:
         known &= ~file.unknown

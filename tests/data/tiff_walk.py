@@ -272,7 +272,7 @@ def _pages(case: Case, page: Page, known: np.ndarray) -> list[Page]:
 
 
 def read(case: Case, path: Path, generator: np.random.Generator) -> tuple[bool, list[str]]:
-    """Read a combination as a picture and as depth; return whether one of them works, and what is wrong, if anything."""
+    """Read a combination as a picture and as depth; return whether one of them works, and what is wrong."""
     data, picture, stored, known = make(case, generator)
     path.write_bytes(data)
     known = known & ((stored > 0) | np.isnan(stored))
