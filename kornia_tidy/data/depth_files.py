@@ -122,8 +122,8 @@ def _tell_of_scale(path: str | os.PathLike[str], of_file: float, scale: float) -
         tell_once(
             None,
             ("scale", Path(path).parent),
-            f"{path} says that its numbers are to be multiplied by {of_file:.9g}, and scale is {scale:.9g}: if that gives "
-            f"metres, give scale={of_file:.9g} (--depth-scale {of_file:.9g})",
+            f"{path} says that its numbers are to be multiplied by {of_file:.9g}, and scale is {scale:.9g}: if that "
+            f"gives metres, give scale={of_file:.9g} (--depth-scale {of_file:.9g})",
             stacklevel=4,
         )
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_tidy.data.tiff_directories import COMPRESSION, DESCRIPTION, PHOTOMETRIC, Directory, picture_directories
+from kornia_tidy.data.tiff_directories import DESCRIPTION, PHOTOMETRIC, Directory, picture_directories
 from kornia_tidy.data.tiff_segments import JPEG, Layout, decode_segments, layout_of
 
 ORIENTATION, COLOUR_MAP, EXTRA_SAMPLES, GDAL_METADATA, GDAL_NODATA = 274, 320, 338, 42112, 42113
@@ -67,27 +67,26 @@ def decode_tiff(
     values = stored[..., :colours]
     white = 1 if layout.format == _FLOAT else 2 ** (layout.bits - (layout.format == _SIGNED)) - 1
     if alpha == _ASSOCIATED and (stored[..., -1] != white).any():
-        raise ValueError(
-            "its colours are multiplied by its transparency (ExtraSamples 1): save it without transparency"
-        )
-    unknown = None
+        raise ValueError("its colours are multiplied by its alpha (ExtraSamples 1): save it without transparency")
+    unknown = []
     if depth and colours == 1:
-        marks = [
-            absent,
-            None if missing is None else values[..., 0] == missing,
-            stored[..., -1] == 0 if alpha else None,
-        ]
-        if mask is not None:
-            marks.append(decode_segments(data, mask, layout_of(mask))[0][..., 0] == 0)
-        given = [mark for mark in marks if mark is not None]
-        unknown = np.logical_or.reduce(given) if given else None
+        unknown += [absent] if absent is not None else []
+        unknown += [values[..., 0] == missing] if missing is not None else []
+        unknown += [stored[..., -1] == 0] if alpha else []
+        unknown += [decode_segments(data, mask, layout_of(mask))[0][..., 0] == 0] if mask is not None else []
     if photometric == _PALETTE:
         values = _palette(directory, layout)[values[..., 0]]
         white = np.iinfo(values.dtype).max
     elif photometric == _WHITE_IS_ZERO and layout.format != _SIGNED:
         values = white - values if layout.format == _FLOAT else values ^ values.dtype.type(white)
     orientation = directory.number(ORIENTATION, 1)
-    return values, white if layout.format == _UNSIGNED else None, unknown, orientation if 1 <= orientation <= 8 else 1, scale
+    return (
+        values,
+        white if layout.format == _UNSIGNED else None,
+        np.logical_or.reduce(unknown) if unknown else None,
+        orientation if 1 <= orientation <= 8 else 1,
+        scale,
+    )
 
 
 def _photometric(directory: Directory, layout: Layout) -> int:
@@ -112,7 +111,7 @@ def _channels(directory: Directory, layout: Layout, photometric: int) -> tuple[i
 
     Three grey samples are R, G and B: GDAL calls them grey unless they are bytes.
     """
-    extra = directory.numbers(EXTRA_SAMPLES).tolist()
+    extra = directory.numbers(EXTRA_SAMPLES)[: layout.samples].tolist()
     colours = _COLOURS[photometric]
     if photometric == _BLACK_IS_ZERO and layout.samples > 2 and not any(extra[:2]):
         colours, extra = 3, extra[2:]

@@ -125,7 +125,7 @@ def picture_directories(data: bytes) -> tuple[Directory, Directory | None]:
     if sizes not in ([], [8, 0]):
         raise ValueError(f"the file is damaged: its BigTIFF header gives offsets of {sizes[0]} bytes, not 8")
     chain = _chain(data, first, [])
-    if data[8:10] == b"CR":
+    if data[8:10] == b"CR" and not big:
         _refuse_raw("Canon CR2")
     for directory in chain:
         _check_raw(directory)
@@ -135,9 +135,7 @@ def picture_directories(data: bytes) -> tuple[Directory, Directory | None]:
     if not whole:
         what = "transparency mask" if all(directory.mask for directory in chain) else "reduced-resolution preview"
         fault = f"NewSubfileType {chain[0].number(NEW_SUBFILE_TYPE, 0)}"
-        raise ValueError(
-            f"it holds only a {what} ({fault}) and no picture; a camera raw file is developed by kornia-tidy raw develop"
-        )
+        raise ValueError(f"it holds only a {what} ({fault}); of a camera raw file: kornia-tidy raw develop")
     if len(whole) > 1:
         _refuse_stack(len(whole))
     picture = whole[0]
@@ -177,7 +175,7 @@ def _below(data: bytes, chain: list[Directory]) -> list[Directory]:
 
 
 def _stacked(picture: Directory) -> int:
-    """Return the number of pictures that lie one behind the other under one directory, as some microscopes' programs do."""
+    """Return the number of pictures that lie behind each other under one directory, as programs of microscopes do."""
     if META_MORPH in picture:
         return picture.fields[META_MORPH][1]  # its number of values is that of the planes
     description = picture.text(DESCRIPTION)

@@ -165,13 +165,13 @@ def _compression(directory: Directory, bits: int, kind: int) -> int:
     compression, predictor = directory.number(COMPRESSION, 1), directory.number(PREDICTOR, 1)
     if compression not in UNFOLDS:
         raise ValueError(f"its compression is {compression} ({COMPRESSIONS.get(compression, 'unknown')}), not read")
-    if compression in CCITT and (bits, kind) != (1, 1) or compression == JPEG and (bits, kind) != (8, 1):
+    if (compression in CCITT and (bits, kind) != (1, 1)) or (compression == JPEG and (bits, kind) != (8, 1)):
         what = f"{bits}-bit {_FORMATS[kind]}"
         raise ValueError(f"its compression is {compression} with {what}: JPEG is read of 8 bits, CCITT of 1 bit")
     if predictor != 1 and compression not in {JPEG, *CCITT}:
         if compression not in _PREDICTED:
             raise ValueError(f"its predictor is {predictor} with compression {compression}, which has none")
-        if predictor not in {2, 3} or bits not in {8, 16, 32, 64} or predictor == 3 and kind != 3:
+        if predictor not in {2, 3} or bits not in {8, 16, 32, 64} or (predictor == 3 and kind != 3):
             raise ValueError(f"its predictor is {predictor} for {bits}-bit {_FORMATS[kind]}, which is not read")
     if (order := directory.number(FILL_ORDER, 1)) not in {1, 2}:
         raise ValueError(f"the file is damaged: its FillOrder is {order}, neither 1 nor 2")

@@ -208,6 +208,10 @@ class TestRefused(BaseTester):
             ({"fields": {33629: (5, [1, 1] * 30)}}, "it holds 30 pictures"),  # MetaMorph
             ({"fields": {50706: (1, [1, 4, 0, 0])}}, r"it is a camera raw file \(DNG\): .* kornia-tidy raw develop"),
             ({"fields": {33422: (1, [0, 1, 1, 2])}}, "it is a camera raw file"),
+            (
+                {"photometric": 1, "fields": {338: (3, [2] * 999)}},
+                "3 samples a pixel .* and ExtraSamples 2, 2, 2: save",
+            ),
             ({"compression": 34712}, r"its compression is 34712 \(JPEG 2000\), not read"),
             ({"fields": {262: (3, [5])}}, r"inks such as CMYK \(photometric interpretation 5\), which is not read"),
             ({"fields": {262: (3, [6])}}, r"its pixels are YCbCr \(photometric interpretation 6\)"),
@@ -219,7 +223,7 @@ class TestRefused(BaseTester):
     )
     def test_exception_intact_files_of_kinds_that_are_not_read(self, page, sentence):
         with pytest.raises(ValueError, match=sentence) as caught:
-            decoded(tiff(Page(RGB, photometric=2, **page)))
+            decoded(tiff(Page(RGB, **{"photometric": 2} | page)))
         assert "damaged" not in str(caught.value)
 
     def test_exception_a_raw_file_with_its_picture_below_a_preview(self):
