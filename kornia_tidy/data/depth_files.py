@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Collection
 from pathlib import Path
@@ -88,7 +89,7 @@ def read_depth(
     """
     calibration: dict[str, Any] = {"focal_px": focal_px, "baseline_m": baseline_m, "doffs_px": doffs_px}
     check_depth_options(scale, kind=kind, **calibration, rotated_bits=rotated_bits)
-    file = read_stored(path)
+    file = read_stored(path, depth=True)
     stored = file.values
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
@@ -97,7 +98,8 @@ def read_depth(
         if stored.dtype != np.uint16:
             raise ValueError(f"cannot read {path}: rotated_bits is for 16-bit values, these are {stored.dtype}")
         stored = (stored >> int(rotated_bits)) | (stored << (16 - int(rotated_bits)))
-    _tell_of_unknown(path, stored, kind, invalid)
+    _tell_of_scale(path, file.scale, scale)
+    _tell_of_unknown(path, stored if file.unknown is None else stored[~file.unknown][:, None], kind, invalid)
     known = stored != 0 if stored.dtype.kind in "ui" else ~np.isnan(stored)
     if file.unknown is not None:
         known &= ~file.unknown
@@ -116,6 +118,18 @@ def read_depth(
     if not known.any():
         raise ValueError(f"cannot read {path}: it has no valid {kind} at any pixel")
     return DepthMap(torch.from_numpy(fill_holes(depth, known))[None], torch.from_numpy(known)[None])
+
+
+def _tell_of_scale(path: str | os.PathLike[str], of_file: float, scale: float) -> None:
+    """Warn once per folder of a file that gives another factor for its numbers than the caller."""
+    if not math.isclose(of_file, 1) and not math.isclose(of_file, scale, rel_tol=1e-6):
+        tell_once(
+            None,
+            ("scale", Path(path).parent),
+            f"{path} says that its numbers are to be multiplied by {of_file:.9g}, and scale is {scale:.9g}: if that "
+            f"gives metres, give scale={of_file:.9g} (--depth-scale {of_file:.9g})",
+            stacklevel=4,
+        )
 
 
 def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: str, invalid: Collection[float]) -> None:

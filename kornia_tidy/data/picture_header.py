@@ -3,7 +3,7 @@
 Decoders allocate memory for the size in the header, and some fill missing parts with grey without an error. OpenCV
 cannot read a header alone.
 
-Source: PNG 1.2, sections 3 and 4.1; ITU-T T.81 (JPEG), annex B; TIFF 6.0, section 2; Netpbm's ppm(5); Microsoft's
+Source: PNG 1.2, sections 3 and 4.1; ITU-T T.81 (JPEG), annex B; Netpbm's ppm(5); Microsoft's
 BITMAPINFOHEADER; RFC 9649 (WebP).
 """
 
@@ -16,9 +16,7 @@ import zlib
 from collections.abc import Callable, Iterator
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-TIFF_LITTLE, TIFF_BIG = (b"II*\0", b"II+\0"), (b"MM\0*", b"MM\0+")
 LARGEST = 1 << 28  # pixels
-MOST_SAMPLES = 4
 VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
 FORMATS = "PNG, JPEG, TIFF, PGM, PPM, PFM, BMP, WebP or NPY"
 
@@ -88,7 +86,7 @@ def _png(data: bytes) -> Size:
     return size
 
 
-def _jpeg(data: bytes) -> Size:
+def jpeg_size(data: bytes) -> Size:
     """Return the size of a JPEG; raise ``ValueError`` unless an end marker follows the last start of a scan.
 
     Entropy-coded data cannot contain either marker.
@@ -117,26 +115,6 @@ def _segments(data: bytes) -> Iterator[tuple[int, int]]:
             continue
         yield marker, place
         place += 2 + struct.unpack_from(">H", data, place + 2)[0]
-
-
-def _tiff(data: bytes) -> Size:
-    """Return the size in the first directory of a TIFF, which is the one decoded; refuse more than four channels."""
-    order, big = "<" if data[:2] == b"II" else ">", data[2 if data[:2] == b"II" else 3] == 0x2B
-    count_form, entry_form, entry_size = ("Q", "HHQ", 20) if big else ("H", "HHI", 12)
-    (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
-    (count,) = struct.unpack_from(order + count_form, data, place)
-    place += struct.calcsize(order + count_form)
-    sizes = {0x0100: 0, 0x0101: 0, 0x0115: 1}  # columns, rows, samples a pixel
-    for entry in range(place, min(place + count * entry_size, len(data)), entry_size):
-        tag, kind, _ = struct.unpack_from(order + entry_form, data, entry)
-        if tag in sizes:
-            form = {3: "H", 4: "I", 16: "Q"}.get(kind)
-            if form is None:
-                raise ValueError("the file is damaged: its size is of no whole numbers")
-            (sizes[tag],) = struct.unpack_from(order + form, data, entry + struct.calcsize(order + entry_form))
-    if sizes[0x0115] > MOST_SAMPLES:
-        raise ValueError(f"it has {sizes[0x0115]} samples a pixel, more than {MOST_SAMPLES}")
-    return sizes[0x0101], sizes[0x0100]
 
 
 def _netpbm(data: bytes) -> Size:
@@ -169,8 +147,7 @@ def _webp(data: bytes) -> Size:
 
 _READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], Size]], ...] = (
     ((PNG,), _png),
-    ((JPEG,), _jpeg),
-    ((*TIFF_LITTLE, *TIFF_BIG), _tiff),
+    ((JPEG,), jpeg_size),
     (tuple(b"P%d" % kind for kind in range(1, 7)), _netpbm),
     ((b"BM",), _bmp),
     ((b"RIFF",), _webp),

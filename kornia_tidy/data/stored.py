@@ -16,6 +16,8 @@ from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.data.pfm import decode_pfm
 from kornia_tidy.data.picture_header import check_header
 from kornia_tidy.data.quiet import caught
+from kornia_tidy.data.tiff import decode_tiff
+from kornia_tidy.data.tiff_directories import MAGIC as TIFF
 from kornia_tidy.files import read_bytes
 
 # Beginnings of messages about incomplete pictures; surplus bytes at the end, as some cameras write, are harmless.
@@ -34,9 +36,11 @@ class Stored(NamedTuple):
     """(H, W), True where the file marks a pixel as missing; None: it marks none."""
     orientation: int = 1
     """How the picture is to be turned for display, 1 to 8 as in EXIF; 1: not at all. The values are not turned."""
+    scale: float = 1.0
+    """Factor by which the file says that its numbers are to be multiplied. They are not."""
 
 
-def read_stored(path: str | os.PathLike[str]) -> Stored:
+def read_stored(path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
     """Read the numbers in a PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP, NPY or HDF5 file, without any conversion.
 
     The format is recognised by content, not by name. The size in the header is checked before decoding, see
@@ -45,6 +49,7 @@ def read_stored(path: str | os.PathLike[str]) -> Stored:
 
     Args:
         path: the file.
+        depth: whether depth is wanted, not a picture: palettes, and numbers of which 0 is white, are then refused.
 
     Returns:
         The numbers, and what the file says of them; alpha is dropped.
@@ -53,17 +58,17 @@ def read_stored(path: str | os.PathLike[str]) -> Stored:
         FileNotFoundError: if there is no file.
         ValueError: if it is no regular file, empty, cut short, damaged, of no known format, or has too many pixels.
     """
-    return decode_stored(read_bytes(path), path)
+    return decode_stored(read_bytes(path), path, depth=depth)
 
 
-def decode_stored(data: bytes, path: str | os.PathLike[str]) -> Stored:
+def decode_stored(data: bytes, path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
     """Decode the bytes of an image file as :func:`read_stored` does; error messages name the path.
 
     Raises:
         ValueError: if the file is cut short, damaged or of no known format.
     """
     try:
-        stored = _decode(data)
+        stored = _decode(data, depth)
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     except MemoryError:
@@ -76,13 +81,15 @@ def decode_stored(data: bytes, path: str | os.PathLike[str]) -> Stored:
     return stored._replace(values=values[..., :3] if values.shape[2] == 4 else values)
 
 
-def _decode(data: bytes) -> Stored:
+def _decode(data: bytes, depth: bool) -> Stored:
     if data.startswith(NPY):
         return Stored(decode_npy(data))
     if data.startswith(HDF5):
         return Stored(decode_hdf5(data))
     if data.startswith((b"PF", b"Pf")):
         return Stored(decode_pfm(data))
+    if data.startswith(TIFF):
+        return Stored(*decode_tiff(data, depth))
     return Stored(_decode_with_opencv(data))
 
 

@@ -27,6 +27,7 @@ from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.reconstruction.midas_small import load_midas_small
 from tests.base import BaseTester
 from tests.data.published import write_nyu
+from tests.data.tiff_writer import Page, tiff
 from tests.forks import fork, wait
 from tests.hostile.limited import limit_memory
 from tests.raw.dng import dng
@@ -42,20 +43,12 @@ def png(width, height, data, *more):
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def tiff(width, height, samples=3):
-    fields = (
-        (256, width),
-        (257, height),
-        (258, 8),
-        (259, 1),
-        (262, 2),
-        (273, 8),
-        (277, samples),
-        (278, height),
-        (279, 99),
-    )
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in fields)
-    return b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(fields)) + entries + bytes(120)
+def strips(width, height, compression, data, samples=3, **fields):
+    """A TIFF of one strip."""
+    fields = {256: (4, [width]), 257: (4, [height]), 277: (3, [samples]), 258: (3, [8]), 339: None} | {
+        int(tag[1:]): content for tag, content in fields.items()
+    }
+    return tiff(Page(np.zeros((1, 1, 1)), photometric=2, compression=compression, segments=[data], fields=fields))
 
 
 def jpeg(width, height):
@@ -101,8 +94,24 @@ def zeros():
 PICTURES = {
     "PNG": lambda: png(HUGE, HUGE, zlib.compress(bytes(999))),
     "PNG, compressed": lambda: png(30_000, 30_000, zeros()),
-    "TIFF": lambda: tiff(HUGE, HUGE),
-    "TIFF, samples": lambda: tiff(16_000, 16_000, 65_535),
+    "TIFF": lambda: strips(HUGE, HUGE, 1, bytes(99)),
+    "TIFF, samples": lambda: strips(16_000, 16_000, 1, bytes(99), 65_535),
+    "TIFF, values": lambda: strips(16_000, 16_000, 1, bytes(99)),
+    "TIFF, Deflate": lambda: strips(16_000, 16_000, 8, zlib.compress(bytes(99))),
+    "TIFF, unfolded": lambda: strips(8, 8, 8, zeros()),
+    "TIFF, LZW": lambda: strips(16_000, 16_000, 5, bytes(99)),
+    "TIFF, Zstandard": lambda: strips(16_000, 16_000, 50_000, bytes(99)),
+    "TIFF, LZMA": lambda: strips(16_000, 16_000, 34_925, bytes(99)),
+    "TIFF, CCITT": lambda: strips(16_000, 16_000, 4, bytes(99), 1, t258=(3, [1]), t262=(3, [1])),
+    "TIFF, JPEG": lambda: strips(16_000, 16_000, 7, jpeg(16_000, 16_000)),
+    "TIFF, another JPEG": lambda: strips(8, 8, 7, jpeg(65_535, 65_535)),
+    "TIFF, tile": lambda: strips(8, 8, 8, zeros(), t322=(4, [2**31]), t323=(4, [2**31]), t324=(4, [8]), t325=(4, [99])),
+    "TIFF, one place for all": lambda: strips(9_000, 9_000, 8, zeros(), t278=(4, [1]), t273=(4, [8] * 9_000),
+                                              t279=(4, [1 << 19] * 9_000)),
+    "TIFF, strips": lambda: strips(1, 1 << 28, 1, bytes(99), t278=(4, [1])),
+    "TIFF, values of a field": lambda: tiff(Page(np.zeros((1, 1, 1)), fields={273: (4, [8])}))
+    .replace(struct.pack("<HHI", 273, 4, 1), struct.pack("<HHI", 273, 4, 2**32 - 1)),
+    "BigTIFF, fields": lambda: b"II+\0" + struct.pack("<HHQQ", 8, 0, 16, 2**60) + bytes(99),
     "BigTIFF": lambda: b"II+\0" + struct.pack("<HHQQ", 8, 0, 16, 2)
     + b"".join(struct.pack("<HHQQ", tag, 16, 1, 2**40) for tag in (256, 257)) + bytes(99),
     "JPEG": lambda: jpeg(65_535, 65_535),

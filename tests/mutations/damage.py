@@ -161,20 +161,18 @@ def png_lines(data: bytes, generator: Generator) -> bytes:
 
 
 def tiff_field(data: bytes, generator: Generator) -> bytes:
-    """A field of the first directory is of another type, number or value."""
-    order = "<" if data[:2] == b"II" else ">"
-    (place,) = struct.unpack_from(f"{order}I", data, 4)
-    (count,) = struct.unpack_from(f"{order}H", data, place)
-    entry = place + 2 + 12 * int(generator.integers(count))
-    part = int(generator.integers(4))
-    array = bytearray(data)
-    if part == 0:
-        struct.pack_into(f"{order}H", array, entry + 2, int(generator.integers(0, 20)))
-    else:
-        form, offset = (("I", 4), ("I", 8), ("H", 8))[part - 1]
-        struct.pack_into(
-            f"{order}{form}", array, entry + offset, int(pick(generator, NUMBERS)) % 2 ** (8 * struct.calcsize(form))
-        )
+    """A field of the first directory, or the link to the next one, is of another number, type or value."""
+    order, big = "<" if data[:2] == b"II" else ">", b"+" in data[:4]
+    offset, length, head = ("Q", 20, 8) if big else ("I", 12, 2)
+    (place,) = struct.unpack_from(f"{order}{offset}", data, 8 if big else 4)
+    (count,) = struct.unpack_from(f"{order}{'Q' if big else 'H'}", data, place)
+    entry = place + head + length * int(generator.integers(count + 1))
+    size = struct.calcsize(offset)
+    array, link = bytearray(data), entry == place + head + length * count
+    changes = [(0, offset)] if link else [(0, "H"), (2, "H"), (4, offset), (4 + size, offset), (4 + size, "H")]
+    where, form = pick(generator, changes)
+    value = int(generator.integers(0, 20)) if (where, form) == (2, "H") else int(pick(generator, (*NUMBERS, len(data))))
+    struct.pack_into(f"{order}{form}", array, entry + where, value % 2 ** (8 * struct.calcsize(form)))
     return bytes(array)
 
 

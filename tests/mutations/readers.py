@@ -12,6 +12,7 @@ import cv2
 import h5py
 import numpy as np
 import torch
+from PIL import Image
 
 from kornia_tidy import TiDyOptics
 from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
@@ -48,12 +49,26 @@ from kornia_tidy.training.callbacks import drop_rows_after
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 from kornia_tidy.training.record import training_record
 from tests.data.published import write_nyu
+from tests.data.tiff_walk import cases as combinations
+from tests.data.tiff_walk import make as make_tiff
 from tests.mutations.pristine import Case, make_cases
 from tests.raw.dng import dng
 from tests.tradeoff.samples import CONDITIONS, ROW
 
-SHARES = {"checkpoint": 0.1, "nyu": 0.1, "raw": 0.005, "weights": 0.02, "figure": 0.02, "index": 2, "header": 3}
+SHARES = {
+    "checkpoint": 0.1,
+    "nyu": 0.1,
+    "raw": 0.005,
+    "weights": 0.02,
+    "figure": 0.02,
+    "index": 2,
+    "header": 3,
+    "tiff": 4,
+}
 """Of slow readers fewer cases are tried than of the others, which count 1."""
+
+TIFFS = 300
+"""Combinations of properties that are damaged."""
 
 CANDIDATE = Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3))
 
@@ -61,8 +76,9 @@ CANDIDATE = Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3)
 def make_readers(folder: Path) -> dict[str, list[Case]]:
     """Write whole files into an empty folder; return the readers of each kind of file."""
     made = make_cases(folder)
-    cases = [*_pictures(made), *_numbers(folder), *_systems(folder), *_calibrations(folder / "calibrations"),
-             *_folders(folder, made), *_runs(folder / "run"), *_raw_files(folder)]  # fmt: skip
+    cases = [*_pictures(made), *_tiffs(folder / "tiffs"), *_numbers(folder), *_systems(folder),
+             *_calibrations(folder / "calibrations"), *_folders(folder, made), *_runs(folder / "run"),
+             *_raw_files(folder)]  # fmt: skip
     by_kind: dict[str, list[Case]] = {}
     for case in cases:
         by_kind.setdefault(case.kind, []).append(case)
@@ -89,8 +105,26 @@ def _pictures(made: dict[str, list[Case]]) -> list[Case]:
         damage = {"ppm": "pfm", "bmp": "raw", "webp": "raw", "hdf5": "hdf5"}.get(kind, kind)
         depth_file = path.stem in {"depth", "plain"}
         cases.append(Case(kind, damage, path, read_depth if depth_file else read_image))
-        if kind in {"png", "tiff", "jpeg", "bmp", "webp", "ppm"}:
+        if kind in {"png", "jpeg", "bmp", "webp", "ppm"}:
             cases.append(Case("header", damage, path, lambda path: check_header(path.read_bytes())))
+    return cases
+
+
+def _tiffs(folder: Path) -> list[Case]:
+    """TIFF files with many combinations of properties, as a picture and as depth."""
+    folder.mkdir()
+    rows = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    cases = []
+    for name, picture in (("jpeg", rows), ("group3", rows[..., 0] > 99), ("group4", rows[..., 0] > 99)):
+        path = folder / f"{name}.tif"
+        Image.fromarray(picture).save(path, compression=name)
+        cases.append(Case("tiff", "tiff", path, read_image))
+    for number, made in enumerate(combinations(TIFFS, 0)):
+        path = folder / f"{number:03d}.tif"
+        path.write_bytes(make_tiff(made, np.random.default_rng(number))[0])
+        for depth, read in ((False, read_image), (True, read_depth)):
+            if not made.refusals(depth):
+                cases.append(Case("tiff", "tiff", path, read))
     return cases
 
 
