@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
 from kornia_tidy.data.metadata import with_text
+from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
@@ -50,7 +51,9 @@ def read_depth(
     to a pixel x, y from the middle of the image, :math:`z = s v f / \sqrt{f^2 + x^2 + y^2}`.
 
     Args:
-        path: a PNG, TIFF, PGM, PFM, NPY or HDF5 file with one channel; an NPY file is (H, W) and is never unpickled.
+        path: a PNG, TIFF, PGM, PAM, PFM, NPY, NPZ, HDF5 or OpenEXR file. It has one channel, and an array is (H, W) and
+            is never unpickled; an NPZ archive and an HDF5 file hold one array; see
+            :func:`~kornia_tidy.data.exr.decode_exr` for the channel of an OpenEXR file.
         scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres.
         kind: quantity that is stored.
         invalid: stored values that mean *unknown*, besides those under Convention.
@@ -86,7 +89,8 @@ def read_depth(
     """
     calibration: dict[str, Any] = {"focal_px": focal_px, "baseline_m": baseline_m, "doffs_px": doffs_px}
     check_depth_options(scale, kind=kind, **calibration, rotated_bits=rotated_bits)
-    file = read_stored(path)
+    file = read_stored(path, depth=True)
+    tell_orientation(path, file.orientation, file.values.shape[:2], "depth")
     stored = file.values
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")

@@ -1,0 +1,211 @@
+"""Depth in OpenEXR files, as Blender and other renderers write it."""
+
+from __future__ import annotations
+
+import io
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from typing import Any, NamedTuple, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_tidy.data.picture_header import check_pixels
+from kornia_tidy.data.quiet import caught
+
+MAGIC = b"v/1\x01"
+
+_COLOURS = ("R", "G", "B")
+_VECTORS = {"Z": "X", "V": "U"}  # a channel, and the one beside which it belongs to a vector
+_NO_DEPTH = ("mist", "denoising")  # beginnings of the names of Blender's layers that have a channel Z too
+_MOST_SHOWN = 300  # characters of channel names in a message
+_MOST_TEXTS = 100  # of a header that are not UTF-8
+
+
+class _Channel(NamedTuple):
+    part: int
+    layer: str
+    leaf: str
+    name: str
+
+
+def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Decode the depth in an OpenEXR file. It needs ``pip install 'kornia-tidy[exr]'``.
+
+    Depth is the only channel of the file; else the only one that is named for it: ``Z``, ``V`` or ``depth`` in any
+    layer, or a grey layer with *depth* in its name; else the red of a picture whose red, green and blue are equal.
+    Blender's layers of mist and of denoising data, and coordinates of vectors (``X``, ``Y``, ``Z``; ``U``, ``V``), are
+    not.
+
+    Args:
+        data: bytes of the file.
+
+    Returns:
+        The values (H, W) float16, float32 or uint32; and (H, W), True where the file has no data, or None.
+
+    Raises:
+        ImportError: if the package OpenEXR is missing.
+        ValueError: if the file is damaged, deep or too large, or which of its channels is depth is not clear.
+
+    Convention:
+        Rows and columns are those of the display window. Data beyond it are dropped, and a pixel in it without data, as
+        around a rendered region, is unknown.
+
+    Source: OpenEXR, Technical introduction, and OpenEXR file layout; Blender's manual, Render passes.
+    """
+    try:
+        import OpenEXR  # noqa: PLC0415 - an extra
+    except ImportError:
+        raise ImportError("an OpenEXR file needs OpenEXR: pip install 'kornia-tidy[exr]'") from None
+    headers = [part.header for part in _parts(data, header_only=True)]
+    try:
+        channels = [channel for number, header in enumerate(headers) for channel in _channels(number, header)]
+        flat = all(header["type"] in {OpenEXR.scanlineimage, OpenEXR.tiledimage} for header in headers)
+        sizes = [_size(header[window]) for header in headers for window in ("dataWindow", "displayWindow")]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise ValueError("its OpenEXR header is damaged") from None
+    if not flat:
+        raise ValueError("it is a deep OpenEXR, with several depths a pixel, and flat ones are read")
+    for size in sizes:
+        check_pixels("the picture", *size)
+    counts = (sum(channel.part == number for channel in channels) for number in range(len(headers)))
+    fours = sum(rows * columns * -(-count // 4) for (rows, columns), count in zip(sizes[::2], counts, strict=True))
+    check_pixels(f"the file, its {len(channels)} channels by fours side by side,", 1, fours)
+    chosen, *equal = _depth_channels(channels)
+    parts = _parts(data, header_only=False)
+    if len(parts) != len(headers):
+        raise ValueError("the file is cut short or damaged")
+    values = _pixels(parts, chosen)
+    if not all(np.array_equal(values, _pixels(parts, other), equal_nan=True) for other in equal):
+        raise _unclear("its red, green and blue differ", channels)
+    return _in_display(values, headers[chosen.part])
+
+
+def _parts(data: bytes, *, header_only: bool) -> list[Any]:
+    """Return the parts of a file; those that are damaged are missing."""
+    import OpenEXR  # noqa: PLC0415
+
+    for _ in range(_MOST_TEXTS):
+        said = _Said()
+        try:
+            with caught(), redirect_stdout(said):  # messages of the library, and of its Python module
+                file = OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=header_only, num_threads=0)
+                parts = list(file.parts)
+        except MemoryError:
+            raise
+        except UnicodeDecodeError as error:  # a text in the header; another encoding is no damage
+            before = struct.pack("<i", len(error.object)) + error.object
+            data = data.replace(before, before[:4] + b"?" * len(error.object), 1)
+            continue
+        except Exception as error:  # the library raises many kinds
+            raise ValueError(f"its OpenEXR is cut short or damaged: {' '.join(str(error).split()):.100}") from error
+        if "MemoryError" in said.text:
+            raise MemoryError
+        return parts
+    raise ValueError("its OpenEXR header is damaged: its texts are none")
+
+
+class _Said(io.TextIOBase):
+    """Standard output that keeps what this thread prints, and passes on what others print."""
+
+    def __init__(self) -> None:
+        import sys  # noqa: PLC0415
+
+        self.text, self.thread, self.others = "", threading.get_ident(), sys.stdout
+
+    text: str
+    others: TextIO
+
+    def write(self, text: str) -> int:
+        """Keep or pass on a text."""
+        if threading.get_ident() != self.thread:
+            return self.others.write(text)
+        self.text += text
+        return len(text)
+
+
+def _channels(number: int, header: Mapping[str, Any]) -> list[_Channel]:
+    """Return the channels of a part; one without a layer in its name is in that of the part's name."""
+    found = []
+    for channel in header["channels"]:
+        layer, _, leaf = channel.name.rpartition(".")
+        found.append(_Channel(number, layer or str(header.get("name", "")), leaf, channel.name))
+    return found
+
+
+def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
+    """Return the channel of depth, and those that must be equal to it.
+
+    Raises:
+        ValueError: if there is none, or several may be it.
+    """
+    if len(channels) == 1:
+        return [*channels]
+    layers: dict[tuple[int, str], dict[str, _Channel]] = {}
+    for channel in channels:
+        layers.setdefault((channel.part, channel.layer), {})[channel.leaf] = channel
+    found = []
+    for (_, layer), members in layers.items():
+        name = layer.rpartition(".")[2].lower()
+        if name.startswith(_NO_DEPTH):
+            continue
+        named = [
+            channel
+            for leaf, channel in members.items()
+            if leaf.lower() == "depth" or (leaf in _VECTORS and _VECTORS[leaf] not in members)
+        ]
+        grey = [members[leaf] for leaf in _COLOURS if leaf in members]
+        if named:
+            found += [[channel] for channel in named]
+        elif "depth" in name and (len(members) == 1 or len(grey) == 3):
+            found.append(grey or [*members.values()])
+    if not found and len(layers) == 1 and set(members) - {"A"} == set(_COLOURS):
+        found.append(grey)
+    if len(found) != 1:
+        names = ", ".join(channel[0].name for channel in found)
+        raise _unclear(f"any of {names:.{_MOST_SHOWN}} may be its depth" if found else "none is named for depth", channels)
+    return found[0]
+
+
+def _unclear(reason: str, channels: Sequence[_Channel]) -> ValueError:
+    """Return the error for a file whose depth is not clear."""
+    names = ", ".join(channel.name for channel in channels) or "none"
+    return ValueError(
+        f"which channel of its OpenEXR is depth is not clear, {reason}: it has {names:.{_MOST_SHOWN}}; write depth to a "
+        f"file of its own"
+    )
+
+
+def _pixels(parts: Sequence[Any], channel: _Channel) -> NDArray[Any]:
+    found = parts[channel.part].channels.get(channel.name)
+    if found is None or not isinstance(found.pixels, np.ndarray):
+        raise ValueError("the file is cut short or damaged")
+    if (found.xSampling, found.ySampling) != (1, 1):
+        raise ValueError(f"its channel {channel.name:.40} has one sample for {found.xSampling} x {found.ySampling} pixels")
+    return found.pixels
+
+
+def _size(window: Any) -> tuple[int, int]:
+    """Return rows and columns of a window, whose corners are the first and last column and row."""
+    (left, top), (right, bottom) = (map(int, corner) for corner in window)
+    if right < left or bottom < top:
+        raise ValueError
+    return bottom - top + 1, right - left + 1
+
+
+def _in_display(values: NDArray[Any], header: Mapping[str, Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Return the pixels of the display window, and those of them without data."""
+    data, display = header["dataWindow"], header["displayWindow"]
+    size = _size(display)
+    if values.shape != _size(data):
+        raise ValueError("the file is cut short or damaged")
+    left, top = (int(a) - int(b) for a, b in zip(data[0], display[0], strict=True))
+    if (left, top) == (0, 0) and size == values.shape:
+        return values, None
+    placed, unknown = np.zeros(size, values.dtype), np.ones(size, np.bool_)
+    part = values[max(0, -top) :, max(0, -left) :][: max(0, size[0] - max(0, top)), : max(0, size[1] - max(0, left))]
+    here = np.s_[max(0, top) : max(0, top) + part.shape[0], max(0, left) : max(0, left) + part.shape[1]]
+    placed[here], unknown[here] = part, False
+    return placed, unknown
