@@ -21,7 +21,7 @@ from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
 from kornia_tidy.optics.units import tell_once
 
-UNKNOWN = 65535  # the largest 16-bit number, by which many data sets mark unknown depth
+UNKNOWN = {np.dtype(np.uint16): 65535, np.dtype(np.float16): 65504}  # largest numbers, which often mark unknown depth
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
 
 
@@ -76,7 +76,10 @@ def read_depth(
         - Infinite depth is valid, such as a sky, and so is a floating-point disparity that is 0 with d added. List
           them in ``invalid`` for a data set that means *unknown* by them.
         - A warning, once per folder, names values that look like *unknown* and are not listed: 65535 far above all
-          other values, and in a PFM file infinity below values as large as disparities.
+          other values (65504 in half precision), and in a PFM file infinity below values as large as disparities.
+        - Renderers write 1e10 (Blender) or infinity where a ray hits nothing. Both are depths, and to a lens the same.
+        - A grey level that a PNG file declares transparent is unknown, as GDAL means it.
+        - The orientation of a file is not applied. A warning, once per folder, size and orientation, tells of it.
         - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
 
     Example:
@@ -123,15 +126,16 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
     if kind != "depth":
         return
     path = Path(path)
-    if stored.dtype == np.uint16 and UNKNOWN not in invalid and bool((full := stored == UNKNOWN).any()):
-        others = int(stored[~full].max(initial=0))
+    mark = UNKNOWN.get(stored.dtype)
+    if mark is not None and mark not in invalid and bool((full := stored == mark).any()):
+        others = float(stored[~full & np.isfinite(stored)].max(initial=0))
         # It is a depth if other depths reach up to it, or if write_depth wrote the file.
-        if others < 0.9 * UNKNOWN and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
+        if others < 0.9 * mark and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
             tell_once(
                 None,
-                ("65535", path.parent),
-                f"{path} holds {UNKNOWN} where its other values end at {others}, and it is taken for a depth: if it "
-                f"means 'unknown', give invalid=[{UNKNOWN}] (--invalid {UNKNOWN})",
+                (mark, path.parent),
+                f"{path} holds {mark} where its other values end at {others:g}, and it is taken for a depth: if it "
+                f"means 'unknown', give invalid=[{mark}] (--invalid {mark})",
                 stacklevel=4,
             )
     if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):

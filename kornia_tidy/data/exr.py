@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import struct
+import sys
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
@@ -55,14 +57,11 @@ def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
 
     Source: OpenEXR, Technical introduction, and OpenEXR file layout; Blender's manual, Render passes.
     """
-    try:
-        import OpenEXR  # noqa: PLC0415 - an extra
-    except ImportError:
-        raise ImportError("an OpenEXR file needs OpenEXR: pip install 'kornia-tidy[exr]'") from None
+    library = _library()
     headers = [part.header for part in _parts(data, header_only=True)]
     try:
         channels = [channel for number, header in enumerate(headers) for channel in _channels(number, header)]
-        flat = all(header["type"] in {OpenEXR.scanlineimage, OpenEXR.tiledimage} for header in headers)
+        flat = all(header["type"] in {library.scanlineimage, library.tiledimage} for header in headers)
         sizes = [_size(header[window]) for header in headers for window in ("dataWindow", "displayWindow")]
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ValueError("its OpenEXR header is damaged") from None
@@ -83,15 +82,21 @@ def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     return _in_display(values, headers[chosen.part])
 
 
+def _library() -> Any:
+    try:
+        return importlib.import_module("OpenEXR")  # an extra, without type hints
+    except ImportError:
+        raise ImportError("an OpenEXR file needs OpenEXR: pip install 'kornia-tidy[exr]'") from None
+
+
 def _parts(data: bytes, *, header_only: bool) -> list[Any]:
     """Return the parts of a file; those that are damaged are missing."""
-    import OpenEXR  # noqa: PLC0415
-
+    library = _library()
     for _ in range(_MOST_TEXTS):
         said = _Said()
         try:
             with caught(), redirect_stdout(said):  # messages of the library, and of its Python module
-                file = OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=header_only, num_threads=0)
+                file = library.File(io.BytesIO(data), separate_channels=True, header_only=header_only, num_threads=0)
                 parts = list(file.parts)
         except MemoryError:
             raise
@@ -111,8 +116,6 @@ class _Said(io.TextIOBase):
     """Standard output that keeps what this thread prints, and passes on what others print."""
 
     def __init__(self) -> None:
-        import sys  # noqa: PLC0415
-
         self.text, self.thread, self.others = "", threading.get_ident(), sys.stdout
 
     text: str
@@ -164,18 +167,21 @@ def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
     if not found and len(layers) == 1 and set(members) - {"A"} == set(_COLOURS):
         found.append(grey)
     if len(found) != 1:
-        names = ", ".join(channel[0].name for channel in found)
-        raise _unclear(f"any of {names:.{_MOST_SHOWN}} may be its depth" if found else "none is named for depth", channels)
+        reason = f"it may be any of {_listed([channel for channel, *_ in found])}" if found else "none is named for it"
+        raise _unclear(reason, channels)
     return found[0]
 
 
 def _unclear(reason: str, channels: Sequence[_Channel]) -> ValueError:
     """Return the error for a file whose depth is not clear."""
-    names = ", ".join(channel.name for channel in channels) or "none"
     return ValueError(
-        f"which channel of its OpenEXR is depth is not clear, {reason}: it has {names:.{_MOST_SHOWN}}; write depth to a "
-        f"file of its own"
+        f"which channel of its OpenEXR is depth is not clear, {reason}: of {_listed(channels)} write it alone to a file"
     )
+
+
+def _listed(channels: Sequence[_Channel]) -> str:
+    names = ", ".join(channel.name for channel in channels) or "no channels"
+    return names if len(names) <= _MOST_SHOWN else f"{names[:_MOST_SHOWN]}..."
 
 
 def _pixels(parts: Sequence[Any], channel: _Channel) -> NDArray[Any]:
@@ -183,7 +189,9 @@ def _pixels(parts: Sequence[Any], channel: _Channel) -> NDArray[Any]:
     if found is None or not isinstance(found.pixels, np.ndarray):
         raise ValueError("the file is cut short or damaged")
     if (found.xSampling, found.ySampling) != (1, 1):
-        raise ValueError(f"its channel {channel.name:.40} has one sample for {found.xSampling} x {found.ySampling} pixels")
+        raise ValueError(
+            f"its channel {channel.name:.40} has one sample for {found.xSampling} x {found.ySampling} pixels"
+        )
     return found.pixels
 
 

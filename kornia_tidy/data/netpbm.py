@@ -139,10 +139,8 @@ def _plain_samples(text: bytes, shape: Shape, bitmap: bool) -> NDArray[Any]:
         text = _COMMENT.sub(b" ", text)
     if text.translate(None, (b"01" if bitmap else b"0123456789") + _BLANKS):
         raise ValueError(f"its samples must be {'digits 0 and 1' if bitmap else 'whole numbers'}")
-    if bitmap:  # need no blanks between them
-        values = np.frombuffer(text.translate(None, _BLANKS), np.uint8) - ord("0")
-    else:
-        values = _whole_numbers(text)
+    packed = text.translate(None, _BLANKS) if bitmap else b""  # digits of a bitmap need no blanks between them
+    values = np.frombuffer(packed, np.uint8) - ord("0") if bitmap else _whole_numbers(text)
     _check_length(len(values), math.prod(shape), b"0" * (len(values) > math.prod(shape)), "samples")
     return values.reshape(shape)
 

@@ -9,7 +9,6 @@ import zipfile
 import zlib
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.npy import decode_npy, npy_header
@@ -37,6 +36,7 @@ def decode_npz(data: bytes) -> NDArray[Any]:
     Source: PKWARE's APPNOTE 6.3, for the archive; see :func:`~kornia_tidy.data.npy.decode_npy` for its member.
 
     Example:
+        >>> import numpy as np
         >>> file = io.BytesIO()
         >>> np.savez_compressed(file, depth=np.array([[1, 2]], np.uint16))
         >>> decode_npz(file.getvalue())
@@ -56,7 +56,9 @@ def decode_npz(data: bytes) -> NDArray[Any]:
     if member.flag_bits & 1:
         raise ValueError("its NPZ is encrypted")
     if member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-        raise ValueError(f"its NPZ is compressed by method {member.compress_type}, and read are Deflate (8) and none (0)")
+        raise ValueError(
+            f"its NPZ is compressed by method {member.compress_type}, and read are Deflate (8) and none (0)"
+        )
     return decode_npy(_unfolded(archive, member))
 
 

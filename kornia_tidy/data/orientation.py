@@ -11,6 +11,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from operator import itemgetter
 from pathlib import Path
 from typing import Literal
@@ -48,10 +49,8 @@ def orientation_of(data: bytes) -> int:
     """
     blocks = _png if data.startswith(PNG) else _jpeg if data.startswith(JPEG) else _webp
     found = []
-    try:
+    with suppress(IndexError, struct.error):  # of a file that is cut short
         found += [turn for block in blocks(data) if (turn := _turn(block))]
-    except (IndexError, struct.error):
-        pass
     return min(found, key=itemgetter(0), default=(0, 1))[1]
 
 
@@ -71,7 +70,8 @@ def tell_orientation(
     """
     if orientation in STORED:
         path = Path(path)
-        tell_once(None, ("orientation", path.parent, path.suffix, size, orientation, of), told(path, orientation, of), 4)
+        key = ("orientation", path.parent, path.suffix, size, orientation, of)
+        tell_once(None, key, told(path, orientation, of), stacklevel=4)
 
 
 def told(path: str | os.PathLike[str], orientation: int, of: Literal["picture", "depth"] = "picture") -> str:
@@ -79,9 +79,9 @@ def told(path: str | os.PathLike[str], orientation: int, of: Literal["picture", 
 
     Example:
         >>> told("lamp.jpg", 3)
-        "lamp.jpg is stored rotated by 180 degrees (orientation 3) and is read as it is stored: if its depth was made \
+        'lamp.jpg is stored rotated by 180 degrees (orientation 3) and is read as it is stored: if its depth was made \
 from the upright picture, as viewers show it, bring the depth into the same form with depth[::-1, ::-1], or save the \
-picture upright"
+picture upright'
     """
     how, _ = STORED[orientation]
     begin = f"{path} is stored {how} (orientation {orientation}) and is read as it is stored: if its "
@@ -101,7 +101,7 @@ def _turn(block: bytes) -> tuple[int, int] | None:
         match = _XMP_TURN.search(block)
         return (1, int(match[1])) if match else None
     order = "<" if block.startswith(b"II") else ">"
-    try:
+    with suppress(struct.error):
         (place,) = struct.unpack_from(f"{order}I", block, 4)
         (count,) = struct.unpack_from(f"{order}H", block, place)
         for entry in range(place + 2, place + 2 + 12 * count, 12):
@@ -109,8 +109,6 @@ def _turn(block: bytes) -> tuple[int, int] | None:
             if tag == _TAG and kind in {1, 3, 4}:
                 (value,) = struct.unpack_from(order + {1: "B", 3: "H", 4: "I"}[kind], block, entry + 8)
                 return (0, value) if 1 <= value <= 8 else None
-    except struct.error:
-        pass
     return None
 
 

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from kornia_tidy.data.dead_leaves import check_arguments, depth_of, rasterise, scatter_leaves
 from kornia_tidy.data.image_files import SUFFIXES, as_image
-from kornia_tidy.data.stored import read_stored
 from kornia_tidy.data.photographic_leaves import LARGEST_RADIUS, ZOOM, of_most, photographed
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.data.stored import read_stored
 from kornia_tidy.seeds import keyed_seed
 
 PIXELS_A_LEAF = (300.0, 40_000.0)  # of the final picture, uniform in its logarithm over the scenes

@@ -80,8 +80,8 @@ def read_rgbd(
             message += f"; {told(image_path, turn)}"
         if resample is None:
             raise ValueError(
-                f"image and depth must have the same size (rows x columns): {message} (resample='image' or 'depth' brings "
-                f"one to the size of the other)"
+                f"image and depth must have the same size (rows x columns): {message} (resample='image' or 'depth' "
+                f"brings one to the size of the other)"
             )
         ratios = [t.shape[1] / t.shape[2] for t in (image, depth)]
         if not 1 - SAME_RATIO < ratios[0] / ratios[1] < 1 + SAME_RATIO:

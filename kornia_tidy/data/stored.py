@@ -105,7 +105,7 @@ def _decode(data: bytes, depth: bool) -> Stored:
         if not depth:
             raise ValueError(
                 "OpenEXR holds linear light without an upper end, and pictures here are encoded in [0, 1]: save it as "
-                "PNG by a renderer's view transform, or give linear light as a tensor; its depth is read as a depth file"
+                "PNG with a view transform, or give linear light as a tensor (OpenEXR is read as a depth file)"
             )
         values, unknown = decode_exr(data)
         return Stored(values, unknown=unknown)
