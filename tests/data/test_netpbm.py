@@ -58,7 +58,14 @@ def combinations():
         rows, columns = SIZES[number % len(SIZES)]
         values = random.integers(0, white + 1, (rows, columns, channels))
         kinds = "".join(f"TUPLTYPE {part}\n" for part in ([name] if name else []))
-        lines = (f"WIDTH {columns}\n", f"HEIGHT  {rows} \n", f"DEPTH {channels}\n", f"MAXVAL\t{white}\n", kinds, "# x\n\n")
+        lines = (
+            f"WIDTH {columns}\n",
+            f"HEIGHT  {rows} \n",
+            f"DEPTH {channels}\n",
+            f"MAXVAL\t{white}\n",
+            kinds,
+            "# x\n\n",
+        )
         head = "P7\n" + "".join(lines[:: -1 if number % 2 else 1]) + "ENDHDR\n"
         yield head.encode() + samples(7, values, white, 0), values[..., :colours], white
 
@@ -117,7 +124,10 @@ class TestDecodeNetpbm(BaseTester):
             (b"P7\nWIDTH x\nENDHDR\n\0", "has the line 'WIDTH x'"),
             (b"P7\nWIDTH 1\nHEIGHT 1\nDEPTH 4\nMAXVAL 9\nTUPLTYPE CMYK\nENDHDR\n\0\0\0\0", "its TUPLTYPE is 'CMYK'"),
             (b"P7\nWIDTH 1\nHEIGHT 1\nDEPTH 2\nMAXVAL 9\nENDHDR\n\0\0", "its 2 channels is unknown: .* missing"),
-            (b"P7\nWIDTH 1\nHEIGHT 1\nDEPTH 3\nMAXVAL 9\nTUPLTYPE GRAYSCALE\nENDHDR\n\0\0\0", "TUPLTYPE is 'GRAYSCALE'"),
+            (
+                b"P7\nWIDTH 1\nHEIGHT 1\nDEPTH 3\nMAXVAL 9\nTUPLTYPE GRAYSCALE\nENDHDR\n\0\0\0",
+                "TUPLTYPE is 'GRAYSCALE'",
+            ),
         ],
     )
     def test_exception_the_sentence_names_the_property(self, data, sentence):
