@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import math
 import struct
 import sys
 import threading
@@ -23,6 +24,7 @@ _COLOURS = ("R", "G", "B")
 _VECTORS = {"Z": "X", "V": "U"}  # a channel, and the one beside which it belongs to a vector
 _NO_DEPTH = ("mist", "denoising")  # beginnings of the names of Blender's layers that have a channel Z too
 _MOST_SHOWN = 300  # characters of channel names in a message
+_MOST_EMPTY = 4096  # pixels without data for each one with data: a small file may not take a large memory
 _MOST_TEXTS = 100  # of a header that are not UTF-8
 
 
@@ -62,13 +64,21 @@ def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     try:
         channels = [channel for number, header in enumerate(headers) for channel in _channels(number, header)]
         flat = all(header["type"] in {library.scanlineimage, library.tiledimage} for header in headers)
+        compressions = [str(header["compression"]) for header in headers]
         sizes = [_size(header[window]) for header in headers for window in ("dataWindow", "displayWindow")]
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ValueError("its OpenEXR header is damaged") from None
+    if any("J2K" in name for name in compressions):
+        raise ValueError("its OpenEXR is compressed by JPEG 2000 (HTJ2K), which is not read")
     if not flat:
         raise ValueError("it is a deep OpenEXR, with several depths a pixel, and flat ones are read")
     for size in sizes:
         check_pixels("the picture", *size)
+    for data_window, display in zip(sizes[::2], sizes[1::2], strict=True):
+        if math.prod(display) > _MOST_EMPTY * math.prod(data_window):
+            raise ValueError(
+                f"its OpenEXR holds {data_window} pixels of a display window of {display}, too few of them"
+            )
     counts = (sum(channel.part == number for channel in channels) for number in range(len(headers)))
     fours = sum(rows * columns * -(-count // 4) for (rows, columns), count in zip(sizes[::2], counts, strict=True))
     check_pixels(f"the file, its {len(channels)} channels by fours side by side,", 1, fours)

@@ -110,7 +110,7 @@ def _png(data: bytes) -> Size:
     return size or (0, 0)
 
 
-def _jpeg(data: bytes) -> Size:
+def jpeg_size(data: bytes) -> Size:
     """Return the size of a JPEG; raise ``ValueError`` unless an end marker follows the last start of a scan.
 
     Entropy-coded data cannot contain either marker.
@@ -204,7 +204,7 @@ def _webp(data: bytes) -> Size:
 
 _READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], Size]], ...] = (
     ((PNG,), _png),
-    ((JPEG,), _jpeg),
+    ((JPEG,), jpeg_size),
     ((*TIFF_LITTLE, *TIFF_BIG), _tiff),
     ((b"BM",), _bmp),
     ((b"RIFF",), _webp),
