@@ -25,6 +25,8 @@ _VECTORS = {"Z": "X", "V": "U"}  # a channel, and the one beside which it belong
 _NO_DEPTH = ("mist", "denoising")  # beginnings of the names of Blender's layers that have a channel Z too
 _MOST_SHOWN = 300  # characters of channel names in a message
 _MOST_EMPTY = 4096  # pixels without data for each one with data: a small file may not take a large memory
+_MOST_UNFOLDED = 1 << 13  # values for each byte of a file; constant ones reach an eighth of it (DWAB)
+_LARGE_TILE = 1 << 22  # pixels; they may be more than the picture has, and are decoded together
 _MOST_TEXTS = 100  # of a header that are not UTF-8
 
 
@@ -33,6 +35,29 @@ class _Channel(NamedTuple):
     layer: str
     leaf: str
     name: str
+
+
+class _Window(NamedTuple):
+    top: int
+    left: int
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, corners: Any) -> _Window:
+        """Return a window by its corners, which are the first and the last column and row."""
+        (left, top), (right, bottom) = (map(int, corner) for corner in corners)
+        if right < left or bottom < top:
+            raise ValueError
+        return cls(top, left, (bottom - top + 1, right - left + 1))
+
+
+class _Header(NamedTuple):
+    kind: Any
+    compression: str
+    data: _Window
+    display: _Window
+    tile: int
+    channels: list[_Channel]
 
 
 def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
@@ -60,28 +85,17 @@ def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     Source: OpenEXR, Technical introduction, and OpenEXR file layout; Blender's manual, Render passes.
     """
     library = _library()
-    headers = [part.header for part in _parts(data, header_only=True)]
+    found = _parts(data, header_only=True)
     try:
-        channels = [channel for number, header in enumerate(headers) for channel in _channels(number, header)]
-        flat = all(header["type"] in {library.scanlineimage, library.tiledimage} for header in headers)
-        compressions = [str(header["compression"]) for header in headers]
-        sizes = [_size(header[window]) for header in headers for window in ("dataWindow", "displayWindow")]
+        headers = [_header(number, part.header) for number, part in enumerate(found)]
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ValueError("its OpenEXR header is damaged") from None
-    if any("J2K" in name for name in compressions):
-        raise ValueError("its OpenEXR is compressed by JPEG 2000 (HTJ2K), which is not read")
-    if not flat:
+    if not all(header.kind in {library.scanlineimage, library.tiledimage} for header in headers):
         raise ValueError("it is a deep OpenEXR, with several depths a pixel, and flat ones are read")
-    for size in sizes:
-        check_pixels("the picture", *size)
-    for data_window, display in zip(sizes[::2], sizes[1::2], strict=True):
-        if math.prod(display) > _MOST_EMPTY * math.prod(data_window):
-            raise ValueError(
-                f"its OpenEXR holds {data_window} pixels of a display window of {display}, too few of them"
-            )
-    counts = (sum(channel.part == number for channel in channels) for number in range(len(headers)))
-    fours = sum(rows * columns * -(-count // 4) for (rows, columns), count in zip(sizes[::2], counts, strict=True))
-    check_pixels(f"the file, its {len(channels)} channels by fours side by side,", 1, fours)
+    if any("J2K" in header.compression for header in headers):
+        raise ValueError("its OpenEXR is compressed by JPEG 2000 (HTJ2K), which is not read")
+    _check_sizes(headers, len(data))
+    channels = [channel for header in headers for channel in header.channels]
     chosen, *equal = _depth_channels(channels)
     parts = _parts(data, header_only=False)
     if len(parts) != len(headers):
@@ -139,13 +153,39 @@ class _Said(io.TextIOBase):
         return len(text)
 
 
-def _channels(number: int, header: Mapping[str, Any]) -> list[_Channel]:
-    """Return the channels of a part; one without a layer in its name is in that of the part's name."""
-    found = []
+def _header(number: int, header: Mapping[str, Any]) -> _Header:
+    """Return what the header of a part says; a channel without a layer in its name is in that of the part's name."""
+    channels = []
     for channel in header["channels"]:
         layer, _, leaf = channel.name.rpartition(".")
-        found.append(_Channel(number, layer or str(header.get("name", "")), leaf, channel.name))
-    return found
+        channels.append(_Channel(number, layer or str(header.get("name", "")), leaf, channel.name))
+    tiles = header.get("tiles")
+    return _Header(
+        header["type"],
+        str(header["compression"]),
+        _Window.of(header["dataWindow"]),
+        _Window.of(header["displayWindow"]),
+        1 if tiles is None else tiles.xSize * tiles.ySize,
+        channels,
+    )
+
+
+def _check_sizes(headers: Sequence[_Header], length: int) -> None:
+    """Raise ``ValueError`` if the pixels of a file are too many, or more than its bytes can hold."""
+    fours, values = 0, 0
+    for header in headers:
+        pixels, shown = math.prod(header.data.size), math.prod(header.display.size)
+        check_pixels("the picture", *header.data.size)
+        check_pixels("the picture", *header.display.size)
+        if shown > _MOST_EMPTY * pixels:
+            raise ValueError(
+                f"its OpenEXR holds {header.data.size} pixels of a display window of {header.display.size}, too few of them"
+            )
+        fours += pixels * -(-len(header.channels) // 4)
+        values += max(pixels, header.tile if header.tile > _LARGE_TILE else 0) * len(header.channels)
+    check_pixels(f"the file, its {sum(len(header.channels) for header in headers)} channels by fours,", 1, fours)
+    if values > _MOST_UNFOLDED * length:
+        raise ValueError("the file is cut short: no compression makes its picture as small")
 
 
 def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
@@ -205,22 +245,13 @@ def _pixels(parts: Sequence[Any], channel: _Channel) -> NDArray[Any]:
     return found.pixels
 
 
-def _size(window: Any) -> tuple[int, int]:
-    """Return rows and columns of a window, whose corners are the first and last column and row."""
-    (left, top), (right, bottom) = (map(int, corner) for corner in window)
-    if right < left or bottom < top:
-        raise ValueError
-    return bottom - top + 1, right - left + 1
-
-
-def _in_display(values: NDArray[Any], header: Mapping[str, Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+def _in_display(values: NDArray[Any], header: _Header) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     """Return the pixels of the display window, and those of them without data."""
-    data, display = header["dataWindow"], header["displayWindow"]
-    size = _size(display)
-    if values.shape != _size(data):
+    size = header.display.size
+    if values.shape != header.data.size:
         raise ValueError("the file is cut short or damaged")
-    left, top = (int(a) - int(b) for a, b in zip(data[0], display[0], strict=True))
-    if (left, top) == (0, 0) and size == values.shape:
+    top, left = header.data.top - header.display.top, header.data.left - header.display.left
+    if (top, left) == (0, 0) and size == values.shape:
         return values, None
     placed, unknown = np.zeros(size, values.dtype), np.ones(size, np.bool_)
     part = values[max(0, -top) :, max(0, -left) :][: max(0, size[0] - max(0, top)), : max(0, size[1] - max(0, left))]

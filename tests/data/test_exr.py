@@ -155,7 +155,7 @@ class TestDecodeExr(BaseTester):
     def test_exception_many_channels_are_limited_together(self, library, monkeypatch):
         monkeypatch.setenv("KORNIA_TIDY_MAX_PIXELS", str(H * W))
         decode_exr(exr(library, {**colours(names="RGB"), "Z": DEPTH}))
-        with pytest.raises(ValueError, match="the file, its 5 channels by fours side by side, has"):
+        with pytest.raises(ValueError, match="the file, its 5 channels by fours, has"):
             decode_exr(exr(library, {**colours(), "Z": DEPTH}))
 
     def test_exception_a_display_window_that_is_almost_empty(self, library):
@@ -168,6 +168,12 @@ class TestDecodeExr(BaseTester):
             pytest.skip("this OpenEXR has no compression by JPEG 2000")
         with pytest.raises(ValueError, match="compressed by JPEG 2000"):
             decode_exr(exr(library, {"Z": DEPTH}, compression=library.HTJ2K32_COMPRESSION))
+
+    def test_exception_tiles_that_the_file_cannot_hold(self, library):
+        data = exr(library, {"Z": DEPTH}, type=library.tiledimage, tiles=library.TileDescription())
+        place = data.index(b"tiledesc\0") + len(b"tiledesc\0") + 4
+        with pytest.raises(ValueError, match="the file is cut short: no compression makes its picture as small"):
+            decode_exr(data[:place] + np.array([32, 1 << 25], "<u4").tobytes() + data[place + 8 :])
 
     def test_exception_deep_data(self, library):
         samples = np.empty((3, 4), object)
