@@ -179,7 +179,7 @@ def _check_sizes(headers: Sequence[_Header], length: int) -> None:
         check_pixels("the picture", *header.display.size)
         if shown > _MOST_EMPTY * pixels:
             raise ValueError(
-                f"its OpenEXR holds {header.data.size} pixels of a display window of {header.display.size}, too few of them"
+                f"its OpenEXR holds {header.data.size} pixels of a display window of {header.display.size}, too few"
             )
         fours += pixels * -(-len(header.channels) // 4)
         values += max(pixels, header.tile if header.tile > _LARGE_TILE else 0) * len(header.channels)
