@@ -18,7 +18,20 @@ from tests.mutations.pristine import Case, make_cases
 from tests.mutations.readers import SHARES, make_readers
 from tests.mutations.reading import damaged_case, read_all, shared_out
 
-KINDS = ("npy", "png", "tiff", "pfm", "jpeg", "safetensors", "checkpoint", "rgbd.json", "sidecar", "response")
+KINDS = (
+    "npy",
+    "npz",
+    "png",
+    "tiff",
+    "pfm",
+    "pam",
+    "jpeg",
+    "safetensors",
+    "checkpoint",
+    "rgbd.json",
+    "sidecar",
+    "response",
+)
 
 
 @pytest.fixture(scope="module")

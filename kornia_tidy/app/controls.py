@@ -88,7 +88,7 @@ def camera_name(name: str) -> str:
 CONTROLS = (
     Control("scene", "Scene", "choice", "scene", choices=[(SCENE_NAMES.get(name, name), name) for name in SCENES]),
     Control("image_file", "Photo (PNG, TIFF, JPEG)", "file", "files"),
-    Control("depth_file", "Its depth map (16-bit PNG, TIFF, PFM, NPY)", "file", "files"),
+    Control("depth_file", "Its depth map (16-bit PNG, TIFF, PGM, PFM, NPY, NPZ, OpenEXR)", "file", "files"),
     Control("depth_scale", "Unit of the depth map", "choice", "files", choices=UNITS),
     Control("seed", "Number of the painted scene", "whole", "painted scene", low=0, high=SEEDS - 1),
     Control(

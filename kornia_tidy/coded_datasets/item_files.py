@@ -62,11 +62,12 @@ def decode_map(name: str, data: bytes, path: str) -> Tensor:
     Raises:
         ValueError: if the bytes are damaged.
     """
-    stored = decode_stored(data, path).values.transpose(2, 0, 1)
+    file = decode_stored(data, path)
+    stored = file.values.transpose(2, 0, 1)
     if name == "mask":
         return torch.from_numpy(stored > 0)
     if stored.dtype.kind == "u":
-        stored = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+        stored = stored.astype(np.float32) / np.float32(file.white or np.iinfo(stored.dtype).max)
     return torch.from_numpy(np.ascontiguousarray(stored, np.float32))
 
 

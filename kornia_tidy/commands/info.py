@@ -29,7 +29,7 @@ yet are compiled, which takes some seconds. Please include this in bug reports.
 
 PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
-    *("lightning", "matplotlib", "h5py"),
+    *("lightning", "matplotlib", "h5py", "OpenEXR"),
 )
 SOURCES = tuple(ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops))
 

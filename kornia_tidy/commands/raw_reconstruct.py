@@ -88,7 +88,7 @@ examples:
 Exit status 2 if any file failed; the others are reconstructed all the same.
 """
 
-PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".pfm", ".pgm", ".ppm"}
+PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".pam", ".bmp", ".webp"}
 PREVIEW_DPI = 150
 SMALLEST_DEVIATION = 1e-9  # m
 

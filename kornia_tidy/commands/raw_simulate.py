@@ -61,7 +61,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument("--image", required=True, metavar="IMAGE", help="picture: PNG, JPEG, TIFF or NPY")
-    parser.add_argument("--depth", required=True, metavar="DEPTH", help="its depth: PNG, TIFF, PFM, PGM or NPY")
+    parser.add_argument("--depth", required=True, metavar="DEPTH", help="its depth: PNG, TIFF, PGM, PFM, NPY, OpenEXR")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.dng", help="DNG to write")
 
     sensor = parser.add_argument_group("sensor", "That of a raw file, or one given in words.")

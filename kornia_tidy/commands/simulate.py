@@ -61,7 +61,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument("image", metavar="IMAGE", help="picture: PNG, JPEG, TIFF, 8 or 16 bits, or NPY in [0, 1]")
-    parser.add_argument("--depth", required=True, metavar="DEPTH", help="its depth: PNG, TIFF, PFM, PGM or NPY")
+    parser.add_argument("--depth", required=True, metavar="DEPTH", help="its depth: PNG, TIFF, PGM, PFM, NPY, OpenEXR")
     parser.add_argument(
         "-o", "--output", metavar="OUT", help="PNG, TIFF or JPEG to write (default: IMAGE_coded.png, in this folder)"
     )

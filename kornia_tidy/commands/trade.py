@@ -82,7 +82,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument("--image", metavar="IMAGE", help="picture of a scene (default: dead leaves, made here)")
-    parser.add_argument("--depth", metavar="DEPTH", help="its depth: PNG, TIFF, PFM, PGM or NPY")
+    parser.add_argument("--depth", metavar="DEPTH", help="its depth: PNG, TIFF, PGM, PFM, NPY, OpenEXR")
     parser.add_argument(
         "-o", "--output", default="outputs/trade", metavar="FOLDER", help="made if missing (default: outputs/trade)"
     )

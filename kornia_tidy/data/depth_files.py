@@ -16,12 +16,13 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
 from kornia_tidy.data.metadata import with_text
+from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
 from kornia_tidy.optics.units import check_depth_scale, tell_once
 
-UNKNOWN = 65535  # the largest 16-bit number, by which many data sets mark unknown depth
+UNKNOWN = {np.dtype(np.uint16): 65535, np.dtype(np.float16): 65504}  # largest numbers, which often mark unknown depth
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
 
 
@@ -51,7 +52,9 @@ def read_depth(
     to a pixel x, y from the middle of the image, :math:`z = s v f / \sqrt{f^2 + x^2 + y^2}`.
 
     Args:
-        path: a PNG, TIFF, PGM, PFM, NPY or HDF5 file with one channel; an NPY file is (H, W) and is never unpickled.
+        path: a PNG, TIFF, PGM, PAM, PFM, NPY, NPZ, HDF5 or OpenEXR file. It has one channel, and an array is (H, W) and
+            is never unpickled; an NPZ archive and an HDF5 file hold one array; see
+            :func:`~kornia_tidy.data.exr.decode_exr` for the channel of an OpenEXR file.
         scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres, where other programs say 1000
             units per metre.
         kind: quantity that is stored.
@@ -76,7 +79,10 @@ def read_depth(
         - Infinite depth is valid, such as a sky, and so is a floating-point disparity that is 0 with d added. List
           them in ``invalid`` for a data set that means *unknown* by them.
         - A warning, once per folder, names values that look like *unknown* and are not listed: 65535 far above all
-          other values, and in a PFM file infinity below values as large as disparities.
+          other values (65504 in half precision), and in a PFM file infinity below values as large as disparities.
+        - Renderers write 1e10 (Blender) or infinity where a ray hits nothing. Both are depths, and to a lens the same.
+        - A grey level that a PNG file declares transparent is unknown, as GDAL means it.
+        - The orientation of a file is not applied. A warning, once per folder, size and orientation, tells of it.
         - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
 
     Example:
@@ -90,6 +96,7 @@ def read_depth(
     calibration: dict[str, Any] = {"focal_px": focal_px, "baseline_m": baseline_m, "doffs_px": doffs_px}
     check_depth_options(scale, kind=kind, **calibration, rotated_bits=rotated_bits)
     file = read_stored(path, depth=True)
+    tell_orientation(path, file.orientation, file.values.shape[:2], "depth")
     stored = file.values
     if stored.shape[2] != 1:
         raise ValueError(f"cannot read {path}: depth has one channel, this has {stored.shape[2]}")
@@ -137,15 +144,16 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
     if kind != "depth":
         return
     path = Path(path)
-    if stored.dtype == np.uint16 and UNKNOWN not in invalid and bool((full := stored == UNKNOWN).any()):
-        others = int(stored[~full].max(initial=0))
+    mark = UNKNOWN.get(stored.dtype)
+    if mark is not None and mark not in invalid and bool((full := stored == mark).any()):
+        others = float(stored[~full & np.isfinite(stored)].max(initial=0))
         # It is a depth if other depths reach up to it, or if write_depth wrote the file.
-        if others < 0.9 * UNKNOWN and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
+        if others < 0.9 * mark and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
             tell_once(
                 None,
-                ("65535", path.parent),
-                f"{path} holds {UNKNOWN} where its other values end at {others}, and it is taken for a depth: if it "
-                f"means 'unknown', give invalid=[{UNKNOWN}] (--invalid {UNKNOWN})",
+                (mark, path.parent),
+                f"{path} holds {mark} where its other values end at {others:g}, and it is taken for a depth: if it "
+                f"means 'unknown', give invalid=[{mark}] (--invalid {mark})",
                 stacklevel=4,
             )
     if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):

@@ -15,6 +15,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.metadata import with_exif
 from kornia_tidy.data.opencv_arrays import to_opencv
+from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.stored import Stored, read_stored
 from kornia_tidy.files import write_bytes
 
@@ -25,8 +26,9 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     """Read a picture as a tensor in [0, 1].
 
     Args:
-        path: an 8- or 16-bit PNG, TIFF, JPEG, PGM or PPM, or a TIFF, PFM or NPY of floats that lie in [0, 1];
-            an NPY file has the layout (H, W) or (H, W, C) with channels R, G, B, and is never unpickled.
+        path: an 8- or 16-bit PNG, TIFF, JPEG, BMP, WebP, PBM, PGM, PPM or PAM, or a TIFF, PFM, NPY or NPZ of floats
+            that lie in [0, 1]. An array has the layout (H, W) or (H, W, C) with channels R, G, B, and is never
+            unpickled; an NPZ archive holds one.
 
     Returns:
         :math:`(3, H, W)`, or :math:`(1, H, W)` for a grey file, float32 in [0, 1], encoded as in the file (usually
@@ -37,9 +39,15 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ValueError: if it is no image, cut short or damaged, has other channels, types or floats outside [0, 1],
             or needs more memory than there is.
 
+    Warns:
+        UserWarning: if viewers turn the picture, by its EXIF or XMP orientation: once for each folder, size and
+            orientation.
+
     Convention:
-        Alpha is dropped. The orientation in EXIF is ignored: a depth map of the same camera has none, and calibrations
-        refer to the pixels of the sensor.
+        - Alpha is dropped. Integers are divided by the maximum that a PGM, PPM or PAM file gives, else by the largest
+          of their bits.
+        - The orientation is not applied: a depth map of the same camera has none, and calibrations refer to the pixels
+          of the sensor. Depth that was estimated from the upright picture must be turned, as the warning says.
 
     Example:
         >>> import tempfile
@@ -48,14 +56,24 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ...     read_image(f"{folder}/grey.png")
         tensor([[[0.0000, 0.2000, 1.0000]]])
     """
+    file = read_stored(path)
+    tell_orientation(path, file.orientation, file.values.shape[:2], "picture")
+    return as_image(file, path)
+
+
+def as_image(file: Stored, path: str | os.PathLike[str]) -> Tensor:
+    """Return the numbers of a picture file (H, W, C) as floats in [0, 1], (C, H, W); error messages name the path.
+
+    Raises:
+        ValueError: if it has other channels, types or floats outside [0, 1], or needs more memory than there is.
+    """
     try:
-        return _as_image(read_stored(path), path)
+        return _scaled(file, path)
     except MemoryError as error:  # of the floats, which take up to four times the memory of the stored pixels
         raise ValueError(f"cannot read {path}: it needs more memory than there is") from error
 
 
-def _as_image(file: Stored, path: str | os.PathLike[str]) -> Tensor:
-    """Return stored pixels (H, W, C) as floats in [0, 1], (C, H, W)."""
+def _scaled(file: Stored, path: str | os.PathLike[str]) -> Tensor:
     stored = file.values
     channels = stored.shape[2]
     if channels not in {1, 3}:

@@ -16,6 +16,7 @@ _KIND = re.compile(r"""['"]descr['"]\s*:\s*(?:(['"])([^'"]*)\1|\[)""")
 _ORDER = re.compile(r"""['"]fortran_order['"]\s*:\s*(True|False)\b""")
 _SHAPE = re.compile(r"""['"]shape['"]\s*:\s*\(((?:\s*\d{1,15}L?\s*,)*(?:\s*\d{1,15}L?)?)\s*\)""")
 _NUMBERS = re.compile(r"[<>=|]?(?:b1|[iu][1248]|f[248]|c(?:8|16))")
+_LONG_NUMBERS = re.compile(r"[<>=]?(?:f1[26]|c(?:24|32))")  # extended precision
 _MOST_AXES = 8
 
 
@@ -43,21 +44,31 @@ def decode_npy(data: bytes) -> NDArray[Any]:
         >>> decode_npy(file.getvalue())
         array([[1, 2]], dtype=uint16)
     """
-    version = data[6] if len(data) > 6 else 0
-    if not data.startswith(MAGIC) or version not in _LENGTHS:
-        raise ValueError("it is not an NPY file of version 1, 2 or 3")
-    begin = 8 + struct.calcsize(_LENGTHS[version])
-    if len(data) < begin:
-        raise ValueError("its NPY header is cut short")
-    start = begin + struct.unpack_from(_LENGTHS[version], data, 8)[0]
-    if len(data) < start:
-        raise ValueError("its NPY header is cut short")
-    dtype, fortran_order, shape = _header(data[begin:start].decode("latin-1"))
+    dtype, fortran_order, shape, start = npy_header(data)
     expected, found = dtype.itemsize * math.prod(shape), len(data) - start
     if found != expected:
         raise ValueError(f"its NPY header promises {expected} bytes of values, there are {found}")
     values = np.frombuffer(data, dtype, offset=start).reshape(shape, order="F" if fortran_order else "C")
     return values.astype(dtype.newbyteorder("="))
+
+
+def npy_header(data: bytes) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:
+    """Return the data type, whether columns vary fastest, the shape, and the offset of the values of an NPY file.
+
+    Args:
+        data: the beginning of the file, at least as far as its header reaches.
+
+    Raises:
+        ValueError: if the header is wrong, or the values are not numbers.
+    """
+    version = data[6] if len(data) > 6 else 0
+    if not data.startswith(MAGIC) or version not in _LENGTHS:
+        raise ValueError("it is not an NPY file of version 1, 2 or 3")
+    begin = 8 + struct.calcsize(_LENGTHS[version])
+    start = begin + struct.unpack_from(_LENGTHS[version], data, 8)[0] if len(data) >= begin else begin
+    if len(data) < start:
+        raise ValueError("its NPY header is cut short")
+    return (*_header(data[begin:start].decode("latin-1")), start)
 
 
 def _header(text: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
@@ -66,7 +77,8 @@ def _header(text: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
         raise ValueError("its NPY header does not tell data type, order and shape")
     name = kind[2] if kind[1] else "a record"
     if not _NUMBERS.fullmatch(name):
-        raise ValueError(f"its NPY header names the data type {name[:20]!r}, which is none of numbers")
+        reason = "has more than 64 bits a number" if _LONG_NUMBERS.fullmatch(name) else "is none of numbers"
+        raise ValueError(f"its NPY header names the data type {name[:20]!r}, which {reason}")
     axes = tuple(int(side.strip(" L")) for side in shape[1].split(",") if side.strip())
     if len(axes) > _MOST_AXES:
         raise ValueError(f"its NPY header tells of {len(axes)} axes, more than {_MOST_AXES}")

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.data.dead_leaves import check_arguments, depth_of, rasterise, scatter_leaves
-from kornia_tidy.data.image_files import SUFFIXES, read_image
+from kornia_tidy.data.image_files import SUFFIXES, as_image
 from kornia_tidy.data.photographic_leaves import LARGEST_RADIUS, ZOOM, of_most, photographed
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import find_files
 from kornia_tidy.seeds import keyed_seed
 
@@ -272,7 +273,7 @@ def _surroundings(light: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _cut(path: str | os.PathLike[str], height: int, width: int, draws: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return linear light of a part of a photograph, (H, W, 3), reduced, at a place and mirrored by four draws."""
-    photograph = read_image(path)
+    photograph = as_image(read_stored(path), path)  # in any orientation, and without a word about it
     rows, columns = photograph.shape[-2:]
     largest = min(rows / height, columns / width)  # photograph's pixels along one that is painted
     least, most = (min(largest, value / ZOOM) for value in REDUCTION)

@@ -1,16 +1,15 @@
-"""Size and completeness of a picture file, checked before it is decoded.
+"""Size, completeness and kind of a picture file, checked before OpenCV decodes it.
 
 Decoders allocate memory for the size in the header, and some fill missing parts with grey without an error. OpenCV
-cannot read a header alone.
+cannot read a header alone. Kinds that it does not decode, or changes, are refused by their names.
 
-Source: PNG 1.2, sections 3 and 4.1; ITU-T T.81 (JPEG), annex B; Netpbm's ppm(5); Microsoft's
-BITMAPINFOHEADER; RFC 9649 (WebP).
+Source: PNG 3, sections 5 and 11; ITU-T T.81 (JPEG), annex B; Microsoft's BITMAPINFOHEADER and BITMAPV4HEADER;
+RFC 9649 (WebP).
 """
 
 from __future__ import annotations
 
 import os
-import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -18,19 +17,30 @@ from collections.abc import Callable, Iterator
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 LARGEST = 1 << 28  # pixels
 VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
-FORMATS = "PNG, JPEG, TIFF, PGM, PPM, PFM, BMP, WebP or NPY"
+FORMATS = "PNG, JPEG, TIFF, PBM, PGM, PPM, PAM, PFM, BMP, WebP, NPY or NPZ, and for depth OpenEXR or HDF5"
+
+OTHERS = (
+    (0, b"GIF8", "GIF"), (4, b"ftyphei", "HEIF"), (4, b"ftypmif1", "HEIF"), (4, b"ftypavi", "AVIF"),
+    (0, b"\xff\x0a", "JPEG XL"), (4, b"JXL \r\n", "JPEG XL"), (4, b"jP  \r\n", "JPEG 2000"),
+    (0, b"\xff\x4f\xff\x51", "JPEG 2000"), (0, b"#?R", "Radiance HDR"), (0, b"8BPS", "Photoshop"),
+    (0, b"DDS ", "DDS"), (0, b"%PDF", "PDF"), (0, b"<svg", "SVG"), (0, b"<?xml", "XML"), (0, b"Ph", "a PFM of halves"),
+    (0, b"PH", "a PFM of halves"), (0, b"PK\5\6", "an empty ZIP"), (0, b"SIMPLE  =", "FITS"), (0, b"MATLAB", "MATLAB"),
+)  # fmt: skip
+"""Kinds of files that are not read: where they begin, with what, and their name."""
 
 _STARTS_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # tables, reserved, arithmetic conditioning
+_DECODED_FRAMES = {0xC0, 0xC1, 0xC2, 0xC9, 0xCA}  # baseline, extended and progressive, with either entropy coding
 _START_OF_SCAN, _END = 0xDA, 0xD9
+_ANIMATED = 0x02  # flag of an extended WebP
+_BYTES = {0xFF << shift for shift in range(0, 32, 8)}  # masks of a BMP
 _ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length: TEM, restarts and the start of the image
-_NETPBM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})\s")
 
 Size = tuple[int, int]
 """Rows and columns."""
 
 
 def check_header(data: bytes) -> None:
-    """Raise ``ValueError`` for a picture file of unknown format, cut short, or with too many pixels.
+    """Raise ``ValueError`` for a picture file of unknown format or kind, cut short, or with too many pixels.
 
     Raises:
         ValueError: if the file is such.
@@ -43,7 +53,8 @@ def check_header(data: bytes) -> None:
                 raise ValueError("the file is cut short") from None
             check_pixels("the picture", rows, columns)
             return
-    raise ValueError(f"it is not an image in a known format: {FORMATS}")
+    name = next((name for place, beginning, name in OTHERS if data.startswith(beginning, place)), None)
+    raise ValueError(f"it is {f'{name}, ' if name else ''}not an image in a known format: {FORMATS}")
 
 
 def check_pixels(name: str, rows: int, columns: int) -> None:
@@ -66,24 +77,35 @@ def check_pixels(name: str, rows: int, columns: int) -> None:
         raise ValueError(f"{name} has {rows} x {columns} pixels, more than {most}: set {VARIABLE} to allow it")
 
 
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the kind of each chunk of a PNG, and where its data begin and end.
+
+    Raises:
+        IndexError, struct.error: if the file is cut short.
+    """
+    kind, place = b"", len(PNG)
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data, place)
+        yield kind, place + 8, place + 8 + length
+        place += 12 + length
+
+
 def _png(data: bytes) -> Size:
     """Return the size of a PNG; raise ``ValueError`` unless all critical chunks are complete and undamaged."""
-    last, size = b"", (0, 0)
-    place = len(PNG)
-    while last != b"IEND":
-        length, last = struct.unpack_from(">I4s", data, place)
-        end = place + 8 + length
+    size = None
+    for kind, begin, end in png_chunks(data):
         (sum_,) = struct.unpack_from(">I", data, end)
-        critical = not last[0] & 0x20
-        if critical and zlib.crc32(memoryview(data)[place + 4 : end]) != sum_:
+        critical = not kind[0] & 0x20
+        if critical and zlib.crc32(memoryview(data)[begin - 4 : end]) != sum_:
             raise ValueError("the file is damaged: a check sum in it is wrong")
-        if place == len(PNG):
-            if last != b"IHDR":
+        if size is None:
+            if kind != b"IHDR":
                 raise ValueError("the file is damaged: it does not begin with its size")
-            columns, rows = struct.unpack_from(">II", data, place + 8)
+            columns, rows = struct.unpack_from(">II", data, begin)
             size = rows, columns
-        place = end + 4
-    return size
+        if kind == b"acTL":
+            raise ValueError("it is an animated PNG, and one picture is read from a file")
+    return size or (0, 0)
 
 
 def jpeg_size(data: bytes) -> Size:
@@ -92,9 +114,15 @@ def jpeg_size(data: bytes) -> Size:
     Entropy-coded data cannot contain either marker.
     """
     size, scan = None, None
-    for marker, place in _segments(data):
+    for marker, place in jpeg_segments(data):
         if marker in _STARTS_OF_FRAME and size is None:
-            rows, columns = struct.unpack_from(">HH", data, place + 5)
+            bits, rows, columns, components = struct.unpack_from(">BHHB", data, place + 4)
+            if marker not in _DECODED_FRAMES:
+                raise ValueError(f"it is a lossless or hierarchical JPEG (SOF{marker - 0xC0}), which is not read")
+            if bits != 8:
+                raise ValueError(f"it is a JPEG of {bits} bits a sample, and read are those of 8")
+            if components not in {1, 3}:
+                raise ValueError(f"it is a JPEG of {components} components, such as CMYK, and read are grey and colour")
             size = rows, columns
         if marker == _START_OF_SCAN:
             scan = place
@@ -103,8 +131,12 @@ def jpeg_size(data: bytes) -> Size:
     return size
 
 
-def _segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield each marker and its offset, up to the end of the image or of the file."""
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield each marker of a JPEG and its offset, up to the end of the image or of the file.
+
+    Raises:
+        struct.error: if the file is cut short.
+    """
     place = 2
     while (place := data.find(b"\xff", place)) >= 0 and place + 1 < len(data):
         marker = data[place + 1]
@@ -117,16 +149,19 @@ def _segments(data: bytes) -> Iterator[tuple[int, int]]:
         place += 2 + struct.unpack_from(">H", data, place + 2)[0]
 
 
-def _netpbm(data: bytes) -> Size:
-    match = _NETPBM.match(data)
-    if match is None:
-        raise ValueError("it is not an image in a known format, or its header is damaged")
-    return int(match[2]), int(match[1])
 
 
 def _bmp(data: bytes) -> Size:
-    form = "<HH" if struct.unpack_from("<I", data, 14)[0] == 12 else "<ii"
-    columns, rows = struct.unpack_from(form, data, 18)
+    """Return the size of a BMP; refuse kinds whose colours OpenCV takes for others."""
+    (length,) = struct.unpack_from("<I", data, 14)
+    columns, rows, _, bits = struct.unpack_from("<HHHH" if length == 12 else "<iiHH", data, 18)
+    coding = 0 if length == 12 else struct.unpack_from("<I", data, 30)[0]
+    if bits not in {0: (1, 4, 8, 24, 32), 1: (8,), 2: (4,), 3: (32,)}.get(coding, ()):
+        raise ValueError(f"it is a BMP of {bits} bits a pixel with compression {coding}, which is not read")
+    if coding == 3:
+        masks = struct.unpack_from("<III", data, 54)
+        if masks != (0xFF0000, 0xFF00, 0xFF) and (length < 56 or any(mask not in _BYTES for mask in masks)):
+            raise ValueError("it is a BMP whose colours lie in other bits than usual, which is not read")
     return abs(rows), abs(columns)  # negative rows: stored from the top
 
 
@@ -136,6 +171,8 @@ def _webp(data: bytes) -> Size:
     if data[8:12] != b"WEBP" or kind not in {b"VP8X", b"VP8L", b"VP8 "}:
         raise ValueError("it is not an image in a known format, or its header is damaged")
     if kind == b"VP8X":
+        if data[20] & _ANIMATED:
+            raise ValueError("it is an animated WebP, and one picture is read from a file")
         columns, rows = (int.from_bytes(data[place : place + 3], "little") + 1 for place in (24, 27))
     elif kind == b"VP8L":
         (bits,) = struct.unpack_from("<I", data, 21)
@@ -148,7 +185,6 @@ def _webp(data: bytes) -> Size:
 _READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], Size]], ...] = (
     ((PNG,), _png),
     ((JPEG,), jpeg_size),
-    (tuple(b"P%d" % kind for kind in range(1, 7)), _netpbm),
     ((b"BM",), _bmp),
     ((b"RIFF",), _webp),
 )

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 _LIBRARIES = re.compile(
     r"libpng |Corrupt JPEG |Premature end of JPEG |Inconsistent progression |Invalid SOS |Unknown Adobe color |"
-    r"Warning: unknown JFIF |Application transferred |\[ ?(?:WARN|ERROR|INFO):"
+    r"Warning: unknown JFIF |Application transferred |\[ ?(?:WARN|ERROR|INFO):|"
+    r"<python_buffer>: "  # OpenEXR
 )
 _ERROR = 2  # the process's stderr
 _PIPE_HOLDS = 1 << 16

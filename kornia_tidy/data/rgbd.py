@@ -14,6 +14,8 @@ from kornia_tidy.checks import check_choice
 from kornia_tidy.data.depth_files import DepthMap, read_depth
 from kornia_tidy.data.guided_fill import fill_guided
 from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data.orientation import told
+from kornia_tidy.data.stored import read_stored
 
 SAME_RATIO = 0.02  # relative difference of the ratios of sides: ScanNet's 1296 x 968 and 640 x 480 differ by 0.004
 
@@ -73,15 +75,17 @@ def read_rgbd(
     depth, valid = read_depth(depth_path, **depth_options)
     if image.shape[1:] != depth.shape[1:]:
         sizes = [f"{t.shape[1]} x {t.shape[2]}" for t in (image, depth)]
-        told = f"{image_path} has {sizes[0]}, {depth_path} has {sizes[1]}"
+        message = f"{image_path} has {sizes[0]}, {depth_path} has {sizes[1]}"
+        if image.shape[1:] == depth.shape[:0:-1] and (turn := read_stored(image_path).orientation) > 1:
+            message += f"; {told(image_path, turn)}"
         if resample is None:
             raise ValueError(
-                f"image and depth must have the same size (rows x columns): {told} (resample='image' or 'depth' brings "
-                f"one to the size of the other)"
+                f"image and depth must have the same size (rows x columns): {message} (resample='image' or 'depth' "
+                f"brings one to the size of the other)"
             )
         ratios = [t.shape[1] / t.shape[2] for t in (image, depth)]
         if not 1 - SAME_RATIO < ratios[0] / ratios[1] < 1 + SAME_RATIO:
-            raise ValueError(f"image and depth must show the same view, and their sides have other ratios: {told}")
+            raise ValueError(f"image and depth must show the same view, and their sides have other ratios: {message}")
         if resample == "image":
             image = _resized_image(image, depth.shape[1], depth.shape[2])
         else:

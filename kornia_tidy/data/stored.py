@@ -9,12 +9,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_tidy.data.exr import MAGIC as EXR
+from kornia_tidy.data.exr import decode_exr
 from kornia_tidy.data.hdf5 import MAGIC as HDF5
 from kornia_tidy.data.hdf5 import decode_hdf5
+from kornia_tidy.data.netpbm import MAGICS as NETPBM
+from kornia_tidy.data.netpbm import decode_netpbm
 from kornia_tidy.data.npy import MAGIC as NPY
 from kornia_tidy.data.npy import decode_npy
+from kornia_tidy.data.npz import MAGIC as NPZ
+from kornia_tidy.data.npz import decode_npz
+from kornia_tidy.data.orientation import orientation_of
 from kornia_tidy.data.pfm import decode_pfm
-from kornia_tidy.data.picture_header import check_header
+from kornia_tidy.data.picture_header import PNG, check_header, png_chunks
 from kornia_tidy.data.quiet import caught
 from kornia_tidy.data.tiff import decode_tiff
 from kornia_tidy.data.tiff_directories import MAGIC as TIFF
@@ -23,6 +30,7 @@ from kornia_tidy.files import read_bytes
 # Beginnings of messages about incomplete pictures; surplus bytes at the end, as some cameras write, are harmless.
 _DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent progression", "Invalid SOS")
 _HARMLESS = "extraneous bytes before marker 0xd9"
+_GREY, _PALETTE, _GREY_AND_ALPHA = 0, 3, 4  # colour types of PNG
 
 
 class Stored(NamedTuple):
@@ -41,15 +49,17 @@ class Stored(NamedTuple):
 
 
 def read_stored(path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
-    """Read the numbers in a PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP, NPY or HDF5 file, without any conversion.
+    """Read the numbers in a picture or depth file, without any conversion.
 
-    The format is recognised by content, not by name. The size in the header is checked before decoding, see
-    :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. The orientation in EXIF is ignored: depth maps
-    and calibrations refer to the pixels of the sensor.
+    The format is recognised by content, not by name: PNG, TIFF, JPEG, PBM, PGM, PPM, PAM, PFM, BMP, WebP, NPY, NPZ,
+    HDF5 or OpenEXR. The size in the header is checked before decoding, see
+    :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. The orientation is reported, not applied: depth
+    maps and calibrations refer to the pixels of the sensor.
 
     Args:
         path: the file.
-        depth: whether depth is wanted, not a picture: palettes, and numbers of which 0 is white, are then refused.
+        depth: whether depth is wanted. It is taken from the channels of an OpenEXR file, which is no picture of codes;
+            and bitmaps, palettes, and numbers of which 0 is white are refused, since they are colours.
 
     Returns:
         The numbers, and what the file says of them; alpha is dropped.
@@ -74,6 +84,11 @@ def decode_stored(data: bytes, path: str | os.PathLike[str], *, depth: bool = Fa
     except MemoryError:
         raise ValueError(f"cannot read {path}: the memory that it needs is not there") from None
     values = stored.values[..., None] if stored.values.ndim == 2 else stored.values
+    if values.ndim == 3 and values.shape[0] in {1, 3, 4} and values.shape[2] > 4:
+        raise ValueError(
+            f"cannot read {path}: channels come last, as in (H, W, C), and its shape is {values.shape}: save "
+            f"{'array[0]' if values.shape[0] == 1 else 'np.moveaxis(array, 0, -1)'}"
+        )
     if values.ndim != 3 or 0 in values.shape:
         raise ValueError(f"cannot read {path}: an image has rows, columns and channels, this is {values.shape}")
     if values.dtype.kind not in "uif":
@@ -84,13 +99,48 @@ def decode_stored(data: bytes, path: str | os.PathLike[str], *, depth: bool = Fa
 def _decode(data: bytes, depth: bool) -> Stored:
     if data.startswith(NPY):
         return Stored(decode_npy(data))
+    if data.startswith(NPZ):
+        return Stored(decode_npz(data))
     if data.startswith(HDF5):
         return Stored(decode_hdf5(data))
     if data.startswith((b"PF", b"Pf")):
         return Stored(decode_pfm(data))
+    if data.startswith(EXR):
+        if not depth:
+            raise ValueError(
+                "OpenEXR holds linear light without an upper end, and pictures here are encoded in [0, 1]: save it as "
+                "PNG with a view transform, or give linear light as a tensor (OpenEXR is read as a depth file)"
+            )
+        values, unknown = decode_exr(data)
+        return Stored(values, unknown=unknown)
+    if data.startswith(NETPBM):
+        if depth and data.startswith((b"P1", b"P4")):
+            raise ValueError("it is a bitmap (PBM) of black and white, which is no depth")
+        return Stored(*decode_netpbm(data))
     if data.startswith(TIFF):
         return Stored(*decode_tiff(data, depth))
-    return Stored(_decode_with_opencv(data))
+    decoded = _decode_with_opencv(data)
+    stored = _as_in_png(decoded, data, depth) if data.startswith(PNG) else Stored(decoded)
+    return stored._replace(orientation=orientation_of(data))
+
+
+def _as_in_png(decoded: NDArray[Any], data: bytes, depth: bool) -> Stored:
+    """Undo what OpenCV does to numbers of less than 8 bits and to grey with alpha, and mark transparent depth.
+
+    A file of GDAL marks missing values by the grey level that is transparent.
+    """
+    bits, kind = data[24], data[25]
+    if kind == _PALETTE and depth:
+        raise ValueError("its pixels are the colours of a palette (PNG), which are no depth")
+    if kind == _GREY_AND_ALPHA:
+        return Stored(decoded[..., :1])
+    if kind != _GREY:
+        return Stored(decoded)
+    white = 2**bits - 1
+    values = decoded // (255 // white) if bits < 8 else decoded
+    clear = next((int.from_bytes(data[b:e], "big") for k, b, e in png_chunks(data) if k == b"tRNS"), None)
+    unknown = values == clear if depth and clear is not None else None
+    return Stored(values, white if bits < 8 else None, unknown)
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[Any]:

@@ -57,7 +57,8 @@ class TestReadImage(BaseTester):
         turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(app1) + 2) + app1 + data[2:]
         (tmp_path / "a.jpg").write_bytes(turned)
         assert cv2.imread(str(tmp_path / "a.jpg")).shape[:2] == (24, 8)  # OpenCV by default does turn it
-        assert read_image(tmp_path / "a.jpg").shape == (3, 8, 24)
+        with pytest.warns(UserWarning, match="orientation 6"):
+            assert read_image(tmp_path / "a.jpg").shape == (3, 8, 24)
 
     @pytest.mark.parametrize("suffix", [".npy", ".tiff", ".pfm"])
     def test_feature_floats_are_taken_as_they_are(self, suffix, tmp_path):
@@ -83,6 +84,12 @@ class TestReadImage(BaseTester):
             (np.zeros((2, 2), complex), "not complex128"),
             (np.zeros((2, 2), bool), "not bool"),
             (np.zeros((2, 2, 5)), "this has 5"),
+            (
+                np.zeros((1, 2, 5)),
+                r"channels come last, as in \(H, W, C\), and its shape is \(1, 2, 5\): save array\[0\]",
+            ),
+            (np.zeros((3, 2, 5)), r"channels come last, .* \(3, 2, 5\): save np.moveaxis\(array, 0, -1\)"),
+            (np.zeros((4, 3, 2, 5)), r"rows, columns and channels, this is \(4, 3, 2, 5\)"),
             (np.zeros(7), r"rows, columns and channels, this is \(7,\)"),
             (np.zeros((0, 3)), "rows, columns and channels"),
             (np.array([{"code": "never run"}]), "names the data type '.O', which is none of numbers"),

@@ -17,7 +17,7 @@ from kornia_tidy.data.picture_header import LARGEST, VARIABLE, check_header, che
 from tests.base import BaseTester
 from tests.forks import fork, wait
 
-SUFFIXES = (".png", ".jpg", ".tif", ".ppm", ".bmp", ".webp")
+SUFFIXES = (".png", ".jpg", ".tif", ".bmp", ".webp")
 GREY = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
 
 
@@ -45,8 +45,6 @@ def enlarged(suffix: str) -> bytes:
         for tag in (0x0100, 0x0101):
             place = data.index(struct.pack("<H", tag), struct.unpack_from("<I", data, 4)[0])
             data[place + 2 : place + 12] = struct.pack("<HII", 4, 1, 10**6)
-    elif suffix == ".ppm":
-        return b"P6\n# a comment\n1000000 1000000\n255\n" + bytes(99)
     elif suffix == ".bmp":
         data[18:26] = struct.pack("<ii", 10**6, -(10**6))
     else:
@@ -109,10 +107,6 @@ class TestCheckHeader(BaseTester):
         with pytest.raises(ValueError, match="a check sum in it is wrong"):
             check_header(bytes(data))
 
-    def test_exception_long_blanks_in_a_header_take_no_time(self):
-        with pytest.raises(ValueError, match="its header is damaged"):
-            check_header(b"P5" + b" " * 100_000 + b"x")
-
 
 class TestCheckPixels(BaseTester):
     def test_feature_the_limit_can_be_raised_and_lowered(self, monkeypatch):
@@ -155,6 +149,6 @@ class TestCheckPixels(BaseTester):
 
         (tmp_path / "a.png").write_bytes(png_of(2, 2, zlib.compress(bytes(6))))
         assert read_image(tmp_path / "a.png").shape[1:] == (2, 2)
-        monkeypatch.setattr(image_files, "_as_image", full)
+        monkeypatch.setattr(image_files, "_scaled", full)
         with pytest.raises(ValueError, match=r"a\.png: it needs more memory than there is"):
             read_image(tmp_path / "a.png")

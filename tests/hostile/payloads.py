@@ -26,8 +26,9 @@ class Payload:
 def payloads(place: Path) -> dict[str, bytes]:
     """Return files by what they are: each makes a folder in a place if it is trusted."""
     evil = Payload(place)
-    objects, old, new = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    objects, packed, old, new = io.BytesIO(), io.BytesIO(), io.BytesIO(), io.BytesIO()
     np.save(objects, np.array([evil], dtype=object), allow_pickle=True)
+    np.savez(packed, np.array([evil], dtype=object))
     torch.save({"state_dict": evil}, old, _use_new_zipfile_serialization=False)
     torch.save({"state_dict": evil}, new)
     command = f"__import__('os').mkdir({str(place / MARKER)!r})"
@@ -35,6 +36,7 @@ def payloads(place: Path) -> dict[str, bytes]:
         "pickle": pickle.dumps(evil),
         "pickle-0": pickle.dumps(evil, protocol=0),
         "objects in NPY": objects.getvalue(),
+        "objects in NPZ": packed.getvalue(),
         "expression in NPY": _npy_with_header(f"{{'descr': {command}, 'fortran_order': False, 'shape': (1,)}}"),
         "torch.save, old": old.getvalue(),
         "torch.save, new": new.getvalue(),

@@ -91,6 +91,31 @@ def zeros():
     return b"".join(packer.compress(bytes(1 << 20)) for _ in range(512)) + packer.flush()
 
 
+def npz(shape, unfolded):
+    """An archive whose array promises a shape, and unfolds into so many bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as member:
+        member.write(npy(shape)[:-64])
+        for _ in range(unfolded >> 20):
+            member.write(bytes(1 << 20))
+    return file.getvalue()
+
+
+def exr(data_window, display_window):
+    """The header of an OpenEXR file with one channel, and no pixels."""
+    channels = b"Z\0" + struct.pack("<iiii", 2, 0, 1, 1) + b"\0"
+    fields = (
+        (b"channels", b"chlist", channels), (b"compression", b"compression", b"\3"),
+        (b"lineOrder", b"lineOrder", b"\0"),
+        (b"dataWindow", b"box2i", struct.pack("<4i", 0, 0, *data_window)),
+        (b"displayWindow", b"box2i", struct.pack("<4i", 0, 0, *display_window)),
+        (b"pixelAspectRatio", b"float", struct.pack("<f", 1)), (b"screenWindowCenter", b"v2f", bytes(8)),
+        (b"screenWindowWidth", b"float", struct.pack("<f", 1)),
+    )  # fmt: skip
+    header = b"".join(name + b"\0" + kind + b"\0" + struct.pack("<i", len(data)) + data for name, kind, data in fields)
+    return b"v/1\x01\2\0\0\0" + header + b"\0" + bytes(999)
+
+
 PICTURES = {
     "PNG": lambda: png(HUGE, HUGE, zlib.compress(bytes(999))),
     "PNG, compressed": lambda: png(30_000, 30_000, zeros()),
@@ -116,6 +141,14 @@ PICTURES = {
     + b"".join(struct.pack("<HHQQ", tag, 16, 1, 2**40) for tag in (256, 257)) + bytes(99),
     "JPEG": lambda: jpeg(65_535, 65_535),
     "PPM": lambda: b"P6\n1000000 1000000\n255\n" + bytes(99),
+    "PGM, plain": lambda: b"P2 1000000 1000000 255\n" + b"0 " * 99,
+    "PAM": lambda: b"P7\nWIDTH 16000\nHEIGHT 16000\nDEPTH 1000000\nMAXVAL 255\nTUPLTYPE RGB\nENDHDR\n" + bytes(99),
+    "NPZ": lambda: npz((HUGE, HUGE), 0),
+    "NPZ, compressed": lambda: npz((1 << 15, 1 << 14), 1 << 29),
+    "NPZ, compressed more than promised": lambda: npz((2, 2), 1 << 29),
+    "OpenEXR": lambda: exr((HUGE, HUGE), (99, 99)),
+    "OpenEXR, display window": lambda: exr((99, 99), (12_000, 12_000)),
+    "OpenEXR, cut short": lambda: exr((12_000, 12_000), (12_000, 12_000)),
     "PFM": lambda: b"PF\n999999999 999999999\n-1.0\n" + bytes(99),
     "BMP": lambda: b"BM" + struct.pack("<IIIIiiHHI", 999, 0, 54, 40, HUGE, HUGE, 1, 24, 0) + bytes(99),
     "WebP": lambda: b"RIFF" + struct.pack("<I", 99) + b"WEBPVP8X" + struct.pack("<II", 10, 0) + b"\xff" * 6 + bytes(99),

@@ -24,8 +24,8 @@ from tests.mutations.forked import Outcome, clear, prepare, run, shown
 from tests.mutations.pristine import Case, make_cases
 
 SHARES = {
-    "npy": 16, "png": 16, "tiff": 12, "pfm": 8, "jpeg": 12, "safetensors": 10, "checkpoint": 10, "rgbd.json": 5,
-    "sidecar": 5, "response": 4, "raw": 6,
+    "npy": 16, "png": 16, "tiff": 12, "pfm": 8, "pam": 4, "npz": 4, "exr": 4, "jpeg": 12,
+    "safetensors": 10, "checkpoint": 10, "rgbd.json": 5, "sidecar": 5, "response": 4, "raw": 6,
 }  # fmt: skip
 NAMES = ("accepted", "refused", "guard", "failed")
 

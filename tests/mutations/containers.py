@@ -1,15 +1,17 @@
-"""Damage to text tables, HDF5 files and tar archives, by their structure."""
+"""Damage to text tables, HDF5 and OpenEXR files, tar and NPZ archives, by their structure."""
 
 from __future__ import annotations
 
 import io
+import struct
 import tempfile
+import zipfile
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from tests.mutations.damage import NUMBERS, TEXTS, Generator, pick
+from tests.mutations.damage import BLIND, NUMBERS, TEXTS, Generator, npy_header, pick
 
 WORDS = (
     *(str(number) for number in (*NUMBERS, -1, 10**12, 10**30)), *TEXTS, "1e400", "-inf", "/etc/passwd", "a.tar:0:9",
@@ -93,6 +95,51 @@ def tar_header(data: bytes, generator: Generator) -> bytes:
     if generator.random() < 0.5:
         array[begin + 148 : begin + 156] = b" " * 8
         array[begin + 148 : begin + 156] = b"%06o\0 " % sum(array[begin : begin + 512])
+    return bytes(array)
+
+
+def npz_member(data: bytes, generator: Generator) -> bytes:
+    """An archive of another array, of several, of another method, or with other sizes in its directories."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        name, array = archive.namelist()[0], archive.read(archive.namelist()[0])
+    act = int(generator.integers(5))
+    if act == 0:
+        array = npy_header(array, generator)
+    elif act == 1:
+        array = pick(generator, BLIND)(array, generator)
+    file = io.BytesIO()
+    method = int(pick(generator, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)))
+    with zipfile.ZipFile(file, "w", method if act == 2 else zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, array)
+        for other in range(int(generator.integers(3)) if act == 3 else 0):
+            archive.writestr(
+                str(pick(generator, (name, "../a.npy", f"{other}.npy", "a/", "\udcff.npy", ""))) or "x", array
+            )
+    packed = bytearray(file.getvalue())
+    if act == 4:
+        begin = packed.index(b"PK\1\2") if generator.random() < 0.6 else 0
+        offset, form = pick(
+            generator, ((8, "<H"), (10, "<H"), (16, "<I"), (20, "<I"), (24, "<I"), (42, "<I"), (26, "<H"))
+        )
+        value = int(pick(generator, NUMBERS)) % 2 ** (8 * struct.calcsize(form))
+        struct.pack_into(form, packed, begin + offset, value)
+    return bytes(packed)
+
+
+def exr_attribute(data: bytes, generator: Generator) -> bytes:
+    """A number in an attribute of the header, or in the table of chunks behind it, is another."""
+    array, places = bytearray(data), []
+    for kind in (b"box2i", b"chlist", b"compression", b"lineOrder", b"tiledesc", b"int", b"v2f", b"string", b"float"):
+        place = -1
+        while (place := data.find(b"\0" + kind + b"\0", place + 1)) >= 0:
+            begin = place + len(kind) + 2
+            (length,) = struct.unpack_from("<i", data, begin)
+            places += [begin, *range(begin + 4, begin + 4 + min(max(0, length), 400))]
+    table = data.find(b"\0\0", places[-1]) + 2 if places else 0
+    place = int(pick(generator, places)) if generator.random() < 0.8 else table + int(generator.integers(64))
+    form = str(pick(generator, ("<B", "<i", "<Q")))
+    value = int(pick(generator, (*NUMBERS, 4, 5, 6, 9, 31, 52, 64))) % 2 ** (7 if form == "<B" else 31)
+    struct.pack_into(form, array, min(place, len(array) - 8), value)
     return bytes(array)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -73,14 +74,22 @@ def _write_pictures(folder: Path) -> None:
     for suffix in ("png", "pfm", "npy"):
         write_depth(folder / f"depth.{suffix}", depth.clamp(max=60), 0.001 if suffix == "png" else 1.0, saturate=True)
     cv2.imwrite(str(folder / "depth.tif"), depth[0].numpy())
+    head = f"P7\nWIDTH {SIZE}\nHEIGHT {SIZE}\nDEPTH 3\nMAXVAL 1023\nTUPLTYPE RGB\nENDHDR\n".encode()
+    (folder / "image.pam").write_bytes(head + np.rint(1023 * rows).astype(">u2").tobytes())
+    np.savez_compressed(folder / "depth.npz", depth[0].numpy())
+    with suppress(ImportError):  # an extra
+        import OpenEXR
+
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"Z": depth[0].numpy()}).write(str(folder / "depth.exr"))
 
 
 def _pictures(folder: Path) -> list[Case]:
     """Each file as the picture or the depth of a scene with an intact other half."""
-    kinds = {".png": "png", ".tif": "tiff", ".jpg": "jpeg", ".npy": "npy", ".pfm": "pfm"}
+    kinds = {".tif": "tiff", ".jpg": "jpeg"}
     cases = []
     for path in sorted(folder.iterdir()):
-        kind, out = kinds[path.suffix], ("-o", "out.png", *CAMERA)
+        kind, out = kinds.get(path.suffix, path.suffix[1:]), ("-o", "out.png", *CAMERA)
         if path.stem == "depth":
             scale = ("--depth-scale", "0.001") if kind == "png" else ()
             argv = ("simulate", str(folder / "image.png"), "--depth", "IN", *scale, *out)

@@ -70,6 +70,9 @@ SHARES = {
 TIFFS = 300
 """Combinations of properties that are damaged."""
 
+KINDS = {"png", "tiff", "jpeg", "pfm", "npy", "npz", "ppm", "pam", "bmp", "webp", "hdf5", "exr"}
+"""Of pictures and depth."""
+
 CANDIDATE = Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3))
 
 
@@ -92,20 +95,27 @@ def _pictures(made: dict[str, list[Case]]) -> list[Case]:
     for suffix in ("bmp", "webp", "ppm"):
         cv2.imwrite(str(folder / f"image.{suffix}"), rows)
     cv2.imwrite(str(folder / "image.pgm"), rows[..., 0])
+    cv2.imwrite(str(folder / "plain.ppm"), rows, [cv2.IMWRITE_PXM_BINARY, 0])
+    height, width = rows.shape[:2]
+    (folder / "image.pbm").write_bytes(f"P1 {width} {height}\n".encode() + (rows[..., 0] // 128 + 48).tobytes())
+    np.savez(folder / "image.npz", image=rows)
     depth = np.load(folder / "depth.npy")
+    (folder / "depth.pgm").write_bytes(f"P2\n{width} {height}\n999\n".encode() + b" ".join(
+        b"%d" % value for value in np.minimum(99 * depth, 999).astype(int).ravel().tolist()))  # fmt: skip
+    _write_exr(folder, depth)
     with h5py.File(folder / "depth.hdf5", "w") as file:
         file.create_dataset("dataset", data=depth, chunks=(16, 16), compression="gzip")
     with h5py.File(folder / "plain.hdf5", "w") as file:
         file.create_dataset("dataset", data=depth)
     cases = []
     for path in sorted(folder.iterdir()):
-        kind = {".tif": "tiff", ".jpg": "jpeg", ".pgm": "ppm", ".hdf5": "hdf5"}.get(path.suffix, path.suffix[1:])
-        if kind not in {"png", "tiff", "jpeg", "pfm", "npy", "ppm", "bmp", "webp", "hdf5"} or path.stem == "heights":
+        kind = {".tif": "tiff", ".jpg": "jpeg", ".pgm": "ppm", ".pbm": "ppm"}.get(path.suffix, path.suffix[1:])
+        if kind not in KINDS or path.stem == "heights":
             continue
-        damage = {"ppm": "pfm", "bmp": "raw", "webp": "raw", "hdf5": "hdf5"}.get(kind, kind)
-        depth_file = path.stem in {"depth", "plain"}
+        damage = {"ppm": "pfm", "bmp": "raw", "webp": "raw"}.get(kind, kind)
+        depth_file = path.stem.startswith("depth") or path.suffix == ".hdf5"
         cases.append(Case(kind, damage, path, read_depth if depth_file else read_image))
-        if kind in {"png", "jpeg", "bmp", "webp", "ppm"}:
+        if kind in {"png", "jpeg", "bmp", "webp"}:
             cases.append(Case("header", damage, path, lambda path: check_header(path.read_bytes())))
     return cases
 
@@ -126,6 +136,25 @@ def _tiffs(folder: Path) -> list[Case]:
             if not made.refusals(depth):
                 cases.append(Case("tiff", "tiff", path, read))
     return cases
+
+
+def _write_exr(folder: Path, depth: np.ndarray) -> None:
+    """Write depth in each compression and layout of OpenEXR, if its package is installed."""
+    try:
+        import OpenEXR
+    except ImportError:
+        return
+    half, values = depth.astype(np.float16), {"Z": depth}
+    for number, name in enumerate(name for name in dir(OpenEXR) if name.endswith("_COMPRESSION") and "J2K" not in name):
+        header = {"compression": getattr(OpenEXR, name), "type": OpenEXR.scanlineimage}
+        if number % 2:
+            header |= {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+        channels = {"R": half, "G": half, "B": half, **values} if number % 3 else values
+        OpenEXR.File(header, channels).write(str(folder / f"depth_{name}.exr"))
+    parts = [
+        OpenEXR.Part({"type": OpenEXR.scanlineimage, "name": name}, {"Y": depth}, name) for name in ("id", "depth")
+    ]
+    OpenEXR.File(parts).write(str(folder / "depth_parts.exr"))
 
 
 def _numbers(folder: Path) -> list[Case]:

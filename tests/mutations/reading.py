@@ -45,6 +45,8 @@ BY_STRUCTURE = BY_KIND | {
     "text": (containers.text_word, containers.text_word, containers.text_line),
     "hdf5": (containers.hdf5_structure,),
     "tar": (containers.tar_header,),
+    "npz": (containers.npz_member,),
+    "exr": (containers.exr_attribute,),
 }
 
 
