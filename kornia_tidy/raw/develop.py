@@ -111,7 +111,7 @@ def default_method(raw: RawCapture) -> str:
     letters = raw.pattern_letters or ""
     if letters in BAYER:
         return "libraw_ahd"
-    return "libraw_markesteijn" if len(letters) == 36 else "bilinear"
+    return "libraw_markesteijn" if is_xtrans(letters) else "bilinear"
 
 
 def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) -> Tensor:
