@@ -48,13 +48,14 @@ def decoded_by_libraw(data: bytes, sensor: Sensor) -> bool:
     Raises:
         ValueError: if they are compressed in a way that neither LibRaw nor this module decodes.
     """
-    tiled = TILES[0] in sensor.directory.entries
+    directory = sensor.directory
+    tiled = TILES[0] in directory.entries
     if sensor.compression in {JPEG, LOSSY_JPEG}:
         name = "lossy JPEG" if sensor.compression == LOSSY_JPEG else "JPEG"
         if sensor.floating or sensor.separate:
             kind = "floating-point samples" if sensor.floating else "separate planes (PlanarConfiguration 2)"
             raise ValueError(f"its {kind} compressed by {name} cannot be decoded")
-        strips = sensor.directory.long_values(data, STRIPS[0])
+        strips = directory.long_values(data, STRIPS[0])
         if not tiled and len(strips) > 1:
             raise ValueError(
                 f"its {len(strips)} strips compressed by {name} cannot be decoded, only tiles or one strip"
@@ -86,6 +87,8 @@ def read_samples(data: bytes, sensor: Sensor) -> np.ndarray:
     together = sensor.samples // planes
     for place, length, (rows, columns, plane, top, left) in _blocks(data, sensor):
         row = _row_bytes(sensor, columns)
+        if columns % step:
+            raise ValueError(f"its Predictor of every {step} pixels does not fit rows of {columns}")
         stored = data[place : place + (row * rows if sensor.compression == NO_COMPRESSION else length)]
         if sensor.compression != NO_COMPRESSION:
             stored = _inflated(stored, row * rows)
@@ -116,6 +119,7 @@ def plain_version(data: bytes, sensor: Sensor) -> bytearray:
         if tag in sensor.directory.entries:
             layout = "HHIHxx" if kind == 3 else "HHII"
             struct.pack_into(order + layout, plain, sensor.directory.entries[tag], new, kind, 1, value)
+    plain += bytes(max(0, ANYWHERE + 2 * sensor.samples * sensor.width * sensor.height - len(plain)))
     return plain
 
 
@@ -218,11 +222,7 @@ def _values(block: np.ndarray, sensor: Sensor, count: int, kind: str, step: int)
 
 def _summed(values: np.ndarray, step: int) -> np.ndarray:
     """Return sums over rows of differences to the value ``step`` before, modulo the range of the integers."""
-    whole = values.shape[1] // step * step
-    sums = values.copy()
-    parts = sums[:, :whole].reshape(len(values), -1, step)
-    sums[:, :whole] = np.cumsum(parts, 1, dtype=values.dtype).reshape(len(values), whole)
-    return sums
+    return np.cumsum(values.reshape(len(values), -1, step), 1, dtype=values.dtype).reshape(values.shape)
 
 
 def _from_24_bits(block: np.ndarray, order: str) -> np.ndarray:
