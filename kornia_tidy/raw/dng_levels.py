@@ -71,7 +71,7 @@ def described(header: dict[str, Any], picture: np.ndarray, sensor: Sensor, raw: 
 def _take_neutral(header: dict[str, Any], sensor: Sensor) -> None:
     """Take the white balance of a linear picture from its tag; LibRaw divides it by the range of each plane."""
     known = header["white_balance"][: sensor.samples]
-    if len(sensor.neutral) == sensor.samples and all(value > 0 for value in (*known, *sensor.neutral)):
+    if len(sensor.neutral) == sensor.samples and all(value > 0 for value in known):
         told = [float(np.float32(1) / np.float32(value)) for value in sensor.neutral]
         daylight = header["daylight_balance"]
         daylight[: sensor.samples] = [d * t / k for d, t, k in zip(daylight, told, known, strict=False)]

@@ -38,6 +38,7 @@ NO_COMPRESSION, JPEG = 1, 7
 PREDICTORS = {2: ("integer", 1), 34892: ("integer", 2), 34893: ("integer", 4)}
 PREDICTORS |= {3: ("float", 1), 34894: ("float", 2), 34895: ("float", 4)}
 UNUSED_TAG, ANYWHERE = 0xFFFE, 8  # of LibRaw's version of a file
+HIGHEST = 65535  # of a sample
 ROWS_AT_ONCE = 64  # packed bits take eight times the memory of the samples
 HIGHEST_DEGREE = 8  # of LibRaw's polynomials
 
@@ -98,12 +99,12 @@ def read_samples(data: bytes, sensor: Sensor) -> np.ndarray:
         values = _values(block, sensor, columns * together, kind, step * together)
         there = picture[top : top + rows, left : left + columns, plane * together : (plane + 1) * together]
         there[:] = values.reshape(rows, columns, together)[: there.shape[0], : there.shape[1]]
-    table = np.array(directory.long_values(data, LINEARIZATION), np.uint16)
-    if len(table):
-        if sensor.floating:
-            raise ValueError("its floating-point samples have a LinearizationTable, which is for integers")
-        picture = table[np.minimum(picture, len(table) - 1)]
-    return picture
+    if LINEARIZATION not in directory.entries:
+        return picture
+    values = directory.long_values(data, LINEARIZATION)
+    if sensor.floating or not values or not all(type(value) is int and 0 <= value <= HIGHEST for value in values):
+        raise ValueError(f"its LinearizationTable of {len(values)} values is not one of 16 bits for integer samples")
+    return np.array(values, np.uint16)[np.minimum(picture, len(values) - 1)]
 
 
 def plain_version(data: bytes, sensor: Sensor) -> bytearray:
@@ -112,6 +113,7 @@ def plain_version(data: bytes, sensor: Sensor) -> bytearray:
     LibRaw opens a file only if it knows how to decode it, and decodes it before it tells the white balance.
     """
     plain, order = bytearray(data), sensor.directory.order
+    plain += bytes(max(12, ANYWHERE + 2 * sensor.samples * sensor.width * sensor.height - len(plain)))
     strips = dict.fromkeys((STRIPS[0], TILES[0]), (STRIPS[0], 4, ANYWHERE))
     one = {COMPRESSION: (COMPRESSION, 3, 1), PLANAR: (PLANAR, 3, 1), SAMPLE_FORMAT: (SAMPLE_FORMAT, 3, 1)}
     unused = dict.fromkeys((PREDICTOR, LINEARIZATION, *TILE_SIZE, STRIPS[1], TILES[1]), (UNUSED_TAG, 3, 1))
@@ -119,7 +121,6 @@ def plain_version(data: bytes, sensor: Sensor) -> bytearray:
         if tag in sensor.directory.entries:
             layout = "HHIHxx" if kind == 3 else "HHII"
             struct.pack_into(order + layout, plain, sensor.directory.entries[tag], new, kind, 1, value)
-    plain += bytes(max(0, ANYWHERE + 2 * sensor.samples * sensor.width * sensor.height - len(plain)))
     return plain
 
 
@@ -163,7 +164,7 @@ def _blocks(data: bytes, sensor: Sensor) -> Iterator[tuple[int, int, tuple[int, 
     if sensor.compression == NO_COMPRESSION:
         lengths = lengths or (0,) * len(offsets)  # not needed
     needed = kept * -(-sensor.height // rows) * -(-sensor.width // columns)
-    if not len(offsets) == len(lengths) == needed:
+    if not len(offsets) == len(lengths) == needed or not all(type(n) is int for n in (*offsets, *lengths)):
         kind = "tiles" if tiled else "strips"
         raise ValueError(
             f"its picture takes {needed} {kind}, and it names {len(offsets)} places and {len(lengths)} sizes"

@@ -131,7 +131,7 @@ def dng_sensor(data: bytes, directories: list[Directory]) -> Sensor | None:
         if samples != 1:
             raise ValueError(f"its picture behind a filter array has {samples} samples a pixel, not 1")
         tile, planes = _square_tile(*_filter_array(found))
-    elif samples > 1:
+    elif samples != 1:
         planes = _plane_names(found, samples)
     black, columns, rows = _black(data, found, directories[0], samples)
     area = found.whole_numbers(ACTIVE_AREA) if ACTIVE_AREA in found else (0, 0, height, width)
@@ -148,6 +148,7 @@ def dng_sensor(data: bytes, directories: list[Directory]) -> Sensor | None:
     white = _white(found if WHITE_LEVEL in found else directories[0], samples, 1 if floating else 2**bits - 1)
     separate = samples > 1 and _one(found, PLANAR, 1) == 2
     neutral = found.get(NEUTRAL) or directories[0].get(NEUTRAL) or ()
+    neutral = neutral if all(isinstance(value, int | float) and 0 < value < math.inf for value in neutral) else ()
     return Sensor(
         found, width, height, samples, bits, floating, compression, separate, planes, tile, area, black, columns,
         rows, white, neutral,
@@ -184,7 +185,7 @@ def ignored_opcodes(data: bytes, sensor: Sensor) -> list[str]:
 def opcodes(data: bytes, directory: Directory, tag: int) -> list[tuple[int, bool, bytes]]:
     """Return the opcodes of a list: code, whether a reader may skip it, and parameters. What is cut short ends it."""
     values = directory.long_values(data, tag)
-    text = values[0] if values and isinstance(values[0], bytes) else bytes(v for v in values if 0 <= v < 256)
+    text = values[0] if values and isinstance(values[0], bytes) else b""
     found: list[tuple[int, bool, bytes]] = []
     place = 4
     for _ in range(min(int.from_bytes(text[:4], "big"), MOST_OPCODES)):
@@ -335,8 +336,8 @@ def _plane_names(directory: Directory, samples: int) -> str:
     planes = _letters(_plane_codes(directory))
     if samples not in {3, 4} or len(planes) != samples:
         raise ValueError(
-            f"its linear picture has {samples} samples a pixel and the colours {' '.join(planes)}, and only one sample, "
-            "or 3 or 4 of as many colours, can be decoded"
+            f"its linear picture has {samples} samples a pixel and the colours {' '.join(planes)}, and only one "
+            "sample, or 3 or 4 of as many colours, can be decoded"
         )
     return planes
 

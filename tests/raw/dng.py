@@ -21,7 +21,7 @@ def dng(counts, pattern="RGGB", black=(64,), white=1023, order="<", **more):
     height, width = counts.shape[:2]
     channels = 1 if counts.ndim == 2 else counts.shape[2]
     side = 0 if pattern is None else int(len(pattern) ** 0.5)
-    blocks = more.get("blocks", [counts.astype(order + "u2").tobytes()])
+    blocks = more.get("blocks") or [counts.astype(order + "u2").tobytes()]
     gaps = more.get("gaps", [0] * len(blocks))
     offsets, lengths = (324, 325) if more.get("tiles") else (273, 279)
     tags = {
