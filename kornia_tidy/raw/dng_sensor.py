@@ -216,7 +216,7 @@ def shifted(tile: Sequence[str], down: int, right: int) -> list[str]:
 def _sample_kind(directory: Directory) -> tuple[int, bool, int]:
     """Return the bits of a sample, whether samples are floating-point numbers, and the compression."""
     bits, kinds = directory.whole_numbers(BITS) or (0,), directory.whole_numbers(SAMPLE_FORMAT) or (UNSIGNED,)
-    compression = _one(directory, COMPRESSION, 1)
+    compression = _one(directory, COMPRESSION) or 1  # 0 is written for none
     if compression not in DECODED:
         name = f"{COMPRESSIONS[compression]} (Compression {compression})" if compression in COMPRESSIONS else None
         raise ValueError(
@@ -250,7 +250,7 @@ def _black(
         raise ValueError(
             f"its BlackLevel has {len(levels)} values, its BlackLevelRepeatDim says {rows} x {columns}{of}"
         )
-    deltas = [source.long_values(data, tag) for tag in (BLACK_COLUMNS, BLACK_ROWS)]
+    deltas = source.long_values(data, BLACK_COLUMNS), source.long_values(data, BLACK_ROWS)
     for name, values in zip(("BlackLevel", "BlackLevelDeltaH", "BlackLevelDeltaV"), (levels, *deltas), strict=True):
         if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
             raise ValueError(f"its {name} holds what is no finite number")
