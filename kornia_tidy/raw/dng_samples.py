@@ -61,8 +61,11 @@ def decoded_by_libraw(data: bytes, sensor: Sensor) -> bool:
             raise ValueError(
                 f"its {len(strips)} strips compressed by {name} cannot be decoded, only tiles or one strip"
             )
+        wide = _first(sensor, TILE_SIZE[0])
         if sensor.compression == LOSSY_JPEG:
             _check_lossy(data, sensor)
+        elif tiled and wide > sensor.width:
+            raise ValueError(f"its JPEG tiles of {wide} pixels are wider than its picture of {sensor.width}")
         return True
     if sensor.floating or sensor.separate or sensor.compression != NO_COMPRESSION or tiled:
         return False
@@ -154,11 +157,11 @@ def _blocks(data: bytes, sensor: Sensor) -> Iterator[tuple[int, int, tuple[int, 
     directory = sensor.directory
     tiled, kept = TILES[0] in directory.entries, sensor.samples if sensor.separate else 1
     if tiled:
-        columns, rows = ((directory.whole_numbers(tag) or (0,))[0] for tag in TILE_SIZE)
+        columns, rows = (_first(sensor, tag) for tag in TILE_SIZE)
         if min(rows, columns) < 1:
             raise ValueError(f"its tiles have {columns} x {rows} pixels (TileWidth and TileLength)")
     else:
-        rows = (directory.whole_numbers(ROWS_PER_STRIP) or (0,))[0] or sensor.height
+        rows = _first(sensor, ROWS_PER_STRIP) or sensor.height
         rows, columns = min(rows, sensor.height), sensor.width
     offsets, lengths = (directory.long_values(data, tag) for tag in (TILES if tiled else STRIPS))
     if sensor.compression == NO_COMPRESSION:
@@ -174,14 +177,18 @@ def _blocks(data: bytes, sensor: Sensor) -> Iterator[tuple[int, int, tuple[int, 
         yield offset, length, (rows if tiled else min(rows, sensor.height - top), columns, plane, top, left)
 
 
+def _first(sensor: Sensor, tag: int) -> int:
+    return (sensor.directory.whole_numbers(tag) or (0,))[0]
+
+
 def _row_bytes(sensor: Sensor, columns: int) -> int:
     return -(-columns * (1 if sensor.separate else sensor.samples) * sensor.bits // 8)
 
 
 def _predictor(sensor: Sensor) -> tuple[str, int]:
     """Return the kind of differences that are stored, and the number of pixels between the two samples."""
-    code = (sensor.directory.whole_numbers(PREDICTOR) or (1,))[0]
-    if code == 1:
+    code = _first(sensor, PREDICTOR)
+    if code in {0, 1}:
         return "", 1
     kind, step = PREDICTORS.get(code, ("", 1))
     if kind != ("float" if sensor.floating else "integer") or sensor.bits % 8 or sensor.compression == NO_COMPRESSION:

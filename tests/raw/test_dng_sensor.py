@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -209,6 +210,21 @@ class TestSamples(BaseTester):
         with pytest.raises(ValueError, match=r"counts must be whole numbers, got torch\.float32"):
             encode_dng(raw)
 
+    @pytest.mark.parametrize("order", ["<", ">"])
+    @pytest.mark.parametrize("tile", [None, (16, 32)])
+    def test_feature_floating_point_below_a_preview_as_tifffile_writes_it(self, order, tile, tmp_path):
+        light = np.random.default_rng(0).uniform(0, 9, (36, 48)).astype(np.float16)
+        version = [(50706, "B", 4, (1, 4, 0, 0), True), (50708, "s", 0, "Maker Model One", True)]
+        sensor_tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, bytes([1, 0, 2, 1]), True)]
+        with tifffile.TiffWriter(tmp_path / "a.dng", byteorder=order) as file:
+            preview = np.zeros((16, 16, 3), np.uint8)
+            file.write(preview, photometric="rgb", subfiletype=1, subifds=1, extratags=version, metadata=None)
+            stored = {"compression": "deflate", "predictor": 3, "tile": tile, "extratags": sensor_tags}
+            file.write(light, photometric="cfa", subfiletype=0, metadata=None, **stored)
+        raw = RawCapture.open(tmp_path / "a.dng")
+        assert (raw.pattern_letters, raw.white) == ("GRBG", 1)
+        np.testing.assert_array_equal(raw.counts[0].numpy(), light)
+
     def test_feature_white_of_floating_point_is_one_by_default(self):
         told = {258: (SHORT, [32]), 339: (SHORT, [3]), 50717: None}
         raw = RawCapture.open(dng(COUNTS, black=(0,), extra=told, blocks=[(COUNTS / 1024).astype("<f4").tobytes()]))
@@ -217,6 +233,24 @@ class TestSamples(BaseTester):
     def test_feature_levels_of_fractions(self):
         raw = RawCapture.open(dng(COUNTS, extra={50714: (RATIONAL, [63.5])}))
         assert raw.black.tolist() == [[63.5, 63.5], [63.5, 63.5]]
+
+    @pytest.mark.parametrize(
+        ("extra", "sentence"),
+        [
+            (
+                {259: (SHORT, [7]), 322: (LONG, [64]), 323: (LONG, [16])},
+                "its JPEG tiles of 64 pixels are wider than its",
+            ),
+            ({259: (SHORT, [34892])}, "its lossy JPEG is not of the kind that can be linearised"),
+            ({259: (SHORT, [8]), 317: (SHORT, [3])}, "its Predictor 3 does not belong to its integer samples of 16"),
+            ({258: (SHORT, [8]), 322: (LONG, [0]), 323: (LONG, [16])}, "its tiles have 0 x 16 pixels"),
+            ({278: (LONG, [5])}, "its picture takes 8 strips, and it names 1 places and 1 sizes"),
+        ],
+    )
+    def test_exception_names_how_it_is_stored(self, extra, sentence):
+        data = dng(COUNTS, extra=extra, tiles=322 in extra)
+        with pytest.raises(ValueError, match=rf"^cannot read the raw file of \d+ bytes: [^\n]*({sentence})"):
+            RawCapture.open(data)
 
     def test_exception_damaged_deflate(self):
         told = {259: (SHORT, [8])}
