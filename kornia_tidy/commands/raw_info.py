@@ -15,8 +15,8 @@ from kornia_tidy.raw.capture import RawCapture, RawInfo
 DESCRIPTION = """\
 Print the properties of raw files: camera, lens and exposure; size and filter array of
 the visible area; black and white levels and the range of the counts; white balance as
-shot, colour matrices and orientation. Every file is decoded completely, so a file that
-is listed can be developed.
+shot, colour matrices and orientation; opcodes of a DNG that are not applied. Every file is
+decoded completely, so a file that is listed can be developed.
 """
 
 EXAMPLES = """\
@@ -100,8 +100,10 @@ def in_words(raw: RawCapture) -> list[tuple[str, str]]:
         picture is upright
     """
     height, width = raw.counts.shape[-2:]
-    colour = f"filter array {raw.pattern_letters}" if raw.pattern else "linear RGB" if raw.colors else "monochrome"
-    low, high = (int(end) for end in raw.counts.aminmax())
+    linear = f"linear {raw.colors}" if raw.colors else "monochrome"
+    colour = f"filter array {raw.pattern_letters}" if raw.pattern else linear
+    low, high = (end.item() for end in raw.counts.aminmax())
+    ignored = ", ".join(raw.info.ignored_opcodes)
     matrices = [name for name in ("xyz_to_camera", "camera_to_srgb") if getattr(raw, name) is not None]
     aspect = "" if raw.pixel_aspect == 1 else f"; its pixels are {raw.pixel_aspect:.4g} times as wide as high"
     return [
@@ -110,11 +112,12 @@ def in_words(raw: RawCapture) -> list[tuple[str, str]]:
         ("sensor", f"{width} x {height} px, {colour}"),
         (
             "levels",
-            f"black {_levels(raw.black)}, white {raw.white:g}; counts {low} to {high}, "
+            f"black {_levels(raw.black)}, white {raw.white:g}; counts {low:.7g} to {high:.7g}, "
             f"{100 * _saturated(raw):.3g} % of them at white or above",
         ),
         ("colour", f"white balance {_balance(raw)}; {' and '.join(matrices) or 'no colour matrix'}"),
         ("picture", FLIPS[raw.flip] + aspect),
+        *([("opcodes", f"{ignored}: not applied")] if ignored else []),
     ]
 
 
@@ -126,7 +129,7 @@ def as_json(raw: RawCapture) -> dict[str, Any]:
 
     info = raw.info
     channels, height, width = raw.counts.shape
-    low, high = (int(end) for end in raw.counts.aminmax())
+    low, high = (end.item() for end in raw.counts.aminmax())
     return {
         "make": info.make,
         "model": info.model,
@@ -137,6 +140,7 @@ def as_json(raw: RawCapture) -> dict[str, Any]:
         "focal_length": info.focal_length,
         "noise_profile": info.noise_profile,
         "timestamp": info.timestamp.isoformat() if info.timestamp else None,
+        "ignored_opcodes": info.ignored_opcodes,
         "width": width,
         "height": height,
         "channels": channels,

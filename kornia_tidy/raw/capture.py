@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.raw.decoding import Source, decode_raw, source_bytes, source_name
-from kornia_tidy.raw.filter_array import filter_tile, tile_planes, tiled
+from kornia_tidy.raw.filter_array import filter_tile, indexed_tile, tile_planes, tiled
 from kornia_tidy.raw.validation import check_counts, validated_white
 
 
@@ -33,6 +34,8 @@ class RawInfo:
         timestamp: time of the exposure by the camera's clock.
         noise_profile: scale S and offset O of the noise's variance S x + O, x from 0 (black) to 1 (white): one pair for
             all colours, or one for each.
+        ignored_opcodes: names of the steps that the file (a DNG) asks for and that are not applied, such as a phone's
+            gain map against shading; ``(optional)`` follows those that a reader may leave out.
     """
 
     make: str | None = None
@@ -44,6 +47,7 @@ class RawInfo:
     focal_length: float | None = None
     timestamp: datetime | None = None
     noise_profile: tuple[tuple[float, float], ...] | None = None
+    ignored_opcodes: tuple[str, ...] = ()
 
     @property
     def camera(self) -> str:
@@ -63,19 +67,21 @@ class RawCapture:
     """Counts of the visible area of a sensor, with levels, colours and orientation.
 
     Attributes:
-        counts: (C, H, W) int32, in the sensor's orientation; C is 1 behind a filter array or for a monochrome
-            sensor, 3 for linear RGB.
-        pattern: index into ``colors`` at each place of the repeating tile, 2x2 (Bayer, four-colour) or 6x6 (X-Trans),
-            from the upper left corner of ``counts``; None without a filter array.
+        counts: (C, H, W) int32, or float32 from a floating-point DNG, in the sensor's orientation; C is 1 behind a
+            filter array or for a monochrome sensor, 3 or 4 for linear colours.
+        pattern: index into ``colors`` at each place of the repeating tile, 2x2 (Bayer, four-colour), 4x4 (quad-Bayer)
+            or 6x6 (X-Trans), from the upper left corner of ``counts``; None without a filter array.
         colors: names of the channels by index, ``"RGBG"`` for a Bayer array (the second green is that of blue's
-            rows), ``"GMCY"``, ``"RGB"`` for X-Trans and linear RGB, ``""`` for monochrome.
+            rows), ``"RGB"`` for other arrays of these colours and linear RGB, ``""`` for monochrome; of four colours
+            as the file names them: C is cyan, M magenta, Y yellow, W white.
         black: count without light, float32: one for each place of the tile, or (C,) without a filter array.
         white: saturation count, with the black level included.
         xyz_to_camera: matrix from CIE XYZ under D65 to the camera's colours, (n, 3) for the n = 3 or 4 different
             letters of ``colors``, or None if unknown.
         camera_to_srgb: matrix from white-balanced camera colours to linear sRGB, (3, 3 or 4), computed from the
             colour matrices of a DNG, or None.
-        white_balance: factors as shot, (len(colors),), 1 for the first green; None if unknown.
+        white_balance: factors as shot, (len(colors),), 1 for the first green, or the first channel without one; None if
+            unknown.
         daylight_balance: factors for daylight, likewise.
         flip: how to turn the picture upright: 1 mirrors columns, 2 rows, then 4 swaps the two (LibRaw's code).
         pixel_aspect: width of a pixel over its height.
@@ -117,10 +123,15 @@ class RawCapture:
 
         Warns:
             UserWarning: if the white level of the file is too low, if more than one count in a thousand lies above
-                white, or if a file without a header is recognised as a Kodak C330's by its length.
+                white, if the file asks for opcodes, which are not applied, or if a file without a header is recognised
+                as a Kodak C330's by its length.
 
         Convention:
-            The counts cover the visible area without the masked borders. A tone curve of the file is inverted.
+            - The counts cover the visible area without the masked borders. A tone curve of the file is inverted.
+            - Floating-point samples are returned as they are stored.
+            - Where the black levels of a DNG repeat over a larger tile than its filter array, or differ by row or
+              column, or its planes differ in white, the counts are rescaled to one black level for each place and one
+              white level, and rounded.
         """
         if white is not None:
             check_positive("white", white, "counts")
@@ -131,6 +142,12 @@ class RawCapture:
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"cannot read {name}: its description of the sensor is invalid ({error})") from None
         check_counts(name, raw.counts, raw.black, raw.white, length)
+        if raw.info.ignored_opcodes:
+            warnings.warn(
+                f"{name}: its opcodes {', '.join(raw.info.ignored_opcodes)} are not applied: shading, distortion and "
+                "defects of the camera stay in the counts; a DNG converter can remove them",
+                stacklevel=2,
+            )
         return replace(raw, white=validated_white(name, raw.counts, raw.white, given=white is not None))
 
     @classmethod
@@ -278,7 +295,9 @@ class RawCapture:
 
 def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
     """Return the capture described by the decoder's header, with checks against values of damaged files."""
-    pattern, colors, info = header["pattern"], header["colors"], dict(header["info"])
+    pattern, colors, info = header.get("pattern"), header["colors"], dict(header["info"])
+    if header.get("letters"):
+        pattern, colors = indexed_tile(header["letters"], colors)
     if pattern is not None:
         pattern = tuple(map(tuple, pattern))
         if not all(0 <= index < len(colors) for row in pattern for index in row):
@@ -287,6 +306,7 @@ def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
             raise ValueError(f"{counts.shape[2]} x {counts.shape[1]} pixels")
     if not 0.1 < header["pixel_aspect"] < 10:
         raise ValueError(f"pixel aspect {header['pixel_aspect']}")
+    info["ignored_opcodes"] = tuple(info.get("ignored_opcodes", ()))
     if "timestamp" in info:
         info["timestamp"] = datetime.fromisoformat(info["timestamp"])
     if "noise_profile" in info:
@@ -311,13 +331,13 @@ def _from_header(header: dict[str, Any], counts: Tensor) -> RawCapture:
 def _matrix(rows: list[list[float]]) -> Tensor | None:
     """Return a colour matrix, or None if the file has none, for which LibRaw returns zeros."""
     matrix = torch.tensor(rows)
-    return matrix if matrix.numel() and bool(matrix.isfinite().all() & (matrix != 0).any()) else None
+    known = matrix.numel() and bool(matrix.isfinite().all() & (matrix != 0).any(0).all() & (matrix != 0).any(1).all())
+    return matrix if known else None
 
 
 def _balance(factors: list[float], colors: str) -> Tensor | None:
-    """Return white balance factors scaled to 1 for the first green, or None if one is unknown."""
-    if "G" not in colors:
-        return None
+    """Return white balance factors scaled to 1 for the first green (else first) channel, or None if one is unknown."""
     known = [factors[i] or factors[colors.index(letter)] for i, letter in enumerate(colors)]
-    balance = torch.tensor(known) / known[colors.index("G")] if known[colors.index("G")] else torch.zeros(1)
+    first = known[max(colors.find("G"), 0)] if known else 0
+    balance = torch.tensor(known) / first if first else torch.zeros(1)
     return balance if bool(balance.isfinite().all() & (balance > 0).all()) else None

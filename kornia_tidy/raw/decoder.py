@@ -7,10 +7,9 @@ this process with limits of time and memory, and the parent process reads a JSON
 
 from __future__ import annotations
 
-import importlib.machinery
+import importlib
 import io
 import json
-import math
 import os
 import sys
 import types
@@ -18,6 +17,7 @@ from typing import Any
 
 LARGEST_TILE = 6  # X-Trans
 LOADED = "loaded"  # printed once NumPy and LibRaw are imported: an earlier crash is not caused by the file
+PACKAGE = "kornia_tidy_raw"  # by which this folder is imported here
 C330_LENGTHS = (2247168, 3370752)  # bytes; LibRaw recognises the headerless files of a Kodak C330 by their length
 
 
@@ -50,65 +50,66 @@ def limit(seconds: int, memory: int) -> None:
 
 
 def _beside(name: str) -> Any:
-    """Import a module of this folder by its path, since importing the package would take longer than decoding."""
-    path = os.path.join(os.path.dirname(os.path.abspath(__file__)), f"{name}.py")
-    loader = importlib.machinery.SourceFileLoader(name, path)
-    module = types.ModuleType(name)
-    loader.exec_module(module)
-    return module
+    """Import a module of this folder, but not the package, which would take longer than decoding."""
+    package = types.ModuleType(PACKAGE)
+    package.__path__ = [os.path.dirname(os.path.abspath(__file__))]
+    sys.modules.setdefault(PACKAGE, package)
+    return importlib.import_module(f"{PACKAGE}.{name}")
 
 
 def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
-    """Decode a raw file into a header and uint16 counts of the visible area, by rows with channels last."""
+    """Decode a raw file into a header and counts of the visible area, by rows with channels last."""
     import numpy as np  # noqa: PLC0415 (after the limits)
     import rawpy  # noqa: PLC0415
 
-    tags = _beside("tags")
+    tags, dng_sensor, dng_samples, dng_levels = map(_beside, ("tags", "dng_sensor", "dng_samples", "dng_levels"))
 
     sys.stderr.write(LOADED + "\n")  # standard error is not buffered
-    if missing := tags.missing_bytes(data):
+    directories = list(tags.tiff_directories(data))
+    if missing := dng_sensor.missing_bytes(data, directories):
         raise ValueError(f"it is cut short, {missing} bytes of its picture are missing")
-    if fault := tags.filter_array_fault(data):
-        raise ValueError(fault)
-    raw = rawpy.imread(io.BytesIO(data))  # left open: the counts are LibRaw's own memory
-    counts = np.ascontiguousarray(raw.raw_image_visible)
-    sizes, levels = raw.sizes, raw.black_level_per_channel
+    sensor, picture = dng_sensor.dng_sensor(data, directories), None
+    if sensor is not None and not dng_samples.decoded_by_libraw(data, sensor):
+        picture = dng_samples.read_samples(data, sensor)
+    # Left open: the counts are LibRaw's own memory.
+    raw = rawpy.imread(io.BytesIO(data if picture is None else dng_samples.plain_version(data, sensor)))
+    counts = raw.raw_image_visible
+    colors = raw.rgb_xyz_matrix.tolist(), raw.color_matrix.tolist()
+    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw does not return this tag
+        colors = colors[0], tags.kodak_matrix(data) or colors[1]
+    header = {
+        "xyz_to_camera": colors[0],
+        "camera_to_srgb": colors[1],
+        "white_balance": raw.camera_whitebalance,
+        "daylight_balance": raw.daylight_whitebalance,
+        "flip": raw.sizes.flip,
+        "pixel_aspect": raw.sizes.pixel_aspect,
+        "info": {**tags.camera_tags(data), **libraw_info(raw)},
+    }
+    if sensor is not None and (counts.ndim == 2) == (sensor.samples == 1):
+        header["info"]["ignored_opcodes"] = dng_sensor.ignored_opcodes(data, sensor)
+        counts = dng_levels.described(header, counts if picture is None else picture, sensor, raw)
+    else:
+        counts = _described_by_libraw(header, counts, raw)
+    counts = np.ascontiguousarray(counts)
+    header |= {"shape": counts.shape if counts.ndim == 3 else (*counts.shape, 1), "type": counts.dtype.name}
+    if counts.ndim == 3 and len(data) in C330_LENGTHS and not any(directories):
+        header |= finished_colors()
+    return header, counts.data.cast("B")
+
+
+def _described_by_libraw(header: dict[str, Any], counts: Any, raw: Any) -> Any:
+    """Write filter array and levels as LibRaw tells them into a header, and return the counts of its channels."""
     channels = 1 if counts.ndim == 2 else min(raw.num_colors, counts.shape[2])
     pattern = None if counts.ndim == 3 or raw.num_colors == 1 else filter_pattern(raw)
-    colors = raw.color_desc.decode("ascii", "replace")
+    colors, levels = raw.color_desc.decode("ascii", "replace"), raw.black_level_per_channel
     if pattern is None:
-        colors = "" if channels == 1 else colors[:channels]
-        black = levels[:channels]
+        colors, black = "" if channels == 1 else colors[:channels], levels[:channels]
     else:
         colors = colors[: 1 + max(map(max, pattern))]
         black = [[levels[c] for c in row] for row in pattern]
-        if (tile := tags.black_tile(data)) is not None:
-            black = mean_over_tile(tile, len(pattern), len(pattern[0]))
-    if counts.ndim == 3:
-        counts = np.ascontiguousarray(counts[..., :channels])
-    white = raw.white_level
-    if counts.ndim == 3 and len(set(levels)) == 1 and white + levels[0] in tags.white_levels(data):
-        white += levels[0]  # LibRaw subtracts a common black level from white but not from the counts
-    camera_to_srgb = raw.color_matrix.tolist()
-    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():  # LibRaw does not return this tag
-        camera_to_srgb = tags.kodak_matrix(data) or camera_to_srgb
-    header = {
-        "shape": (*counts.shape[:2], channels),
-        "pattern": pattern,
-        "colors": colors,
-        "black": black,
-        "white": white,
-        "xyz_to_camera": raw.rgb_xyz_matrix.tolist(),
-        "camera_to_srgb": camera_to_srgb,
-        "white_balance": raw.camera_whitebalance,
-        "daylight_balance": raw.daylight_whitebalance,
-        "flip": sizes.flip,
-        "pixel_aspect": sizes.pixel_aspect,
-        "info": {**tags.camera_tags(data), **libraw_info(raw)},
-    }
-    if counts.ndim == 3 and len(data) in C330_LENGTHS and not any(tags.tiff_directories(data)):
-        header |= finished_colors()
-    return header, counts.data.cast("B")
+    header |= {"pattern": pattern, "colors": colors, "black": black, "white": raw.white_level}
+    return counts if counts.ndim == 2 else counts[..., :channels]
 
 
 def finished_colors() -> dict[str, Any]:
@@ -135,21 +136,6 @@ def filter_pattern(raw: Any) -> list[list[int]]:
         if all(places[row][column] == tile[row % side][column % side] for row in span for column in span):
             return tile
     raise ValueError("its filter array repeats neither after 2 nor after 6 pixels")
-
-
-def mean_over_tile(levels: list[list[float]], rows: int, columns: int) -> list[list[float]]:
-    """Return black levels averaged onto the filter tile, from levels that repeat with another period."""
-    tall, wide = math.lcm(len(levels), rows), math.lcm(len(levels[0]), columns)
-
-    def mean(row: int, column: int) -> float:
-        places = [
-            levels[y % len(levels)][x % len(levels[0])]
-            for y in range(row, tall, rows)
-            for x in range(column, wide, columns)
-        ]
-        return sum(places) / len(places)
-
-    return [[mean(row, column) for column in range(columns)] for row in range(rows)]
 
 
 def libraw_info(raw: Any) -> dict[str, Any]:

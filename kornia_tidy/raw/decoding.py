@@ -38,6 +38,7 @@ BEGINNINGS = {
     4: (b"ftypcrx ",),
     6: (b"HEAPCCDR",),
 }  # fmt: skip
+COUNTS = {"uint16": torch.int32, "int32": torch.int32, "float32": torch.float32}  # by the decoder's data type
 SENTENCES = {
     "LibRawIOError": "it is damaged or cut short",
     "LibRawDataError": "its data are damaged, or of a kind that LibRaw does not decode",
@@ -59,7 +60,7 @@ OUT_OF_MEMORY_WORDS = (
 
 
 def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[str, Any], Tensor, int]:
-    """Decode a raw file into LibRaw's header, the counts, (C, H, W) int32, and the file's length in bytes.
+    """Decode a raw file into a header, the counts, (C, H, W) int32 or float32, and the file's length in bytes.
 
     Args:
         source: a path, the bytes of a file, or a binary file, which is read from its current position.
@@ -98,7 +99,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
         if complaint is not None:
             raise ValueError(f"cannot read {name}: {complaint}")
         try:
-            return header, _counts(result, header["shape"]), length
+            return header, _counts(result, header["shape"], header["type"]), length
         except (KeyError, TypeError, ValueError):
             raise ValueError(f"cannot read {name}: decoding it gave no complete picture") from None
 
@@ -205,13 +206,14 @@ def _header(result: IO[bytes]) -> dict[str, Any]:
     return header if isinstance(header, dict) else {}
 
 
-def _counts(result: IO[bytes], shape: list[int]) -> Tensor:
+def _counts(result: IO[bytes], shape: list[int], kind: str) -> Tensor:
     height, width, channels = shape
-    start = result.tell()
-    if result.seek(0, SEEK_END) - start != 2 * height * width * channels:
+    start, dtype = result.tell(), np.dtype(kind)
+    if kind not in COUNTS or result.seek(0, SEEK_END) - start != dtype.itemsize * height * width * channels:
         raise ValueError
-    mapped = np.memmap(result, dtype=np.uint16, mode="r", offset=start, shape=(height, width, channels))
-    counts = torch.empty(channels, height, width, dtype=torch.int32)  # not NumPy: see quantised_demosaicing.py
+    mapped = np.memmap(result, dtype=dtype, mode="r", offset=start, shape=(height, width, channels))
+    # Not allocated by NumPy: see quantised_demosaicing.py
+    counts = torch.empty(channels, height, width, dtype=COUNTS[kind])
     counts.numpy()[:] = mapped.transpose(2, 0, 1)
     return counts
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.raw.color import srgb_from_xyz
 from kornia_tidy.raw.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
-from kornia_tidy.raw.filter_array import Tile
+from kornia_tidy.raw.filter_array import Tile, is_xtrans
 from kornia_tidy.raw.quantised_demosaicing import ROWS_AT_ONCE, demosaic_quantised
 
 # kornia and OpenCV's older names denote a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
@@ -236,7 +236,10 @@ def _opencv(mosaic: Tensor, letters: str, colors: str, name: str, matrix: Tensor
 def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
     import rawpy  # noqa: PLC0415  (a C++ library, loaded only when needed)
 
-    kind = "Bayer" if letters in BAYER else "four-colour" if len(colors) == 4 else "X-Trans"
+    four = len(colors) == len(letters) == 4
+    kind = "Bayer" if letters in BAYER else "four-colour" if four else "X-Trans" if is_xtrans(letters) else "other"
+    if kind == "other":
+        raise ValueError(f"LibRaw demosaics Bayer, four-colour and X-Trans arrays, not {letters}: choose 'bilinear'")
     check_choice(f"LibRaw's demosaicing of a {kind} array", name, LIBRAW[kind])
     side = 6 if kind == "X-Trans" else 2
     lacking = LIBRAW_SMALLEST[kind] - min(mosaic.shape[-2:])

@@ -14,7 +14,7 @@ from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.raw.auto_balance import auto_balance
 from kornia_tidy.raw.color import adapted_to_srgb, assumed_camera_to_srgb, camera_to_srgb
 from kornia_tidy.raw.demosaic import BAYER, demosaic_to_srgb, mixed
-from kornia_tidy.raw.filter_array import tiled
+from kornia_tidy.raw.filter_array import is_xtrans, tiled
 
 if TYPE_CHECKING:
     from kornia_tidy.raw.capture import RawCapture
@@ -111,7 +111,7 @@ def default_method(raw: RawCapture) -> str:
     letters = raw.pattern_letters or ""
     if letters in BAYER:
         return "libraw_ahd"
-    return "libraw_markesteijn" if len(letters) == 36 else "bilinear"
+    return "libraw_markesteijn" if is_xtrans(letters) else "bilinear"
 
 
 def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) -> Tensor:

@@ -34,7 +34,7 @@ def dng_bytes(
 
     Args:
         samples: (H, W, C) uint16.
-        letters: of the filter array's tile, 4 or 36, by rows; None without one.
+        letters: of the filter array's square tile, by rows; None without one.
         colors: the different letters in the order of the colour planes.
         white: saturation count.
         fields: further fields of the main directory.
@@ -65,9 +65,10 @@ def dng_bytes(
         all_fields += [
             (33421, SHORT, [side, side]),
             (33422, BYTE, [COLOR_CODES.index(letter) for letter in letters]),
-            (50710, BYTE, [COLOR_CODES.index(letter) for letter in colors]),
             (50711, SHORT, [1]),  # pixels in rows and columns
         ]
+    if letters is not None or len(colors) > 3:
+        all_fields.append((50710, BYTE, [COLOR_CODES.index(letter) for letter in colors]))
     return b"".join(_tiff(all_fields, exif, samples.data.cast("B")))
 
 

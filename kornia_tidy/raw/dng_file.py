@@ -25,7 +25,7 @@ def write_dng(path: str | os.PathLike[str], raw: RawCapture) -> None:
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if the capture is empty, or a count does not fit 16 bits.
+        ValueError: if the capture is empty, or a count is no whole number of 16 bits.
     """
     write_bytes(path, encode_dng(raw))
 
@@ -48,6 +48,8 @@ def encode_dng(raw: RawCapture) -> bytes:
     counts = raw.counts.cpu()
     if counts.numel() == 0:
         raise ValueError(f"a DNG file needs one pixel or more, got counts of shape {tuple(counts.shape)}")
+    if counts.is_floating_point():
+        raise ValueError(f"counts must be whole numbers, got {counts.dtype} (of a floating-point DNG)")
     if int(counts.min()) < 0 or int(counts.max()) > 65535:
         raise ValueError(f"counts must lie in 0 to 65535, found {int(counts.min())} to {int(counts.max())}")
     samples = counts.permute(1, 2, 0).numpy().astype(np.uint16)

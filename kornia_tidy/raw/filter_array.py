@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from torch import Tensor
 
@@ -10,7 +11,7 @@ from kornia_tidy.checks import check_choice
 
 Tile = tuple[tuple[int, ...], ...]  # index of a channel at each place, by rows
 
-PATTERN_COLORS = {"RGB": "RGBG", "CGMY": "GMCY"}  # LibRaw's order of the channels, by the letters of a filter array
+PATTERN_COLORS = {"RGB": "RGB", "CGMY": "GMCY"}  # LibRaw's order of the colours, by the letters of a filter array
 
 
 def filter_tile(letters: str) -> tuple[Tile, str]:
@@ -32,12 +33,34 @@ def filter_tile(letters: str) -> tuple[Tile, str]:
     if side not in {2, 6} or side * side != len(letters):
         raise ValueError(f"a filter array's tile has 4 or 36 letters, got {letters!r}")
     check_choice("the letters of a filter array, sorted,", kinds, tuple(PATTERN_COLORS))
-    colors = PATTERN_COLORS[kinds] if side == 2 else kinds
     rows = [letters[i : i + side] for i in range(0, len(letters), side)]
-    tile = tuple(
-        tuple(3 if colors == "RGBG" and c == "G" and "B" in row else colors.index(c) for c in row) for row in rows
-    )
-    return tile, colors
+    return indexed_tile(rows, PATTERN_COLORS[kinds])
+
+
+def indexed_tile(rows: Sequence[str], planes: str) -> tuple[Tile, str]:
+    """Return a tile of letters as channel indices, and the names of the channels, by the convention of filter_tile.
+
+    Args:
+        rows: letters of the tile.
+        planes: the different letters in their order.
+
+    Example:
+        >>> indexed_tile(["RB", "WG"], "RGBW")
+        (((0, 2), (3, 1)), 'RGBW')
+    """
+    second = len(rows) == 2 and planes == "RGB" and any("B" in row and "G" in row for row in rows)
+    tile = tuple(tuple(3 if second and c == "G" and "B" in row else planes.index(c) for c in row) for row in rows)
+    return tile, planes + "G" * second
+
+
+def is_xtrans(letters: str) -> bool:
+    """Return whether the letters of a tile are those of Fujifilm's X-Trans array, with 20 green pixels of 36.
+
+    Example:
+        >>> is_xtrans("GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"), is_xtrans("RGGB")
+        (True, False)
+    """
+    return [letters.count(color) for color in "RGB"] == [8, 20, 8]
 
 
 def tile_planes(mosaic: Tensor, tile: tuple[int, int]) -> Tensor:

@@ -129,6 +129,8 @@ def sensor_counts(
     """
     check_float_tensor("light", light, 4, "(B, C, H, W)")
     check_choice("color", color, COLORS)
+    if camera.counts.is_floating_point():
+        raise ValueError("the camera must have counts, got a capture of floating-point samples")
     wanted = 1 if not camera.colors else 3
     if light.shape[1] != wanted or light.numel() == 0:
         raise ValueError(

@@ -1,49 +1,72 @@
-"""Reader of the TIFF tags of raw files: names, exposure, levels, filter array and colours.
+"""Reader of the TIFF tags of raw files: directories with their values, names, exposure and colours.
 
-LibRaw's Python package does not return the manufacturer, black levels that differ within a large tile, and the colour
-matrix of Kodak's first cameras. The tags of a damaged file may hold any value. The decoder process runs this file, so
-it imports only the standard library. ExifRead and tifffile are not used: of 51 raw files tried they read nothing from
-12, which are CRW, CR3, RAF and QuickTake files.
+LibRaw's Python package does not return the manufacturer and the colour matrix of Kodak's first cameras. The tags of a
+damaged file may hold any value. The decoder process runs this file, so it imports only the standard library. ExifRead
+and tifffile are not used: of 51 raw files tried they read nothing from 12, which are CRW, CR3, RAF and QuickTake files.
 
-Source: TIFF 6.0, section 2; TIFF/EP, CFAPattern; Exif 2.32, 4.6; DNG 1.7, BlackLevel, WhiteLevel, CFAPlaneColor and
-CFALayout; P. Harvey's notes on Canon's CRW format; dcraw for Kodak's matrix.
+Source: TIFF 6.0, section 2; Exif 2.32, 4.6; P. Harvey's notes on Canon's CRW format; dcraw for Kodak's matrix.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
 
 TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 7: "s", 10: "ii", 11: "f", 12: "d", 13: "I"}  # of TIFF's fields
 SUB_DIRECTORIES = (0x014A, 0x8769)  # SubIFDs, Exif
 MOST_DIRECTORIES, MOST_ENTRIES, MOST_BYTES = 32, 512, 1 << 16
-MOST_SHOWN = 8  # numbers in a message
+MOST_LONG_BYTES = 1 << 22  # of a tag that is read for one directory only, such as a gain map
 
 TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
 NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
 TIMES = (0x9003, 0x0132)
-NOISE_PROFILE = 0xC761
-SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL = 0x00FE, 0xC612, 0xC619, 0xC61A
-WHITE_LEVEL, KODAK_MATRIX = 0xC61D, 0x9218
-PHOTOMETRIC, FILTER_ARRAY = 0x0106, 32803  # the tag, and its value for a picture behind a filter array
+NOISE_PROFILE, KODAK_MATRIX = 0xC761, 0x9218
+# The picture of a DNG and how it is stored
+SUBFILE_TYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC = 0x00FE, 0x0100, 0x0101, 0x0102, 0x0103, 0x0106
+SAMPLES, ROWS_PER_STRIP, PLANAR, PREDICTOR, SAMPLE_FORMAT = 0x0115, 0x0116, 0x011C, 0x013D, 0x0153
+STRIPS, TILES, TILE_SIZE = (0x0111, 0x0117), (0x0144, 0x0145), (0x0142, 0x0143)  # offsets and lengths; columns, rows
+# Its sensor
 FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT = 0x828D, 0x828E, 0xC616, 0xC617
-LARGEST_FILTER_TILE = 8  # rows or columns; DNG names no limit, X-Trans has 6
-COLOR_CODES = range(7)  # red, green, blue, cyan, magenta, yellow, white
-EXTENTS = ((0x0111, 0x0117), (0x0144, 0x0145))  # offsets and lengths of strips and of tiles
+DNG_VERSION, LINEARIZATION, BLACK_REPEAT, BLACK_LEVEL, BLACK_COLUMNS, BLACK_ROWS = 0xC612, *range(0xC618, 0xC61D)
+WHITE_LEVEL, NEUTRAL, ACTIVE_AREA, OPCODE_LISTS = 0xC61D, 0xC628, 0xC68D, (0xC740, 0xC741, 0xC74E)
 QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
 CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
 
 # Tags that are read; a hostile file may hold 64 KiB behind each of the others.
 WANTED = frozenset(
-    [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, *EXTENTS) for tag in tags]
-    + [NOISE_PROFILE, SUBFILE_TYPE, DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, KODAK_MATRIX, PHOTOMETRIC]
-    + [FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT, *SUB_DIRECTORIES]
+    [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, STRIPS, TILES, TILE_SIZE) for tag in tags]
+    + [NOISE_PROFILE, KODAK_MATRIX, SUBFILE_TYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES]
+    + [ROWS_PER_STRIP, PLANAR, PREDICTOR, SAMPLE_FORMAT, FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT]
+    + [DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, NEUTRAL, ACTIVE_AREA, *SUB_DIRECTORIES]
 )
 
-Directory = dict[int, tuple[Any, ...]]
+
+class Directory(dict[int, tuple[Any, ...]]):
+    """Values of the wanted tags of a directory, and the places of all its entries; empty values cannot be read."""
+
+    def __init__(self, base: int, order: str) -> None:
+        super().__init__()
+        self.base, self.order = base, order
+        self.entries: dict[int, int] = {}  # offsets in the file
+
+    def whole_numbers(self, tag: int) -> tuple[int, ...]:
+        """Return the integer values of a tag; empty if it is missing or has another type."""
+        values = self.get(tag, ())
+        return tuple(values) if all(type(value) is int for value in values) else ()
+
+    def codes(self, tag: int) -> tuple[int, ...]:
+        """Return the values of a tag of type BYTE or UNDEFINED."""
+        values = self.get(tag, ())
+        return tuple(values[0]) if values and isinstance(values[0], bytes) else self.whole_numbers(tag)
+
+    def long_values(self, data: bytes, tag: int) -> tuple[Any, ...]:
+        """Return the values of a tag that may be long; empty if it is missing or cannot be read."""
+        place = self.entries.get(tag, len(data))
+        _, kind, number = _unpack(data, f"{self.order}HHI", place) or (0, 0, 0)
+        return _entry_values(data, self.base, self.order, place + 8, kind, number, MOST_LONG_BYTES)
 
 
 def camera_tags(data: bytes) -> dict[str, Any]:
@@ -70,75 +93,6 @@ def camera_tags(data: bytes) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def black_tile(data: bytes) -> list[list[float]] | None:
-    """Return the black levels of a DNG by rows if they repeat over more than 2x2 pixels, else None."""
-    for directory in tiff_directories(data):
-        rows, columns = (*_whole_numbers(directory, BLACK_REPEAT), 1, 1)[:2]
-        levels = directory.get(BLACK_LEVEL, ())
-        if max(rows, columns) > 2 and len(levels) == rows * columns and all(map(math.isfinite, levels)):
-            return [list(levels[row * columns : (row + 1) * columns]) for row in range(rows)]
-    return None
-
-
-def white_levels(data: bytes) -> set[int]:
-    """Return all white levels of a DNG, including those of its previews."""
-    return {level for directory in tiff_directories(data) for level in _whole_numbers(directory, WHITE_LEVEL)}
-
-
-def filter_array_fault(data: bytes) -> str | None:
-    """Return the contradiction among the filter array tags of a DNG, in words; None for valid tags and other files.
-
-    LibRaw reads beyond its tables if a pattern has unknown colours, and assumes another array or none if the sizes do
-    not fit. All directories are tested, as LibRaw takes the pattern from any of them.
-
-    Example:
-        >>> filter_array_fault(b"no DNG") is None
-        True
-    """
-    directories = list(tiff_directories(data))
-    if not directories or DNG_VERSION not in directories[0]:
-        return None
-    faults = [_fault(one) for one in directories if FILTER_PATTERN in one or _behind_filters(one)]
-    return next((fault for fault in faults if fault), None)
-
-
-def _behind_filters(directory: Directory) -> bool:
-    return FILTER_ARRAY in directory.get(PHOTOMETRIC, ())
-
-
-def _fault(directory: Directory) -> str | None:
-    """Return the contradiction among the filter array tags of one directory, in words, or None."""
-    pattern = _codes(directory, FILTER_PATTERN)
-    if not pattern:
-        return "its CFAPattern is missing or cannot be read"
-    size = _whole_numbers(directory, FILTER_REPEAT)
-    rows, columns = size if len(size) == 2 else (0, 0)
-    if not (0 < rows <= LARGEST_FILTER_TILE and 0 < columns <= LARGEST_FILTER_TILE):
-        return f"its CFARepeatPatternDim is {_listed(size)}, not two numbers from 1 to {LARGEST_FILTER_TILE}"
-    if len(pattern) != rows * columns:
-        return f"its CFAPattern has {len(pattern)} entries, its CFARepeatPatternDim says {rows} x {columns}"
-    colors = _codes(directory, FILTER_COLORS) if FILTER_COLORS in directory else (0, 1, 2)
-    if not 0 < len(colors) == len(set(colors) & set(COLOR_CODES)):
-        return f"its CFAPlaneColor is {_listed(colors)}, not different colours from 0 to {COLOR_CODES[-1]}"
-    if beyond := sorted(set(pattern) - set(colors)):
-        return f"its CFAPattern holds {_listed(beyond)}, which is not among its colours {_listed(colors)}"
-    layout = _whole_numbers(directory, FILTER_LAYOUT) if FILTER_LAYOUT in directory else (1,)
-    if layout != (1,):
-        return f"its CFALayout is {_listed(layout)}, and only 1, pixels in rows and columns, can be decoded"
-    return None
-
-
-def _codes(directory: Directory, tag: int) -> tuple[int, ...]:
-    """Return the values of a tag of type BYTE or UNDEFINED."""
-    values = directory.get(tag, ())
-    return tuple(values[0]) if values and isinstance(values[0], bytes) else _whole_numbers(directory, tag)
-
-
-def _listed(values: Sequence[int]) -> str:
-    shown = " ".join(map(str, values[:MOST_SHOWN])) or "empty"
-    return shown if len(values) <= MOST_SHOWN else f"{shown} ..."
-
-
 def kodak_matrix(data: bytes) -> list[list[float]] | None:
     """Return the matrix from camera colours to RGB of a KDC file, by rows, or None; an offset precedes each row."""
     for directory in tiff_directories(data):
@@ -146,27 +100,6 @@ def kodak_matrix(data: bytes) -> list[list[float]] | None:
         if len(values) == 12 and not isinstance(values[0], bytes):
             return [list(values[row + 1 : row + 4]) for row in (0, 4, 8)]
     return None
-
-
-def missing_bytes(data: bytes) -> int:
-    """Return the number of bytes of a DNG's picture beyond the end of the file; LibRaw leaves lost tiles empty."""
-    directories = list(tiff_directories(data))
-    if not directories or DNG_VERSION not in directories[0]:
-        return 0
-    whole = [directory for directory in directories if not any(_whole_numbers(directory, SUBFILE_TYPE)[:1])]
-    ends = [
-        offset + length
-        for directory in whole
-        for offsets, lengths in EXTENTS
-        for offset, length in zip(_whole_numbers(directory, offsets), _whole_numbers(directory, lengths), strict=False)
-    ]
-    return max(0, max(ends, default=0) - len(data))
-
-
-def _whole_numbers(directory: Directory, tag: int) -> tuple[int, ...]:
-    """Return the integer values of a tag; empty if it is missing or has another type."""
-    values = directory.get(tag, ())
-    return tuple(values) if all(type(value) is int for value in values) else ()
 
 
 def tiff_directories(data: bytes) -> Iterator[Directory]:
@@ -183,7 +116,7 @@ def tiff_directories(data: bytes) -> Iterator[Directory]:
         while waiting and left:
             left -= 1
             directory, following = _directory(data, base, order, waiting.pop(0))
-            below = [offset for tag in SUB_DIRECTORIES for offset in _whole_numbers(directory, tag)[:MOST_DIRECTORIES]]
+            below = [offset for tag in SUB_DIRECTORIES for offset in directory.whole_numbers(tag)[:MOST_DIRECTORIES]]
             fresh = [offset for offset in dict.fromkeys([*below, *following]) if offset not in seen]
             waiting += fresh
             seen.update(fresh)
@@ -203,9 +136,10 @@ def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directo
     """Return a directory and the offset of the next one; unreadable and contradictory tags have no values."""
     start = base + offset
     count = min((_unpack(data, f"{order}H", start) or (0,))[0], MOST_ENTRIES)
-    directory: Directory = {}
+    directory = Directory(base, order)
     for entry in range(start + 2, start + 2 + 12 * count, 12):
         tag, kind, number = _unpack(data, f"{order}HHI", entry) or (0, 0, 0)
+        directory.entries[tag] = entry
         if tag in WANTED:
             values = _entry_values(data, base, order, entry + 8, kind, number)
             # Of two different values LibRaw may use the other one.
@@ -213,11 +147,13 @@ def _directory(data: bytes, base: int, order: str, offset: int) -> tuple[Directo
     return directory, _unpack(data, f"{order}I", start + 2 + 12 * count)
 
 
-def _entry_values(data: bytes, base: int, order: str, field: int, kind: int, number: int) -> tuple[Any, ...]:
+def _entry_values(
+    data: bytes, base: int, order: str, field: int, kind: int, number: int, most: int = MOST_BYTES
+) -> tuple[Any, ...]:
     """Return the values of an entry, stored in its last field or at the offset given there."""
     code = TYPES.get(kind, "")
     size = number * struct.calcsize(f"={code}")
-    if not 0 < size <= MOST_BYTES:
+    if not 0 < size <= most:
         return ()
     place = _unpack(data, f"{order}I", field) if size > 4 else (field - base,)
     letters = f"{number}s" if code == "s" else code * number

@@ -50,9 +50,9 @@ def check_counts(name: str, counts: Tensor, black: Tensor, white: float, length:
     height, width = counts.shape[-2:]
     if 8 * length < LEAST_BITS * height * width:
         raise ValueError(f"cannot read {name}: its {length} bytes cannot hold its {width} x {height} pixels")
-    low, high = (int(end) for end in counts.aminmax())
+    low, high = (end.item() for end in counts.aminmax())
     if low == high:
-        raise ValueError(f"cannot read {name}: all its {width} x {height} counts are {low}, so it holds no picture")
+        raise ValueError(f"cannot read {name}: all its {width} x {height} counts are {low:.7g}, so it holds no picture")
     least, most = (float(end) for end in black.aminmax())
     if not most < white < float("inf"):
         raise ValueError(
@@ -66,7 +66,8 @@ def check_counts(name: str, counts: Tensor, black: Tensor, white: float, length:
 def validated_white(name: str, counts: Tensor, white: float, given: bool) -> float:
     """Return the white level, or the largest count if the white level of the file is too low.
 
-    A white level that is too low would make most of the picture white.
+    A white level that is too low would make most of the picture white. Floating-point samples may lie above white, as
+    in merged exposures, so theirs is kept.
 
     Args:
         name: of the file, for the message.
@@ -77,6 +78,8 @@ def validated_white(name: str, counts: Tensor, white: float, given: bool) -> flo
     Warns:
         UserWarning: if the level of the file is replaced, or more than one count in a thousand lies above white.
     """
+    if counts.is_floating_point():
+        return white
     high = int(counts.max())
 
     def share(level: float) -> float:

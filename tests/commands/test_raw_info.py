@@ -7,7 +7,8 @@ import pytest
 
 from kornia_tidy.cli import main
 from tests.base import BaseTester, shared
-from tests.raw.dng import dng
+from tests.raw.dng import SHORT, UNDEFINED, dng
+from tests.raw.dng_kinds import gain_map
 
 
 @pytest.fixture
@@ -65,6 +66,26 @@ class TestRawInfo(BaseTester):
             "file": "short.dng",
             "error": "cannot read short.dng: it is cut short, 9 bytes of its picture are missing",
         }
+
+    @pytest.mark.filterwarnings("default::UserWarning")
+    def test_feature_opcodes_that_are_not_applied(self, folder, capsys):
+        counts = np.random.default_rng(0).integers(64, 1000, (36, 48))
+        (folder / "phone.dng").write_bytes(dng(counts, extra={51009: (UNDEFINED, gain_map())}))
+        assert run("info phone.dng") == 0
+        told = capsys.readouterr()
+        assert "opcodes   GainMap (optional): not applied\n" in told.out
+        assert told.err.count("warning: phone.dng: its opcodes GainMap (optional) are not applied") == 1
+        assert run("info --json phone.dng") == 0
+        assert json.loads(capsys.readouterr().out)[0]["ignored_opcodes"] == ["GainMap (optional)"]
+
+    def test_feature_floating_point_samples(self, folder, capsys):
+        counts = np.random.default_rng(0).integers(64, 1000, (36, 48))
+        extra = {258: (SHORT, [32]), 339: (SHORT, [3])}
+        data = dng(counts, black=(0,), white=1, extra=extra, blocks=[(counts / 500).astype("<f4").tobytes()])
+        (folder / "merged.dng").write_bytes(data)
+        assert run("info merged.dng") == 0
+        share = 100 * (counts >= 500).mean()
+        assert f"black 0, white 1; counts 0.128 to 1.998, {share:.3g} % of them at white" in capsys.readouterr().out
 
     @pytest.mark.filterwarnings("default::UserWarning")
     def test_feature_a_white_level_that_lies_is_told_once(self, folder, capsys):

@@ -198,10 +198,13 @@ class TestOpen(BaseTester):
         assert raw.pattern_letters == XTRANS
         assert raw.black.flatten().tolist() == list(range(36))
 
-    def test_feature_levels_that_repeat_more_slowly_are_averaged(self):
+    def test_feature_levels_that_repeat_more_slowly_than_the_filters(self):
         """LibRaw's package gives the smallest of them, 0, for every place."""
-        raw = RawCapture.open(dng(random_counts(), black=range(16), black_repeat=(4, 4)))
-        assert raw.black.tolist() == [[5, 6], [9, 10]]
+        counts, levels = random_counts(), np.tile(np.arange(16).reshape(4, 4), (9, 12))
+        raw = RawCapture.open(dng(counts, black=range(16), black_repeat=(4, 4)))
+        assert raw.black.tolist() == [[0, 1], [4, 5]]
+        expected = (counts - levels) / (1023 - levels)
+        np.testing.assert_allclose(raw.mosaic()[0].numpy(), expected, rtol=0, atol=0.5 / 1000)
 
     def test_feature_pattern_begins_at_the_visible_corner(self):
         """Counts say which filter they lie behind, by the active area's corner; LibRaw moves odd borders in."""
@@ -298,7 +301,7 @@ class TestOpen(BaseTester):
             (dng(np.full((36, 48), 64)), "all its 48 x 36 counts are 64"),
             (dng(random_counts(), white=64), "white level 64 is not above its black level 64"),
             (dng(random_counts(), black=(1010,)), "counts are below its black level 1010"),
-            (dng(random_counts(), "RGRGRGGBG"), "repeats neither after 2 nor after 6|no raw file|damaged"),
+            (dng(random_counts(), "RGRGR" * 4 + "GBGBG"), "its filter array repeats after 5 x 5 pixels"),
         ],
     )
     def test_exception_says_why(self, data, reason):

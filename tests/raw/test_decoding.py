@@ -48,7 +48,7 @@ class TestDecodeRaw(BaseTester):
 
     def test_smoke(self):
         header, counts, length = decode_raw(DATA, 60, 2**31)
-        assert (header["pattern"], counts.shape, length) == ([[0, 1], [3, 2]], (1, 36, 48), len(DATA))
+        assert (header["letters"], counts.shape, length) == (["RG", "GB"], (1, 36, 48), len(DATA))
 
     def test_feature_the_process_imports_no_torch(self):
         """Nor anything else of ours or of the sort: NumPy, rawpy and the standard library."""

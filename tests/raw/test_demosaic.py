@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from kornia_tidy.raw.demosaic import METHODS, bilinear, demosaic
-from kornia_tidy.raw.filter_array import filter_tile
+from kornia_tidy.raw.filter_array import filter_tile, indexed_tile
 from tests.base import BaseTester
 from tests.raw.dng import XTRANS
 
@@ -127,6 +127,14 @@ class TestDemosaic(BaseTester):
         half = demosaic(mosaic, *filter_tile("GRBG"), "half")
         assert half.tolist() == [[[2.0, 6.0]], [[2.5, 6.5]], [[3.0, 7.0]]]
 
+    def test_feature_flat_colours_behind_a_quad_bayer_array_come_back(self):
+        tile, colors = indexed_tile(["RRGG", "RRGG", "GGBB", "GGBB"], "RGB")
+        levels = torch.tensor([0.2, 0.7, 0.5])
+        flat = levels[torch.tensor(tile).repeat(5, 6)][None]
+        for method in ("bilinear", "half"):
+            image = demosaic(flat, tile, colors, method)
+            self.assert_close(image, levels[:, None, None].expand_as(image))
+
     def test_feature_half_of_xtrans_is_by_squares_of_three(self):
         mosaic = torch.rand(1, 6, 6)
         half = demosaic(mosaic, *filter_tile(XTRANS), "half")
@@ -176,6 +184,7 @@ class TestDemosaic(BaseTester):
     def test_exception_says_what_is_allowed(self):
         mosaic = torch.rand(1, 8, 8)
         bayer, xtrans = filter_tile("RGGB"), filter_tile(XTRANS)
+        quad, stripes = indexed_tile(["RRGG", "RRGG", "GGBB", "GGBB"], "RGB"), indexed_tile(["RGBRGB"] * 6, "RGB")
         for args, message in (
             ((mosaic, *bayer, "best"), "method of demosaicing must be one of 'bilinear', 'half'"),
             ((torch.rand(3, 8, 8), *bayer), r"mosaic must have shape \(..., 1, H, W\), got \(3, 8, 8\)"),
@@ -187,6 +196,14 @@ class TestDemosaic(BaseTester):
             ((mosaic, *filter_tile("GMYC"), "libraw_ahd"), "of a four-colour array must be one of 'linear', 'vng'"),
             ((mosaic, *xtrans, "libraw_ahd"), "X-Trans array must be one of 'markesteijn', got 'ahd'"),
             ((mosaic / 0, *bayer, "libraw_ahd"), "mosaic must be finite, got inf"),
+            (
+                (mosaic, *quad, "libraw_ahd"),
+                "four-colour and X-Trans arrays, not RRGGRRGGGGBBGGBB: choose",
+            ),
+            (
+                (mosaic, *stripes, "libraw_markesteijn"),
+                "LibRaw demosaics Bayer, four-colour and X-Trans arr",
+            ),
         ):
             with pytest.raises(ValueError, match=message):
                 demosaic(*args)

@@ -13,8 +13,10 @@ import torch
 
 from kornia_tidy.raw.capture import RawCapture, RawInfo
 from kornia_tidy.raw.dng_file import encode_dng, write_dng
+from kornia_tidy.raw.filter_array import indexed_tile
 from tests.base import BaseTester
 from tests.raw.dng import XTRANS
+from tests.raw.dng_kinds import QUAD, QUAD_WHITE
 
 MATRIX = torch.tensor([[0.9, -0.3, -0.1], [-0.8, 1.6, 0.3], [-0.3, 0.3, 0.8]])
 
@@ -64,6 +66,24 @@ class TestDng(BaseTester):
         assert [back.info.exposure, back.info.aperture, back.info.focal_length] == pytest.approx([1 / 125, 2.8, 0.05])
         again = RawCapture.open(encode_dng(back))
         self.assert_close(again.camera_to_srgb, back.camera_to_srgb, rtol=0, atol=1e-4)
+
+    @pytest.mark.parametrize(
+        ("letters", "planes"), [(QUAD, "RGB"), (QUAD_WHITE, "RGBW"), ("RGWB", "RGBW"), ("RYYB", "RYB"), (None, "RGBW")]
+    )
+    def test_feature_other_arrays_open_as_the_same_capture(self, letters, planes):
+        raw, balance = capture(None, channels=3 if letters is None else 1), 1 + torch.arange(len(planes)) / 8
+        if letters is None:
+            raw = replace(raw, counts=raw.counts[[0, 1, 2, 0]], colors=planes, black=raw.black[[0, 1, 2, 0]])
+        else:
+            side = round(len(letters) ** 0.5)
+            tile, colors = indexed_tile([letters[i : i + side] for i in range(0, len(letters), side)], planes)
+            raw = replace(raw, pattern=tile, colors=colors, black=raw.black.expand(side, side))
+        raw = replace(raw, white_balance=balance / balance[max(planes.find("G"), 0)])
+        back = RawCapture.open(encode_dng(raw))
+        assert torch.equal(back.counts, raw.counts)
+        assert (back.pattern, back.colors, back.white) == (raw.pattern, raw.colors, raw.white)
+        assert torch.equal(back.black, raw.black)
+        self.assert_close(back.white_balance, raw.white_balance)
 
     def test_feature_the_matrix_is_libraws(self):
         """LibRaw's own conversion of grey under D65 is grey, and its matrix is that of the rows divided by white's."""

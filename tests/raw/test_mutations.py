@@ -6,23 +6,20 @@ own as always, but forked from one that has imported NumPy and rawpy already: a 
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import subprocess
 import sys
 import tempfile
 import time
 import warnings
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from kornia_tidy.raw import decoder, decoding
 from kornia_tidy.raw.capture import RawCapture
 from tests.base import BaseTester, shared
+from tests.raw.dng_kinds import kind as dng_kind
+from tests.raw.forked import forked_decoding
 
 FILES = 1000
 CHUNK = 100
@@ -32,8 +29,10 @@ SMALL = 1_000_000  # bytes; larger files are taken once in eight
 
 
 def mutated(seed):
-    """Return the name of a file of the data and its bytes, damaged in one of five ways."""
+    """Return the name of a file and its bytes, damaged in one of five ways: of the data, or in a third a small DNG."""
     generator = np.random.default_rng(seed)
+    if generator.random() < 1 / 3:
+        return f"DNG {seed}", *damaged(generator, seed, dng_kind(seed).data)
     folders = [shared(f"data/{name}", {"*": 1}) for name in ("raw", "raw_synthetic")]
     paths = [p for folder in folders for p in sorted(folder.rglob("*")) if p.is_file()]
     # Headerless dumps and files of other kinds are refused by their first bytes, whatever comes later.
@@ -42,7 +41,12 @@ def mutated(seed):
     small = [p for p in paths if p.stat().st_size <= SMALL]
     chosen = (large if generator.random() < 1 / 8 else small) or paths
     path = chosen[generator.integers(len(chosen))]
-    data = np.frombuffer(path.read_bytes(), np.uint8).copy()
+    return path.name, *damaged(generator, seed, path.read_bytes())
+
+
+def damaged(generator, seed, data):
+    """Return the kind of damage and the bytes."""
+    data = np.frombuffer(data, np.uint8).copy()
     kind = ("cut", "bytes", "header", "block", "zeros")[seed % 5]
     if kind == "cut":
         data = data[: generator.integers(1, len(data))]
@@ -56,32 +60,7 @@ def mutated(seed):
         size = int(generator.integers(1, min(1 << 16, len(data))))
         start = generator.integers(0, len(data) - size)
         data[start : start + size] = 0 if kind == "zeros" else generator.integers(0, 256, size)
-    return path.name, kind, data.tobytes()
-
-
-@contextmanager
-def forked_decoding():
-    """Replace the decoder process of RawCapture.open by a fork, with the same limits, decoder and reader."""
-    command = [sys.executable, "-I", "-S", Path(__file__).with_name("decoding_forks.py"), json.dumps(sys.path)]
-    command.append(decoding.DECODER.parent)
-    before = decoding._run
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
-
-        def run(file, result, timeout, memory_limit):
-            paths = [f"/proc/{os.getpid()}/fd/{one.fileno()}" for one in (file, result)]
-            server.stdin.write(json.dumps([*paths, timeout, memory_limit]).encode())
-            server.stdin.flush()
-            status = json.loads(server.stdout.readline())
-            if status is None:
-                raise subprocess.TimeoutExpired("decoder", timeout)
-            return status, decoder.LOADED  # its server loaded all before it forked
-
-        decoding._run = run
-        try:
-            yield
-        finally:
-            decoding._run = before
-            server.stdin.close()
+    return kind, data.tobytes()
 
 
 def outcome(data):

@@ -127,6 +127,8 @@ class TestSensorCounts(BaseTester):
             sensor_counts(light[:, :1], camera())
         with pytest.raises(ValueError, match=r"light must have shape \(B, 1, H, W\)"):
             sensor_counts(light, camera(None))
+        with pytest.raises(ValueError, match="camera must have counts, got a capture of floating-point samples"):
+            sensor_counts(light, replace(camera(), counts=torch.zeros(1, 4, 4)))
         with pytest.raises(ValueError, match="color must be one of 'camera', 'channels', got 'raw'"):
             sensor_counts(light, camera(), color="raw")
         with pytest.raises(ValueError, match="has no colour matrix: choose color='channels'"):
