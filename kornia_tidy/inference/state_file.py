@@ -64,7 +64,7 @@ def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: if the file is damaged or of another format.
 
     Convention:
-        Each tensor of the file stands in one place, so that the state takes little more memory than the file: weights in
+        Each tensor of the file stands in one place, so that the state takes little more memory than the file: those
         eight bits take four times theirs, and the header, of at most 16 MiB, up to 50 times.
     """
     tensors, header = read_tensors(path, WHAT)
