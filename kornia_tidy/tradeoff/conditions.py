@@ -15,6 +15,7 @@ from torch import Tensor
 
 import kornia_tidy
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.runtime.search_path import ROOT, find_program
 
 MEASURED_CODE = (
     "**/*.c",
@@ -142,7 +143,8 @@ def git_commit() -> str | None:
     root = Path(kornia_tidy.__file__).parent
 
     def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, check=True, text=True)  # noqa: S603, S607
+        command = [find_program("git"), "-C", str(root), *words]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True)  # noqa: S603
         return done.stdout.strip()
 
     try:
