@@ -15,6 +15,7 @@ from torch import Tensor
 
 import kornia_tidy
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.runtime.programs import find_program, outside
 
 MEASURED_CODE = (
     "**/*.c",
@@ -139,11 +140,13 @@ def measured_files(root: Path) -> list[Path]:
 
 def git_commit() -> str | None:
     """Return the commit of the repository that the library is run from, or None if it is run from elsewhere."""
-    root = Path(kornia_tidy.__file__).parent
+    root, program = Path(kornia_tidy.__file__).parent, find_program("git")
+    if program is None:
+        return None
 
     def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, check=True, text=True)  # noqa: S603, S607
-        return done.stdout.strip()
+        command = [program, "-C", str(root), *words]
+        return subprocess.run(command, capture_output=True, check=True, text=True, **outside()).stdout.strip()  # noqa: S603
 
     try:
         git("ls-files", "--error-unmatch", "__init__.py")  # else it is an enclosing repository
