@@ -29,6 +29,7 @@ from kornia_tidy.coded_datasets.item_files import encode_item
 from kornia_tidy.coded_datasets.layout import Layout, Part, item_key
 from kornia_tidy.files import remove_leftovers, replacing, write_bytes, write_folder
 from kornia_tidy.render.repeatable import repeatable
+from kornia_tidy.runtime.search_path import starting_workers
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 
@@ -193,7 +194,9 @@ def _rendered(items: _Captures, indices: Sequence[int], jobs: int) -> Iterator[C
         worker_init_fn=_end_with_parent,
         generator=torch.Generator().manual_seed(0),  # else it would draw from the global generator
     )
-    for index, files in zip(indices, loader, strict=True):
+    with starting_workers():
+        captures = iter(loader)
+    for index, files in zip(indices, captures, strict=True):
         if isinstance(files, str):
             raise ValueError(files)
         yield item_key(index), files

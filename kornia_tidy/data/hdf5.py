@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
+from kornia_tidy.runtime.search_path import import_installed
 
 DAMAGE = (OSError, OverflowError, RuntimeError, KeyError, TypeError, AttributeError)  # of h5py on damaged files
 MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -26,7 +27,7 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
         ValueError: if the file is damaged, or holds no data set or several, or one that is no map of numbers in it.
     """
     try:
-        import h5py  # noqa: PLC0415 - an extra, and slow to import
+        h5py = import_installed("h5py")  # an extra, and slow to import
     except ImportError:
         raise ImportError("an HDF5 file needs h5py: pip install 'kornia-tidy[data]'") from None
     try:
@@ -50,7 +51,7 @@ def stored_numbers(file: Any, name: str) -> Any:
     Raises:
         ValueError: if the data set is such a one, or its values are not numbers.
     """
-    import h5py  # noqa: PLC0415 - an extra, and slow to import
+    h5py = import_installed("h5py")
 
     link = file.get(name, getlink=True) if name in file else None
     if link is not None and not isinstance(link, h5py.HardLink):

@@ -15,6 +15,7 @@ from kornia_tidy.data.hdf5 import DAMAGE, stored_numbers
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import read_bytes
+from kornia_tidy.runtime.search_path import import_installed
 
 LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 SOURCES = {
@@ -123,7 +124,7 @@ def _published(root: Path, name: str) -> Path:
 
 def _open(path: Path) -> Any:
     try:
-        import h5py  # noqa: PLC0415 - an extra, and slow to import
+        h5py = import_installed("h5py")  # an extra, and slow to import
     except ImportError:
         raise ImportError("NYU Depth v2 needs h5py: pip install 'kornia-tidy[data]'") from None
     try:
@@ -159,7 +160,7 @@ def _read_split(root: Path, split: str | os.PathLike[str]) -> list[int]:
 
 def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
     try:
-        from scipy.io import loadmat  # noqa: PLC0415 - only this needs it
+        loadmat = import_installed("scipy.io").loadmat  # only this needs it
     except ImportError:
         raise ImportError(
             f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text "

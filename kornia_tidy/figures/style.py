@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from kornia_tidy.runtime.search_path import import_installed
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -20,7 +22,7 @@ def require_matplotlib() -> None:
         ImportError: if matplotlib is missing.
     """
     try:
-        import matplotlib.figure  # noqa: F401, PLC0415
+        import_installed("matplotlib.figure")
     except ImportError:
         raise ImportError("pictures need matplotlib: pip install 'kornia-tidy[plot]'") from None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from typing import Any, Self
 
@@ -14,6 +13,7 @@ from kornia_tidy.checks import check_part
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.midas_small import IMAGE_DEVIATION, IMAGE_MEAN
+from kornia_tidy.runtime.search_path import import_installed
 
 NEAREST = 1e-3  # m; smaller metric estimates are taken for this depth
 
@@ -325,6 +325,6 @@ def _transformers(name: str, in_channels: int, out_channels: int, width: int) ->
 
 def _imported(name: str) -> Any:
     try:
-        return importlib.import_module("transformers")
+        return import_installed("transformers")
     except ImportError:
         raise ImportError(f"{name} needs transformers: pip install 'kornia-tidy[baselines]'") from None

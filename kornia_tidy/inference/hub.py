@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import os
@@ -19,6 +18,7 @@ from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.inference.half_precision import halved
 from kornia_tidy.inference.model_card import check_license, model_card
 from kornia_tidy.inference.trained import TrainedSystem, system_of_state
+from kornia_tidy.runtime.search_path import import_installed
 from kornia_tidy.tensor_files import read_tensors
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"  # the names of huggingface_hub's mixins
@@ -195,7 +195,7 @@ def _standard(value: Any) -> Any:
 def _download(repository: str, file: str, options: Mapping[str, Any]) -> Path:
     """Return the path of a file of a repository, downloaded unless it is in the cache."""
     try:
-        hub = importlib.import_module("huggingface_hub")  # for repositories only
+        hub = import_installed("huggingface_hub")  # for repositories only
     except ImportError:
         raise ImportError(
             f"there is no folder {repository}; to download the repository of this name: pip install 'kornia-tidy[hub]'"

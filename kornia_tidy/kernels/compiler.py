@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from kornia_tidy.runtime.programs import find_program, outside
+from kornia_tidy.runtime.search_path import ROOT, find_program
 
 THREADS = "-fopenmp"  # PyTorch has brought OpenMP's library along, but a compiler may lack its own
 SECONDS = 120  # to wait for a compiler, which needs two to seven on an idle processor
@@ -48,11 +48,11 @@ def find_compiler() -> Compiler:
     """
     words = _words(named_compiler())
     if not words:
-        found = next(filter(None, map(find_program, ("cc", "gcc", "clang"))), None)
-        if found is None:
+        found = next(filter(None, map(_program, ("cc", "gcc", "clang"))), "")
+        if not found:
             raise NotBuiltError("no C compiler was found: install gcc or clang, or name one in $CC")
         words = [found]
-    words[0] = find_program(words[0]) or words[0]
+    words[0] = _program(words[0]) or words[0]
     if not os.path.isabs(words[0]):
         raise NotBuiltError(f"the C compiler {words[0]} of $CC is in no absolute folder of $PATH; give its whole path")
     first_option = next((i for i, word in enumerate(words) if i and word.startswith("-")), len(words))
@@ -68,12 +68,20 @@ def named_compiler() -> str:
 
 def _words(command: str) -> list[str]:
     """Split a command into words; one that is a file as it stands may have spaces in its name."""
-    if find_program(command):
+    if _program(command):
         return [command]
     try:
         return shlex.split(command)
     except ValueError as error:
         raise NotBuiltError(f"$CC is {command!r}, which is no command: {error}") from None
+
+
+def _program(name: str) -> str:
+    """Return the path of a program that does not depend on the current folder, empty if there is none."""
+    try:
+        return find_program(name)
+    except FileNotFoundError:
+        return ""
 
 
 @cache
@@ -108,7 +116,9 @@ def run(command: list[str]) -> str:
             text=True,
             errors="replace",
             start_new_session=True,
-            **outside(),
+            # What it calls itself is not looked up in the current folder either.
+            cwd=ROOT,
+            env={**os.environ, "PATH": os.pathsep.join(filter(os.path.isabs, os.get_exec_path()))},
         )
     except OSError as error:
         raise NotBuiltError(f"the C compiler {command[0]} cannot be started: {error.strerror}") from None

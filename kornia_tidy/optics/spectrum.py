@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.runtime.search_path import import_installed
 
 REFERENCE_WAVELENGTH = 530e-9  # m; defocus and mask phase are quoted at this wavelength throughout
 
@@ -166,8 +167,7 @@ def camera_spectrum(
     grid = _slice_middles(int(samples) * steps)
     with warnings.catch_warnings(), np.printoptions():  # importing colour warns, and sets NumPy's print options
         warnings.simplefilter("ignore")
-        import colour  # noqa: PLC0415  (takes two seconds, which only this function needs)
-
+        colour = import_installed("colour")  # takes two seconds, which only this function needs
         check_choice("camera", camera, list(colour.MSDS_CAMERA_SENSITIVITIES))
         check_choice("illuminant", illuminant, list(colour.SDS_ILLUMINANTS))
         sensitivity = colour.MSDS_CAMERA_SENSITIVITIES[camera]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.runtime.search_path import import_installed
 
 # Linear sRGB from CIE XYZ with white (D65) at Y = 1, from the primaries of IEC 61966-2-1. XYZ from sRGB is its inverse.
 SRGB_FROM_XYZ = (
@@ -119,6 +120,4 @@ def _colour_science() -> Generator[Any]:
     """Import colour-science with its warnings off and NumPy's print options restored; it takes seconds."""
     with warnings.catch_warnings(), np.printoptions():
         warnings.simplefilter("ignore")
-        import colour  # noqa: PLC0415
-
-        yield colour
+        yield import_installed("colour")

@@ -22,10 +22,10 @@ C330_LENGTHS = (2247168, 3370752)  # bytes; LibRaw recognises the headerless fil
 
 
 def main() -> None:
-    """Decode standard input; arguments are sys.path as JSON, and the limits in processor seconds and bytes."""
+    """Decode standard input; arguments are the folders of NumPy and rawpy as JSON, and limits in seconds and bytes."""
     paths, seconds, memory = sys.argv[1:]
     limit(int(seconds), int(memory))
-    sys.path[:] = json.loads(paths)
+    sys.path += json.loads(paths)  # after the standard library
     with os.fdopen(os.dup(1), "wb") as output:
         os.dup2(2, 1)  # LibRaw prints to standard output too
         try:

@@ -23,10 +23,11 @@ from kornia_tidy.checks import check_positive
 from kornia_tidy.files import check_file
 from kornia_tidy.raw.decoder import C330_LENGTHS, LOADED
 from kornia_tidy.raw.validation import is_c330
+from kornia_tidy.runtime.search_path import ROOT, package_folders
 
 Source = str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryIO
 
-DECODER = Path(__file__).with_name("decoder.py")
+DECODER = Path(__file__).absolute().with_name("decoder.py")
 LONGEST_HEADER = 1 << 16
 # First bytes of raw files, by their offset: TIFF and its relatives, Canon, Fujifilm, Sigma, Minolta, Apple and others.
 # LibRaw guesses the camera of a file without any of these from its size.
@@ -170,12 +171,14 @@ def _run(file: IO[bytes], result: IO[bytes], timeout: float, memory_limit: int) 
     Raises:
         subprocess.TimeoutExpired: if it took too long; the process has been killed.
     """
-    arguments = [json.dumps(sys.path), str(int(timeout) + 1), str(int(memory_limit))]
+    packages = package_folders("numpy", "rawpy")
+    arguments = [json.dumps(packages), str(int(timeout) + 1), str(int(memory_limit))]
     process = subprocess.run(  # noqa: S603 (our own interpreter and file)
         [sys.executable, "-I", "-S", str(DECODER), *arguments],
         stdin=file,
         stdout=result,
         stderr=subprocess.PIPE,
+        cwd=ROOT,  # files beside a raw file are not ours
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # idle threads would take memory for their stacks
         timeout=timeout,
         check=False,

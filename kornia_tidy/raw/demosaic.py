@@ -16,6 +16,7 @@ from kornia_tidy.raw.color import srgb_from_xyz
 from kornia_tidy.raw.dng_fields import D65, SHORT, SRATIONAL, Field, dng_bytes
 from kornia_tidy.raw.filter_array import Tile
 from kornia_tidy.raw.quantised_demosaicing import ROWS_AT_ONCE, demosaic_quantised
+from kornia_tidy.runtime.search_path import import_installed
 
 # kornia and OpenCV's older names denote a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
 BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
@@ -234,7 +235,7 @@ def _opencv(mosaic: Tensor, letters: str, colors: str, name: str, matrix: Tensor
 
 
 def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
-    import rawpy  # noqa: PLC0415  (a C++ library, loaded only when needed)
+    rawpy = import_installed("rawpy")  # a C++ library, loaded only when needed
 
     kind = "Bayer" if letters in BAYER else "four-colour" if len(colors) == 4 else "X-Trans"
     check_choice(f"LibRaw's demosaicing of a {kind} array", name, LIBRAW[kind])

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import kornia_tidy
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.runtime.programs import find_program, outside
+from kornia_tidy.runtime.search_path import ROOT, find_program
 
 MEASURED_CODE = (
     "**/*.c",
@@ -140,13 +140,12 @@ def measured_files(root: Path) -> list[Path]:
 
 def git_commit() -> str | None:
     """Return the commit of the repository that the library is run from, or None if it is run from elsewhere."""
-    root, program = Path(kornia_tidy.__file__).parent, find_program("git")
-    if program is None:
-        return None
+    root = Path(kornia_tidy.__file__).parent
 
     def git(*words: str) -> str:
-        command = [program, "-C", str(root), *words]
-        return subprocess.run(command, capture_output=True, check=True, text=True, **outside()).stdout.strip()  # noqa: S603
+        command = [find_program("git"), "-C", str(root), *words]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True)  # noqa: S603
+        return done.stdout.strip()
 
     try:
         git("ls-files", "--error-unmatch", "__init__.py")  # else it is an enclosing repository

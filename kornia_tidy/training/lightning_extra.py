@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+from kornia_tidy.runtime.search_path import import_installed
 
 
 def require_lightning() -> None:
@@ -12,7 +12,7 @@ def require_lightning() -> None:
         ImportError: if one is missing.
     """
     try:
-        importlib.import_module("lightning.pytorch")
-        importlib.import_module("tensorboard")
+        import_installed("lightning.pytorch")
+        import_installed("tensorboard")
     except ImportError:
         raise ImportError("training needs lightning and tensorboard: pip install 'kornia-tidy[train]'") from None

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
+from kornia_tidy.runtime.search_path import starting_workers
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 
@@ -218,7 +219,9 @@ class SceneLoader(DataLoader):
     def __iter__(self) -> Any:
         """Yield batches; loading starts with the first one that is asked for."""
         self._handed = self._batches.first
-        for batch in super().__iter__():
+        with starting_workers():
+            batches = super().__iter__()
+        for batch in batches:
             self._handed += 1
             yield batch
 
