@@ -14,6 +14,8 @@ from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
+import torch
+
 from kornia_tidy.kernels.build import FLAGS, KERNELS, REALS, library_name
 from kornia_tidy.kernels.compiler import THREADS, NotBuiltError, find_compiler, run
 from kornia_tidy.kernels.processor import LEVELS
@@ -32,19 +34,26 @@ def make_libraries(folder: Path, machine: str = platform.machine()) -> list[Path
     """
     if sys.platform != "linux" or machine not in LEVELS:
         raise ValueError(f"libraries are made on Linux for {' and '.join(LEVELS)}, this is {sys.platform}, {machine}")
-    compiler = find_compiler()
     folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for level, source, dtype in product(LEVELS[machine], sorted(KERNELS.glob("*.c")), REALS):
-        path = folder / library_name(source, dtype, level)
-        flags = (*FLAGS, f"-march={level}", THREADS, f"-DREAL={REALS[dtype]}", *compiler.options)
-        with tempfile.TemporaryDirectory() as own:
-            part = Path(own) / "library.o"
-            run([*compiler.program, *flags, "-c", "-o", str(part), str(source)])
-            # Without -fopenmp, which would name a library of OpenMP.
-            run([*compiler.program, "-shared", "-s", "-o", str(path.absolute()), str(part), "-lm", *compiler.options])
-        paths.append(path)
-    return paths
+    each = product(LEVELS[machine], sorted(KERNELS.glob("*.c")), REALS)
+    return [make_library(source, dtype, level, folder) for level, source, dtype in each]
+
+
+def make_library(source: Path, dtype: torch.dtype, level: str, folder: Path) -> Path:
+    """Compile a C source for a level of processors into a folder and return the library's path.
+
+    Raises:
+        NotBuiltError: if there is no compiler or it fails.
+    """
+    compiler = find_compiler()
+    path = folder.absolute() / library_name(source, dtype, level)
+    flags = (*FLAGS, f"-march={level}", THREADS, f"-DREAL={REALS[dtype]}", *compiler.options)
+    with tempfile.TemporaryDirectory() as own:
+        part = Path(own) / "library.o"
+        run([*compiler.program, *flags, "-c", "-o", str(part), str(source)])
+        # Without -fopenmp, which would name a library of OpenMP.
+        run([*compiler.program, "-shared", "-s", "-o", str(path), str(part), "-lm", *compiler.options])
+    return path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
