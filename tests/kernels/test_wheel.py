@@ -17,12 +17,16 @@ import torch
 
 from kornia_tidy.kernels import build as module
 from kornia_tidy.kernels.build import CompiledCodeWarning, build, compiled, maker
+from kornia_tidy.kernels.gather_ops import SOURCE
 from kornia_tidy.kernels.make_libraries import make_library
 from kornia_tidy.kernels.processor import LEVELS, levels, levels_here
 from tests.base import BaseTester
 from tests.kernels.test_build import CompiledTester, forget
 
 ROOT = Path(__file__).resolve().parents[2]
+TOOLS = ("auditwheel", "build", "hatchling")  # patchelf, which auditwheel asks for, is no module
+can_compile = bool(levels_here()) and build(SOURCE, torch.float32).threads
+can_make = can_compile and all(importlib.util.find_spec(name) for name in TOOLS)
 EVERY = list(next((names for names in LEVELS.values() if set(levels_here()) & set(names)), ()))  # on such machines
 
 # What Linux lists of processors, without features that belong to no level.
@@ -73,7 +77,7 @@ class TestLevels(BaseTester):
         assert levels_here() == re.findall(r"(x86-64-v\d) \(supported", told.stdout)
 
 
-@pytest.mark.skipif(not levels_here(), reason="a wheel has no libraries for this processor")
+@pytest.mark.skipif(not can_compile, reason="no C compiler on this machine, or no wheels for its processor")
 class WheelTester(CompiledTester):
     @pytest.fixture
     def wheel(self, source):
@@ -187,9 +191,6 @@ class TestThreads(WheelTester):
         subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
 
 
-MAKES_WHEELS = ("auditwheel", "build", "hatchling", "patchelf")
-without_tools = [name for name in MAKES_WHEELS if importlib.util.find_spec(name) is None]
-
 # A capture and its gradient by the libraries of the wheel, for each level, and what they came from.
 CAPTURES = """
 import json, sys, torch
@@ -215,7 +216,7 @@ print(json.dumps(sorted(origins)))
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.skipif(bool(without_tools) or not levels_here(), reason=f"needs {' and '.join(MAKES_WHEELS)}, on Linux")
+@pytest.mark.skipif(not can_make, reason="needs Linux and what `make wheel` installs")
 class TestMake(CompiledTester):
     """`make wheel`: as the Makefile does it, without its environment."""
 
