@@ -20,7 +20,7 @@ enum { ROW_CHUNK = 4 };  // rows of light that are summed separately
 enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
 enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share one sum
 
-typedef REAL loose __attribute__((vector_size(64), aligned(sizeof(REAL)), may_alias));
+typedef REAL loose __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(REAL)), may_alias));
 
 // The fields of `_Scene` in gather_ops.py. Strides count elements; widths and heights are those of the output.
 typedef struct {
@@ -296,7 +296,7 @@ int correlate(const scene *s) {
         place places[PIECE_ROWS * PIECE_BLOCKS];
         member *members = malloc(sizeof(member) * PIECE_ROWS * PIECE_BLOCKS * TERMS);
         char *present = malloc(s->layers + 1);
-        vec *sums = aligned_alloc(64, area * sizeof(vec));
+        vec *sums = aligned_alloc(sizeof(vec), area * sizeof(vec));
         if (!members || !present || !sums) {
 #pragma omp atomic write
             failed = 1;

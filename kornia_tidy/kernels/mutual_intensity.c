@@ -12,7 +12,7 @@
 
 #include "vectors.h"
 
-enum { BLOCK = 8 };  // rows of J that stay in registers
+enum { BLOCK = 8, STEP = LANES > BLOCK ? LANES : BLOCK };  // rows of J that stay in registers, and what rows are padded to
 
 // Computes `count` vectors of a wave: the sum over m of x[m] u[m], complex, with a row x of the kernel and the field u.
 INLINE void add_wave(const REAL *x, const vec *u, int64_t cells, int64_t vecs, int count, vec *re, vec *im) {
@@ -65,10 +65,10 @@ static void products(const vec *re, const vec *im, const vec *one, const vec *tw
 // (depths, window, window) real. Returns 0, or 1 if there is no memory.
 int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels, REAL *energies, int64_t states,
                     int64_t depths, int64_t window, int64_t order, int64_t cells, int64_t threads) {
-    int64_t vecs = (cells + LANES - 1) / LANES, pitch = vecs * LANES, waves = states * order;
+    int64_t vecs = (cells + STEP - 1) / STEP * (STEP / LANES), pitch = vecs * LANES, waves = states * order;
     int64_t rows = (cells + BLOCK - 1) / BLOCK * BLOCK, plane = rows * vecs;
     size_t numbers = 2 * states * cells * vecs;
-    vec *fields = aligned_alloc(64, numbers * sizeof(vec));
+    vec *fields = aligned_alloc(sizeof(vec), numbers * sizeof(vec));
     if (!fields) return 1;
     memset(fields, 0, numbers * sizeof(vec));
     for (int64_t k = 0; k < states; k++)  // the real and the imaginary part of each row alternate
@@ -79,7 +79,7 @@ int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels,
     int failed = 0;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
     for (int64_t d = 0; d < depths; d++) {
-        vec *memory = aligned_alloc(64, (4 * waves * vecs + (window + 1) * plane) * sizeof(vec));
+        vec *memory = aligned_alloc(sizeof(vec), (4 * waves * vecs + (window + 1) * plane) * sizeof(vec));
         if (!memory) {
 #pragma omp atomic write
             failed = 1;

@@ -18,10 +18,10 @@
 
 #include "direct.c"
 
-enum { BAND = 8, DOUBLES = 8, PARTS = LANES / DOUBLES };
+enum { BAND = 8, DOUBLES = VECTOR_BYTES / sizeof(double), PARTS = LANES / DOUBLES };
 
-typedef double dvec __attribute__((vector_size(64)));
-typedef double dloose __attribute__((vector_size(64), aligned(8), may_alias));
+typedef double dvec __attribute__((vector_size(VECTOR_BYTES)));
+typedef double dloose __attribute__((vector_size(VECTOR_BYTES), aligned(8), may_alias));
 typedef REAL part __attribute__((vector_size(DOUBLES * sizeof(REAL))));
 
 static const REAL EPSILON = 1e-6;  // as in dense_occlusion.py
@@ -92,7 +92,7 @@ typedef struct {
 
 static int64_t table_pitch(const scene_parameters *s) { return s->side + 2 * LANES; }
 static int64_t table_rows(const scene_parameters *s) { return s->side + 2 * BAND - 2; }
-static int64_t table_size(const scene_parameters *s) { return table_rows(s) * (table_pitch(s) + 1) + DOUBLES; }
+static int64_t table_size(const scene_parameters *s) { return table_rows(s) * (table_pitch(s) + 1) + BAND; }
 
 static void fill_table(const scene_parameters *s, const REAL *psf, double *table) {
     int64_t pitch = table_pitch(s), rows = table_rows(s);
@@ -265,11 +265,12 @@ static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec tot
 // Adds the blur of weights 1: the sum over the starts and ends of runs of sign times the table's partial sum.
 static void add_edges(const scene_parameters *s, const double *table, const region *a, vec total[BAND]) {
     int64_t pitch = table_pitch(s);
-    dvec constant = {0}, sums[BAND][PARTS];
+    dvec constant[BAND / DOUBLES] = {0}, sums[BAND][PARTS];
     for (const edge *e = a->rows; e < a->rows + a->row_count; e++)
-        constant += e->sign * *(const dloose *)(table + table_rows(s) * pitch + e->at);
+        for (int v = 0; v < BAND; v += DOUBLES)
+            constant[v / DOUBLES] += e->sign * *(const dloose *)(table + table_rows(s) * pitch + e->at + v);
     for (int v = 0; v < BAND; v++)
-        for (int p = 0; p < PARTS; p++) sums[v][p] = constant[v] - (dvec){0};
+        for (int p = 0; p < PARTS; p++) sums[v][p] = constant[v / DOUBLES][v % DOUBLES] - (dvec){0};
     for (const edge *e = a->columns; e < a->columns + a->column_count; e++)
 #pragma GCC unroll 8
         for (int v = 0; v < BAND; v++)

@@ -177,11 +177,7 @@ static REAL *plan(transform *t, int64_t length, REAL *memory) {
 #define IS_double 0
 #define JOINED(a, b) a##b
 #define IS(type) JOINED(IS_, type)
-#ifdef __AVX__
-#define PART 32
-#else
-#define PART 16
-#endif
+#define PART (VECTOR_BYTES < 32 ? VECTOR_BYTES : 32)
 
 enum { PIECE = PART / sizeof(REAL), PIECES = LANES / PIECE };
 typedef REAL part __attribute__((vector_size(PART), may_alias));
