@@ -5,9 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
+WHEEL_READY := $(VENV)/.wheel-ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint docs bench targets clean
+.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint docs wheel bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -23,6 +24,7 @@ help:
 	@echo "make lint     style, spelling and types"
 	@echo "make docs     the site of the documentation, in outputs/site: minutes at first, for the examples of its gallery;"
 	@echo "              ARGS=--no-gallery runs none of them, ARGS=--linkcheck also asks the addresses of external links"
+	@echo "make wheel    a wheel in dist/ that needs no compiler: with the C sources compiled for each level of processors"
 	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
 	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
 	@echo "make targets  the figures that rendering is judged by, on a real scene: minutes, on an idle machine"
@@ -62,6 +64,13 @@ lint: $(READY)
 docs: $(DOCS_READY)
 	@$(BIN)/python docs/site/make_site.py $(ARGS)
 
+# auditwheel names the wheel after the oldest Linux that it runs on.
+wheel: $(WHEEL_READY)
+	@rm -rf build/libraries build/wheel
+	@$(BIN)/python -m kornia_tidy.kernels.make_libraries build/libraries
+	@KORNIA_TIDY_LIBRARIES=build/libraries $(BIN)/python -m build --wheel --no-isolation --outdir build/wheel
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir dist build/wheel/*.whl
+
 # The usual options of pytest leave the benchmarks out.
 bench: $(READY)
 	@mkdir -p outputs
@@ -80,6 +89,10 @@ clean:
 
 $(DOCS_READY): $(READY)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@touch $@
+
+$(WHEEL_READY): $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[wheel]'
 	@touch $@
 
 $(READY): pyproject.toml constraints.txt

@@ -102,7 +102,7 @@ def recipe(arguments: list[str]) -> list[list[str]]:
     """Return the commands that make would run for targets, without those that set up the environment."""
     if shutil.which("make") is None:
         pytest.skip("make is not installed")
-    old = [f"--old-file=.venv/{stamp}" for stamp in (".ready", ".docs-ready")]
+    old = [f"--old-file=.venv/{stamp}" for stamp in (".ready", ".docs-ready", ".wheel-ready")]
     done = subprocess.run(
         ["make", "--dry-run", *old, *arguments], cwd=ROOT, env=outside(), capture_output=True, text=True, check=False
     )

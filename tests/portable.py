@@ -77,7 +77,8 @@ V2 = frozenset({"sse4_2", "ssse3", "popcnt", "cx16"})
 PROBE = """
 import hashlib, json, warnings
 import torch
-from kornia_tidy.kernels.build import NotBuiltError, compiled, find_compiler
+from kornia_tidy.kernels.build import compiled
+from kornia_tidy.kernels.compiler import NotBuiltError, find_compiler
 from kornia_tidy.render.backends.direct import SOURCE
 warnings.simplefilter("ignore")
 try:

@@ -7,6 +7,7 @@ import os
 import platform
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from pathlib import Path
@@ -18,13 +19,15 @@ import kornia_tidy
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.tune import in_words
 from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops
-from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
+from kornia_tidy.kernels.build import REALS, build, cache_folder
+from kornia_tidy.kernels.compiler import Compiler, find_compiler
 from kornia_tidy.render.cost_store import read_profile
 
 DESCRIPTION = """\
 Print the environment of kornia_tidy: versions of packages, processor and threads, the C
-compiler, and the compiled kernels with their cache folder. Kernels that are not compiled
-yet are compiled, which takes some seconds. Please include this in bug reports.
+compiler, and the compiled kernels: those of the wheel, with their level of processors, or
+those compiled here, with their cache folder. Kernels that are not compiled yet are compiled,
+which takes some seconds. Please include this in bug reports.
 """
 
 PACKAGES = (
@@ -69,8 +72,9 @@ def lines() -> Iterator[tuple[str, str]]:
         if built.path is None:
             yield "kernel", f"{name}: not there: {built.remark}"
         else:
-            threads = "" if built.threads else f", in one thread: {built.remark}"
-            yield "kernel", f"{name}: {built.path.name}, {built.path.stat().st_size >> 10} KiB{threads}"
+            threads = "" if built.threads else ", in one thread"
+            remark = f": {built.remark}" if built.remark else ""
+            yield "kernel", f"{name}: {built.origin}{threads}, {built.path.name}{remark}"
     yield "costs", _costs()
     yield "cache", _cache()
 
@@ -114,8 +118,12 @@ def _cache() -> str:
         folder = cache_folder()
     except OSError as error:
         return f"none: {error}"
-    files = [path for path in folder.iterdir() if path.is_file()]
-    return f"{folder}, {len(files)} files, {sum(path.stat().st_size for path in files) >> 10} KiB"
+    sizes = []
+    for path in folder.iterdir():
+        with suppress(OSError):  # another process may remove it at any moment
+            if path.is_file():
+                sizes.append(path.stat().st_size)
+    return f"{folder}, {len(sizes)} files, {sum(sizes) >> 10} KiB"
 
 
 def _without_home(text: str) -> str:

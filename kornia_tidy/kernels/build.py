@@ -1,12 +1,14 @@
-"""C sources of this package, compiled for the processor they run on when they are first wanted.
+"""C sources of this package as libraries: those that a wheel brings, or compiled here when they are first wanted.
 
-Wheels would have to be built for every system and would know only its oldest processors. Most machines that run PyTorch
-have a C compiler (``torch.compile`` asks for one too), so the source is compiled once, in a second or two, and kept in
-the user's cache. Without a compiler nothing is lost but speed: whoever asks gets None and takes another way, and one
-warning says why and what it costs.
+A wheel that ``make wheel`` makes holds them for each level of processors of its platform, and the best one that this
+processor can run is loaded: no compiler is needed. Otherwise, and where ``$CC`` names a compiler, the source is
+compiled for this very processor, in seconds, and kept in the user's cache. Each way stands in where the other fails.
+If both do, nothing is lost but speed: whoever asks gets None and takes another way, and one warning says why and what
+it costs.
 
-A library is loaded only if it is whole and the user's own: its name holds a digest of its content, and nobody else may
-own it or write to it. A library that fails this is built again.
+A wheel's libraries are trusted as the package's Python code beside them is. A library of the cache is loaded only if it
+is whole and the user's own: its name holds a digest of its content, and nobody else may own it or write to it. One that
+fails this is built again, and so is one that another process removes meanwhile.
 """
 
 from __future__ import annotations
@@ -15,54 +17,41 @@ import ctypes
 import hashlib
 import os
 import platform
-import shlex
-import shutil
-import signal
 import stat
-import subprocess
 import tempfile
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import torch
+
+from kornia_tidy.kernels.compiler import (
+    THREADS,
+    Compiler,
+    NotBuiltError,
+    find_compiler,
+    named_compiler,
+    run,
+    why_no_threads,
+)
+from kornia_tidy.kernels.processor import levels_here, processor_features
 
 REALS = {torch.float32: "float", torch.float64: "double"}
 KERNELS = Path(__file__).parent  # the folder of the C sources
 SHARED = KERNELS / "vectors.h"  # what sources include
 FLAGS = ("-O3", "-std=gnu11", "-ffp-contract=fast", "-fPIC", "-shared", f"-I{SHARED.parent}")
 NATIVE = {"x86_64": "-march=native", "AMD64": "-march=native"}
-THREADS = "-fopenmp"  # PyTorch has brought OpenMP's library along, but a compiler may lack its own
-SECONDS = 120  # to wait for a compiler, which needs two to seven on an idle processor
+LIBRARIES = "libraries"  # the folder beside the sources that a wheel has
+NO_LIBRARIES = "the wheel that `make wheel` makes in a checkout needs no compiler"
 COST = "takes 2 to 6 times as long"  # measured on one real scene: gather 3.3, PSFs 1.8, occlusion 5.6
 
-_hung: list[str] = []  # the reason, once a compiler was ended: no compiler is called again
 _warned: set[bool] = set()  # of a library that is missing (False), of one without threads (True)
 
 
 class CompiledCodeWarning(RuntimeWarning):
     """Rendering is slower than it could be on this machine, since compiled code cannot be used."""
-
-
-class NotBuiltError(RuntimeError):
-    """Why there is no library, in words."""
-
-
-@dataclass(frozen=True)
-class Compiler:
-    """A C compiler as it is called.
-
-    Args:
-        program: the words that start it, such as ``("ccache", "gcc")``.
-        options: what the user wants it to be told, after everything else.
-        version: the first line of what it says of itself.
-    """
-
-    program: tuple[str, ...]
-    options: tuple[str, ...]
-    version: str
 
 
 @dataclass(frozen=True)
@@ -72,12 +61,14 @@ class Build:
     Args:
         library: to call functions of; None if there is none.
         path: where the library lies.
+        origin: where it comes from, in words: from the wheel, or compiled here.
         threads: whether it shares its work among threads.
-        remark: why there is no library, or why it has one thread only.
+        remark: why there is no library, why it has one thread only, or why it is from the second choice.
     """
 
     library: ctypes.CDLL | None
     path: Path | None = None
+    origin: str = ""
     threads: bool = False
     remark: str = ""
 
@@ -86,9 +77,10 @@ class Build:
 def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
     """Return a C source as a library in which ``REAL`` is the given type, or None where it cannot be had.
 
-    The library is kept under ``$XDG_CACHE_HOME/kornia_tidy`` (``~/.cache/kornia_tidy``, or a private temporary folder
-    where that cannot be written to), named after all that it depends on: source, compiler with its version, flags and
-    processor. ``$CC`` chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``).
+    A library of the wheel is taken if there is one for this processor. Else the source is compiled, and kept under
+    ``$XDG_CACHE_HOME/kornia_tidy`` (``~/.cache/kornia_tidy``, or a private temporary folder where that cannot be
+    written to), named after all that it depends on: source, compiler with its version, flags and processor. ``$CC``
+    chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``), and is preferred to the wheel.
 
     Args:
         source: a file of C.
@@ -126,130 +118,122 @@ def load(source: Path, dtype: torch.dtype) -> ctypes.CDLL:
 
 @cache
 def build(source: Path, dtype: torch.dtype) -> Build:
-    """Build a C source and report the library's path or the reason for its absence, without a warning."""
-    try:
-        return _build(source, dtype, find_compiler(), cache_folder())
-    except NotBuiltError as error:
-        return Build(None, remark=str(error))
-    except OSError as error:
-        return Build(None, remark=f"{source.name}: {error.strerror or error}")
-
-
-def _build(source: Path, dtype: torch.dtype, compiler: Compiler, folder: Path) -> Build:
+    """Load or build a C source and report the library's path or the reason for its absence, without a warning."""
     if not source.is_file():
-        raise NotBuiltError(f"{source}: no such file")
-    remark = ""
+        return Build(None, remark=f"{source}: no such file")
+    ways = (_from_compiler, _from_wheel) if named_compiler() else (_from_wheel, _from_compiler)
+    reasons = []
+    for way in ways:
+        try:
+            built = way(source.absolute(), dtype)
+        except NotBuiltError as error:
+            reasons.append(str(error))
+        except OSError as error:
+            reasons.append(f"{source.name}: {error.strerror or error}")
+        else:
+            return replace(built, remark=_joined([*reasons, built.remark]))
+    return Build(None, remark=_joined([*reasons, "" if (source.parent / LIBRARIES).is_dir() else NO_LIBRARIES]))
+
+
+def maker() -> str:
+    """Return what makes the libraries in use, without making one: the wheel's level, or the compiler's version."""
+    level = _level(KERNELS / LIBRARIES)
+    if level and not named_compiler():
+        return level
+    try:
+        return find_compiler().version
+    except NotBuiltError:
+        return level or "no compiler"
+
+
+def _joined(reasons: list[str]) -> str:
+    return "; ".join(filter(None, reasons))
+
+
+# ---------------------------------------------------------------------- the wheel
+
+
+def library_name(source: Path, dtype: torch.dtype, level: str) -> str:
+    """Return the name of a library in a wheel."""
+    return f"{source.stem}-{REALS[dtype]}-{level}.so"
+
+
+def _level(folder: Path) -> str | None:
+    """Return the best level that a wheel's libraries are for and that this processor can run."""
+    return next((level for level in levels_here() if any(folder.glob(f"*-{level}.so"))), None)
+
+
+def _from_wheel(source: Path, dtype: torch.dtype) -> Build:
+    folder = source.parent / LIBRARIES
+    level = _level(folder)
+    if level is None:
+        raise NotBuiltError("the wheel's libraries need a newer processor" if folder.is_dir() else "")
+    path = folder / library_name(source, dtype, level)
+    return Build(_load_beside_torch(path), path, f"from the wheel, for {level}", threads=True)
+
+
+def _load_beside_torch(path: Path) -> ctypes.CDLL:
+    """Load a library that takes OpenMP from whoever has brought it: torch, whose threads it shares in this way.
+
+    torch opens it for all libraries of the process, by a name that differs from version to version.
+    """
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError:  # a torch that has opened it for itself, or none
+        ctypes.CDLL("libgomp.so.1", mode=ctypes.RTLD_GLOBAL)
+        return ctypes.CDLL(str(path))
+
+
+# ---------------------------------------------------------------------- compiled here
+
+
+def _from_compiler(source: Path, dtype: torch.dtype) -> Build:
+    """Load the library that the cache has, or compile it for this very processor."""
+    compiler = find_compiler()
+    origin, remark = f"compiled for this processor by {compiler.version}", ""
     for extra in ((THREADS,), ()):
         flags = (*FLAGS, NATIVE.get(platform.machine(), "-mcpu=native"), *extra, f"-DREAL={REALS[dtype]}")
         name = f"{source.stem}-{_digest(source, compiler, flags)}"
-        path = _find(folder, name)
-        if path is None:
-            if extra and (why := _no_threads(compiler)):
-                remark = why
-                continue
-            path = _compile(source, folder, name, [*compiler.program, *flags, *compiler.options])
         try:
-            return Build(ctypes.CDLL(str(path)), path, bool(extra), remark)
+            path, library = _cached(source, name, [*compiler.program, *flags, *compiler.options])
+        except NotBuiltError:
+            remark = why_no_threads(compiler) if extra else ""
+            if not remark:
+                raise
         except OSError as error:  # such as OpenMP's library, which may be missing when it is wanted
-            remark = f"{path.name} cannot be loaded: {error}"
+            remark = f"{source.name}: {error.strerror or error}"
+        else:
+            return Build(library, path, origin, bool(extra), remark)
     raise NotBuiltError(remark)
 
 
-# ---------------------------------------------------------------------- the compiler
+def _cached(source: Path, name: str, command: list[str]) -> tuple[Path, ctypes.CDLL]:
+    """Return a library of the cache and its path, compiled if need be.
 
-
-@cache
-def find_compiler() -> Compiler:
-    """Return the compiler that ``$CC`` names, or the first of cc, gcc and clang on the path.
-
-    Raises:
-        NotBuiltError: if there is none, or it does not even tell its version.
+    Another process may remove a file or the whole cache at any moment, so that it is tried three times.
     """
-    words = _words(os.environ.get("CC", ""))
-    if not words:
-        found = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
-        if found is None:
-            raise NotBuiltError("no C compiler was found: install gcc or clang, or name one in $CC")
-        words = [found]
-    first_option = next((i for i, word in enumerate(words) if i and word.startswith("-")), len(words))
-    program, options = tuple(words[:first_option]), tuple(words[first_option:])
-    version = _run([*program, "--version"]).strip().splitlines()
-    return Compiler(program, options, version[0] if version else "a compiler that tells no version")
 
+    def library() -> tuple[Path, ctypes.CDLL]:
+        folder = cache_folder()
+        path = _find(folder, name) or _compile(source, folder, name, command)
+        return path, ctypes.CDLL(str(path))
 
-def _words(command: str) -> list[str]:
-    """Split a command into words; one that is a file as it stands may have spaces in its name."""
-    if shutil.which(command):
-        return [command]
-    try:
-        return shlex.split(command)
-    except ValueError as error:
-        raise NotBuiltError(f"$CC is {command!r}, which is no command: {error}") from None
-
-
-@cache
-def _no_threads(compiler: Compiler) -> str:
-    """Return why a compiler cannot build for threads, which may lack OpenMP's library; empty if it can."""
-    with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder) / "threads.c"
-        source.write_text("#include <omp.h>\nint threads(void) { return omp_get_max_threads(); }\n")
-        command = [*compiler.program, "-fPIC", "-shared", THREADS, "-o", str(source.with_suffix(".so")), str(source)]
-        try:
-            _run([*command, *compiler.options])
-        except NotBuiltError as error:
-            return f"{compiler.version} cannot build for threads, install its OpenMP library ({error})"
-    return ""
-
-
-def _run(command: list[str]) -> str:
-    """Run a compiler and return what it prints. One that hangs is ended with all that it has started.
-
-    Raises:
-        NotBuiltError: if it says no, hangs, or is not there.
-    """
-    if _hung:
-        raise NotBuiltError(_hung[0])
-    name = Path(command[0]).name
-    try:
-        process = subprocess.Popen(  # noqa: S603 (the user's own compiler)
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-        )
-    except OSError as error:
-        raise NotBuiltError(f"the C compiler {command[0]} cannot be started: {error.strerror}") from None
-    try:
-        output, complaints = process.communicate(timeout=SECONDS)
-    except subprocess.TimeoutExpired:
-        _end(process)
-        _hung.append(f"the C compiler {name} was ended, since it took more than {SECONDS} s")
-        raise NotBuiltError(_hung[0]) from None
-    except BaseException:
-        _end(process)
-        raise
-    if process.returncode:
-        said = next((line for line in complaints.splitlines() if "error" in line), complaints.strip()[-300:])
-        raise NotBuiltError(f"the C compiler {name} failed (status {process.returncode}): {said.strip() or 'no word'}")
-    return output
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.kill()
-    process.communicate()
+    for _ in range(2):
+        with suppress(OSError):
+            return library()
+    return library()
 
 
 def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:
     """Compile and install a library in one step, under a name with the digests of its inputs and of its content."""
     with tempfile.TemporaryDirectory(dir=folder) as own:
         new = Path(own) / "library.so"
-        _run([*command, "-o", str(new), str(source)])
+        try:
+            run([*command, "-o", str(new), str(source)])
+        except NotBuiltError as error:
+            if Path(own).is_dir():
+                raise
+            raise FileNotFoundError(f"the cache was removed while it was compiled: {error}") from None
         new.chmod(0o700)
         with new.open("rb") as file:
             os.fsync(file.fileno())
@@ -267,15 +251,19 @@ def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:
 # ---------------------------------------------------------------------- the cache
 
 
-@cache
 def cache_folder() -> Path:
-    """Return the folder of compiled libraries, which no one else may write to.
+    """Return the folder of compiled libraries, which no one else may write to. It is made if it is not there.
+
+    Source: XDG Base Directory Specification, by which a relative ``$XDG_CACHE_HOME`` is ignored.
 
     Raises:
         OSError: if there is none that can be used.
     """
     try:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        named = os.environ.get("XDG_CACHE_HOME", "")
+        home = Path(named) if os.path.isabs(named) else Path.home() / ".cache"
+        if not home.is_absolute():
+            raise RuntimeError("a relative home folder is that of whatever folder one is in")
         return _private(home / "kornia_tidy")
     except (OSError, RuntimeError):  # the second: a user without a home folder
         user = f"-{os.getuid()}" if hasattr(os, "getuid") else ""
@@ -297,12 +285,15 @@ def is_ours(status: os.stat_result) -> bool:
 
 def _find(folder: Path, name: str) -> Path | None:
     """Return the library of a name that is whole and ours. What is not is removed, so that it is built again."""
-    for path in sorted(folder.glob(f"{name}-*.so")):
-        status = path.lstat()
-        whole = stat.S_ISREG(status.st_mode) and path.stem == f"{name}-{_content_digest(path)}"
-        if whole and is_ours(status):
-            return path
-        with suppress(OSError):
+    paths: list[Path] = []
+    with suppress(OSError):
+        paths = sorted(folder.glob(f"{name}-*.so"))
+    for path in paths:
+        with suppress(OSError):  # another process may remove it at any moment
+            status = path.lstat()
+            whole = stat.S_ISREG(status.st_mode) and path.stem == f"{name}-{_content_digest(path)}"
+            if whole and is_ours(status):
+                return path
             path.unlink()
     return None
 
@@ -317,14 +308,3 @@ def _digest(source: Path, compiler: Compiler, flags: tuple[str, ...]) -> str:
     words = [source.name, *compiler.program, compiler.version, *flags, *compiler.options]
     parts = [*(path.read_bytes() for path in sources), *(word.encode() for word in words), processor_features()]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
-
-
-@cache
-def processor_features() -> bytes:
-    """Return the processor's model and instruction sets: unlike machines may share a home folder."""
-    try:
-        lines = Path("/proc/cpuinfo").read_bytes().split(b"\n\n")[0].splitlines()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}".encode()
-    kept = (b"model name", b"flags", b"Features", b"CPU part")
-    return b"\n".join(line for line in lines if line.startswith(kept))

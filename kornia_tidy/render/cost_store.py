@@ -20,7 +20,8 @@ from typing import Any
 import torch
 
 from kornia_tidy.files import parse_json
-from kornia_tidy.kernels.build import KERNELS, NotBuiltError, cache_folder, find_compiler, is_ours, processor_features
+from kornia_tidy.kernels.build import KERNELS, cache_folder, is_ours, maker
+from kornia_tidy.kernels.processor import processor_features
 from kornia_tidy.render.cost_profile import EPYC, RATES, XEON, CostProfile
 from kornia_tidy.render.repeatable import of_thread
 from kornia_tidy.runtime.threads import SharedLock
@@ -117,17 +118,13 @@ def forget_in_process() -> None:
 def profile_path(threads: int) -> Path:
     """Return the file of a number of threads, named after all that times depend on.
 
-    That is the processor, the threads, torch, the C compiler and the C sources, and the terms of the profile.
+    That is the processor, the threads, torch, the C sources and what compiled them, and the terms of the profile.
 
     Raises:
         OSError: if there is no folder that can be used.
     """
-    try:
-        compiler = find_compiler().version
-    except NotBuiltError:
-        compiler = "no compiler"
     terms = [f"{name}: {', '.join(kind.__dataclass_fields__)}" for name, kind in RATES.items()]
-    words = [str(threads), torch.__version__, compiler, *terms]
+    words = [str(threads), torch.__version__, maker(), *terms]
     sources = [path.read_bytes() for path in sorted(KERNELS.glob("*.[ch]"))]
     parts = [processor_features(), *(word.encode() for word in words), *sources]
     digest = hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
@@ -182,7 +179,8 @@ def forget_profile(threads: int) -> Path | None:
         OSError: if it cannot be removed.
     """
     path = profile_path(threads)
-    if not path.is_file():
+    try:
+        path.unlink()
+    except FileNotFoundError:
         return None
-    path.unlink()
     return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 
 import pytest
 import torch
@@ -42,15 +43,25 @@ class TestInfo(BaseTester):
     @pytest.mark.skipif(compiled.build(info.SOURCES[0], torch.float32).library is None, reason="no C compiler")
     def test_feature_kernels_and_their_cache(self, capsys):
         topics = self.told(capsys)
-        assert all(" KiB" in text for text in topics["kernel"])
-        assert topics["kernel"][0].startswith("direct.c, float32: direct-")
+        assert topics["kernel"][0].startswith("direct.c, float32: compiled for this processor by ")
+        assert all(text.endswith(".so") for text in topics["kernel"])
+
+    @pytest.mark.skipif(compiled.build(info.SOURCES[0], torch.float32).library is None, reason="no C compiler")
+    def test_feature_libraries_that_were_removed_meanwhile(self, capsys, tmp_path, monkeypatch):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        monkeypatch.setattr(info, "SOURCES", info.SOURCES[-1:])
+        assert self.told(capsys)["cache"][0].startswith(f"{tmp_path}/cache/kornia_tidy, 2 files, ")
+        shutil.rmtree(tmp_path / "cache")
+        topics = self.told(capsys)
+        assert len(topics["kernel"]) == 2
+        assert topics["cache"] == [f"{tmp_path}/cache/kornia_tidy, 0 files, 0 KiB"]
 
     def test_feature_without_a_compiler_it_says_why(self, capsys, monkeypatch):
         monkeypatch.setenv("CC", "false")
         topics = self.told(capsys)
         why = "the C compiler false failed (status 1): no word"
         assert topics["compiler"] == [why]
-        assert all(text.endswith(f"not there: {why}") for text in topics["kernel"])
+        assert all(f"not there: {why}; the wheel that" in text for text in topics["kernel"])
 
     def test_feature_the_home_folder_is_not_named(self, capsys, tmp_path, monkeypatch):
         monkeypatch.setenv("HOME", str(tmp_path))

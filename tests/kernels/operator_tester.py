@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops
-from kornia_tidy.kernels.build import NotBuiltError, build
+from kornia_tidy.kernels.build import build
+from kornia_tidy.kernels.compiler import NotBuiltError
 from tests.base import BaseTester
 from tests.kernels.kernel_shapes import Call
 

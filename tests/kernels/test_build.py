@@ -15,19 +15,21 @@ import pytest
 import torch
 
 from kornia_tidy.kernels import build as module
-from kornia_tidy.kernels.build import CompiledCodeWarning, build, compiled, find_compiler
+from kornia_tidy.kernels import compiler as compiler_module
+from kornia_tidy.kernels.build import CompiledCodeWarning, build, compiled
+from kornia_tidy.kernels.compiler import find_compiler
 from kornia_tidy.kernels.gather_ops import SOURCE
 from tests.base import BaseTester
 
 pytestmark = pytest.mark.skipif(build(SOURCE, torch.float32).library is None, reason="no C compiler on this machine")
-MEMORIES = (compiled, build, module.find_compiler, module.cache_folder, module._no_threads)
+MEMORIES = (compiled, build, find_compiler, compiler_module.why_no_threads)
 
 
 def forget() -> None:
     """Let everything be found anew, as in a new process."""
     for memory in MEMORIES:
         memory.cache_clear()
-    module._hung.clear()
+    compiler_module._hung.clear()
     module._warned.clear()
 
 
@@ -132,8 +134,40 @@ class TestCompiler(CompiledTester):
 
     def test_exception_no_compiler(self, source, monkeypatch):
         monkeypatch.setenv("PATH", "")
-        with pytest.warns(CompiledCodeWarning, match="no C compiler was found: install gcc or clang"):
+        words = (
+            "no C compiler was found: install gcc or clang.*; the wheel that `make wheel` makes .* needs no compiler"
+        )
+        with pytest.warns(CompiledCodeWarning, match=words):
             assert compiled(source, torch.float32) is None
+
+    @pytest.mark.parametrize("command", ["./mine", "tools/mine", "nowhere-on-the-path"])
+    def test_exception_a_compiler_of_the_current_folder(self, command, source, tmp_path, monkeypatch):
+        (tmp_path / "tools").mkdir()
+        for path in (tmp_path / "mine", tmp_path / "tools" / "mine"):
+            self.compiler(path, f'touch {tmp_path}/started; exec cc "$@"')
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("CC", command)
+        with pytest.warns(
+            CompiledCodeWarning, match=f"the C compiler {command} of .CC is in no absolute folder of .PATH"
+        ):
+            assert compiled(source, torch.float32) is None
+        assert not (tmp_path / "started").exists()
+
+    @pytest.mark.parametrize("command", ["", "gcc", "env gcc"])
+    @pytest.mark.parametrize("entry", ["", ".", "tools"])
+    def test_feature_nothing_in_the_current_folder_is_started(self, entry, command, source, tmp_path, monkeypatch):
+        here = tmp_path / "downloaded"
+        (here / "tools").mkdir(parents=True)
+        for folder, name in product((here, here / "tools"), ("cc", "gcc", "clang", "env", "as", "ld")):
+            self.compiler(folder / name, f"touch {tmp_path}/started; exit 1")
+        (here / "stdint.h").write_text("#error a header of the current folder\n")
+        source.write_text(f"#include <stdint.h>\n{source.read_text()}")
+        monkeypatch.chdir(here)
+        for name in ("PATH", "CPATH", "C_INCLUDE_PATH", "COMPILER_PATH", "LIBRARY_PATH"):
+            monkeypatch.setenv(name, os.pathsep.join((entry, os.environ.get(name, ""))))
+        monkeypatch.setenv("CC", command)
+        assert self.twice(compiled(source, torch.float64)) == 2.5
+        assert not (tmp_path / "started").exists()
 
     def test_exception_a_source_with_an_error(self, source, folder):
         source.write_text("REAL twice(REAL x) { return y; }\n")
@@ -145,7 +179,7 @@ class TestCompiler(CompiledTester):
         child = tmp_path / "child"
         script = self.compiler(tmp_path / "hangs", f"sleep 1000 & echo $! > {child}; wait")
         monkeypatch.setenv("CC", script)
-        monkeypatch.setattr(module, "SECONDS", 0.5)
+        monkeypatch.setattr(compiler_module, "SECONDS", 0.5)
         with pytest.warns(CompiledCodeWarning, match=r"hangs was ended, since it took more than 0.5 s"):
             assert compiled(source, torch.float32) is None
         process = int(child.read_text())
@@ -226,6 +260,56 @@ class TestCache(CompiledTester):
         path = build(source, torch.float32).path
         assert path.parent.parent == tmp_path  # a private temporary folder instead
         assert path.parent.stat().st_mode & 0o777 == 0o700
+
+    @pytest.mark.parametrize("moment", ["lstat", "digest", "load"])
+    def test_feature_a_library_that_is_removed_meanwhile_is_built_again(self, moment, source, folder, monkeypatch):
+        """By another process, at any moment between finding its name and loading it."""
+        path = self.damaged(source, folder, lambda path: None)
+        owner, name = {"lstat": (Path, "lstat"), "digest": (module, "_content_digest"), "load": (ctypes, "CDLL")}[
+            moment
+        ]
+        original, removed = getattr(owner, name), []
+
+        def remove_first(given, *args, **options):
+            if Path(given) == path and not removed:
+                removed.append(path.unlink())
+            return original(given, *args, **options)
+
+        monkeypatch.setattr(owner, name, remove_first)
+        assert self.twice(compiled(source, torch.float64)) == 2.5
+        assert removed
+        assert build(source, torch.float64).threads
+        assert list(folder.iterdir()) == [path]
+
+    def test_feature_a_cache_that_is_removed_while_the_compiler_runs_is_made_again(
+        self, source, folder, tmp_path, monkeypatch
+    ):
+        body = (
+            f'case "$*" in *library.so*) [ -e {tmp_path}/once ] || {{ touch {tmp_path}/once; rm -r {folder}; }};; esac'
+        )
+        monkeypatch.setenv("CC", self.compiler(tmp_path / "mine", f'{body}\nexec cc "$@"'))
+        assert self.twice(compiled(source, torch.float64)) == 2.5
+        assert (tmp_path / "once").exists()
+        assert build(source, torch.float64).path.parent == folder
+
+    def test_feature_a_cache_that_is_removed_between_two_sources_is_made_again(self, source, folder):
+        assert compiled(source, torch.float32) is not None
+        shutil.rmtree(folder.parent)
+        assert self.twice(compiled(source, torch.float64)) == 2.5
+
+    @pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "HOME"])
+    def test_feature_a_relative_cache_folder_is_ignored(self, variable, source, tmp_path, monkeypatch):
+        """It would be another one in each folder, and may have come with a download."""
+        (tmp_path / "here").mkdir()
+        monkeypatch.chdir(tmp_path / "here")
+        monkeypatch.setenv("HOME", str(tmp_path / "home"))
+        monkeypatch.setenv("XDG_CACHE_HOME", "")
+        monkeypatch.setenv(variable, "cache")
+        built = build(source, torch.float64)
+        assert self.twice(built.library) == 2.5
+        expected = tmp_path / "home" / ".cache" if variable == "XDG_CACHE_HOME" else tmp_path
+        assert built.path.parent.parent == expected
+        assert not list((tmp_path / "here").iterdir())
 
     @pytest.mark.parametrize("why", ["no home", "a file in its place"])
     def test_feature_without_a_cache_folder_a_temporary_one_serves(self, why, source, tmp_path, monkeypatch):

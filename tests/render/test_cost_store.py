@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy.kernels import build
 from kornia_tidy.render import cost_store, dispatch
 from kornia_tidy.render.cost_profile import EPYC, XEON
 from kornia_tidy.render.cost_store import (
@@ -39,10 +38,8 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv(cost_store.TUNE)
     monkeypatch.setattr(dispatch, "_choices", {})
-    build.cache_folder.cache_clear()
     forget_in_process()
     yield tmp_path / "kornia_tidy"
-    build.cache_folder.cache_clear()
     forget_in_process()
 
 
@@ -68,7 +65,7 @@ class TestFile(BaseTester):
         if part == "torch":
             monkeypatch.setattr(cost_store.torch, "__version__", "9.9")
         elif part == "compiler":
-            monkeypatch.setattr(cost_store, "find_compiler", lambda: build.Compiler(("cc",), (), "cc 99"))
+            monkeypatch.setattr(cost_store, "maker", lambda: "cc 99")
         else:
             monkeypatch.setattr(cost_store, "processor_features", lambda: b"GenuineIntel 9")
         assert read_profile(3) is None
