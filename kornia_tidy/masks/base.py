@@ -267,7 +267,8 @@ def initial_values(
     check_choice("initial", initial, ("noise", "flat"))
     if initial == "flat":
         return torch.zeros(num_masks, *shape)
-    return rms * torch.randn(num_masks, *shape, generator=generator)
+    noise = rms * torch.randn(num_masks, *shape, generator=generator, dtype=torch.float32)
+    return noise.to(torch.get_default_dtype())  # another type draws other numbers
 
 
 def adam_groups(masks: nn.Module, lr_metres: float, **options: float) -> dict[str, object]:
