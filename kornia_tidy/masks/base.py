@@ -119,7 +119,10 @@ class PhaseMasks(nn.Module):
 
     def extra_repr(self) -> str:
         """Return a one-line description of the masks."""
-        masks, rows, columns = self.phase.shape
+        try:
+            masks, rows, columns = self.phase.shape
+        except AttributeError:  # of the base class, or before a family has registered its parameters
+            return "no masks yet"
         learnable = "learnable" if any(p.requires_grad for p in self.parameters()) else "fixed"
         limit = ""
         if self.constraint != "none":
