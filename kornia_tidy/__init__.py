@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from kornia_tidy.runtime.signals import end_on_signals, is_command
+
+if is_command():
+    end_on_signals()  # during the imports that follow, which take seconds
+
 from typing import TYPE_CHECKING, Any
 
 from kornia_tidy.camera.burst import burst

@@ -95,6 +95,19 @@ def described(value: Any) -> str:
     return repr(value) if isinstance(value, str) and len(value) < 40 else f"a {type(value).__name__}"
 
 
+def printed(value: Tensor, digits: int = 3) -> str:
+    """Return the numbers of a tensor in short, for the description of a module; the meta device has none.
+
+    Example:
+        >>> printed(torch.tensor(0.0301)), printed(torch.tensor([0.5, 0.25])), printed(torch.ones(2, device="meta"))
+        ('0.0301', '(0.5, 0.25)', 'unset')
+    """
+    if value.is_meta:
+        return "unset"
+    numbers = [f"{number:.{digits}g}" for number in value.detach().flatten().tolist()]
+    return f"({', '.join(numbers)})" if value.ndim else numbers[0]
+
+
 def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
     """Raise ``TypeError`` unless ``value`` is a floating-point tensor, ``ValueError`` unless it has this rank."""
     if not isinstance(value, Tensor):
@@ -103,10 +116,21 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
         raise TypeError(
             f"{name} must be floating point with values in [0, 1] or metres, got {value.dtype}{_as_float(name, value)}"
         )
+    if value.is_meta:
+        check_values(name, value)
     if value.ndim != rank:
         missing = name == "depth" and value.ndim == rank - 1
         remedy = f": add the axis of channels with depth.unsqueeze({-3})" if missing else ""
         raise ValueError(f"{name} must have shape {layout}, got {tuple(value.shape)}{remedy}")
+
+
+def check_values(name: str, value: Tensor) -> None:
+    """Raise ``ValueError`` if a tensor is on the meta device, where it has a shape and no values."""
+    if value.is_meta:
+        raise ValueError(
+            f"{name} must hold values, and tensors on the meta device have none: move it to another device, and call "
+            f"torch.set_default_device('cpu') if that is where new tensors are made"
+        )
 
 
 def _as_float(name: str, value: Tensor) -> str:
@@ -122,6 +146,7 @@ def check_finite(name: str, value: Tensor) -> None:
     """Raise ``ValueError`` if a value is NaN or infinite. Waits for the device."""
     if not value.numel():
         return
+    check_values(name, value)
     lowest, highest = torch.aminmax(value.detach())  # NaN if any value is: one pass without a boolean tensor
     if not bool(lowest.isfinite() & highest.isfinite()):
         bad = value[~torch.isfinite(value)][0].item()
@@ -130,6 +155,7 @@ def check_finite(name: str, value: Tensor) -> None:
 
 def check_depth(depth: Tensor) -> None:
     """Raise ``ValueError`` if a depth is NaN, zero or negative; infinity is allowed. Waits for the device."""
+    check_values("depth", depth)
     if depth.numel() and not bool(depth.detach().amin() > 0):  # False for NaN too
         bad = depth[~(depth > 0)][0].item()
         raise ValueError(f"depth must be positive metres, got {bad} (fill holes and mark them in a mask first)")

@@ -7,11 +7,10 @@ import io
 import os
 import signal
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import TextIO
 
 import torch
@@ -33,12 +32,13 @@ from kornia_tidy.commands import (
     train,
     tune,
 )
+from kornia_tidy.runtime.signals import Stopped, ignore_interruption, raised_signals, status_and_sentence
 
 # Each has add_parser(subparsers), which sets run(args).
 COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, app, info)
 
-# Exit statuses; 70 is EX_SOFTWARE of sysexits.h, those above 128 are 128 and the number of the signal.
-DONE, CANNOT, BUG, INTERRUPTED, NOBODY_READS, TERMINATED = 0, 2, 70, 130, 141, 143
+# Exit statuses; 70 is EX_SOFTWARE of sysexits.h, 141 is 128 and the number of SIGPIPE.
+DONE, CANNOT, BUG, NOBODY_READS = 0, 2, 70, 141
 DEBUG = "KORNIA_TIDY_DEBUG"  # environment variable; if set, tracebacks are printed
 
 DESCRIPTION = """\
@@ -60,36 +60,67 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: from argparse, after ``--help`` (0) or arguments that it cannot read (2).
     """
+    _open_closed_streams()
     _print_any_name()
-    args = build_parser().parse_args(argv)
-    with warnings.catch_warnings(), _termination_raised():
-        warnings.showwarning = _print_warning  # ty: ignore[invalid-assignment]
+    try:
+        with warnings.catch_warnings(), raised_signals():
+            warnings.showwarning = _print_warning  # ty: ignore[invalid-assignment]
+            return _run(argv)
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            _empty(stream)
+        if argv is None:
+            ignore_interruption()
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    """Run the command line; return its exit status."""
+    try:
         try:
+            args = build_parser().parse_args(argv)
             args.run(args)
-            sys.stdout.flush()  # raises here if the disk is full or the pipe is closed
-        except KeyboardInterrupt as stop:
-            return _stopped(stop)
-        except BrokenPipeError:
-            _forget_stdout()
-            return NOBODY_READS
-        except Exception as error:
-            stop = _interruption_behind(error)
-            return _told(error) if stop is None else _stopped(stop)
+        except SystemExit:
+            sys.stdout.flush()  # of --help
+            raise
+        sys.stdout.flush()  # raises here if the disk is full or the pipe is closed
+    except KeyboardInterrupt as stop:
+        status, sentence = status_and_sentence(stop.number if isinstance(stop, Stopped) else signal.SIGINT)
+        _say(sentence)
+        return status
+    except BrokenPipeError:
+        return NOBODY_READS
+    except Exception as error:
+        return _told(error)
     return DONE
 
 
-def _stopped(stop: KeyboardInterrupt) -> int:
-    """Say that a signal ended the command; return its exit status."""
-    terminated = isinstance(stop, _Terminated)
-    print(f"kornia-tidy: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
-    return TERMINATED if terminated else INTERRUPTED
+def _say(sentence: str) -> None:
+    """Print a line to standard error, if it can be written to."""
+    with suppress(OSError):
+        print(sentence, file=sys.stderr, flush=True)
 
 
-def _interruption_behind(error: BaseException | None) -> KeyboardInterrupt | None:
-    """Return the signal that an error comes from: in the middle of an import it may be told as an ``ImportError``."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error
+def _open_closed_streams() -> None:
+    """Open standard streams that are closed as the null device.
+
+    Otherwise the next file would get their number, and with it what C libraries and child processes print.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115 as long as the process lives
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
+
+
+def _empty(stream: TextIO) -> None:
+    """Write what a stream holds, or drop it: Python would complain of it at the end and change the exit status."""
+    try:
+        stream.flush()
+    except (OSError, ValueError):
+        with suppress(OSError, ValueError):
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, stream.fileno())
+            os.close(nothing)
 
 
 def _print_any_name() -> None:
@@ -98,43 +129,19 @@ def _print_any_name() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, raised as Ctrl-C is, so that temporary files are removed and locks released."""
-
-
-@contextmanager
-def _termination_raised() -> Generator[None]:
-    """Raise :class:`_Terminated` on SIGTERM within a block, in the main thread and where nobody handles it."""
-
-    def end(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one would interrupt the clearing up
-        raise _Terminated
-
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
 def _told(error: Exception) -> int:
     """Print an error as one sentence, and return the exit status."""
     if os.environ.get(DEBUG):
         traceback.print_exception(error)
     if _is_out_of_memory(error):
-        print(f"kornia-tidy: error: out of memory: {_sentence(error)}", file=sys.stderr)
+        _say(f"kornia-tidy: error: out of memory: {_sentence(error)}")
         return CANNOT
     if isinstance(error, (ImportError, KeyError, OSError, TypeError, ValueError)):
-        print(f"kornia-tidy: error: {_sentence(error)}", file=sys.stderr)
+        _say(f"kornia-tidy: error: {_sentence(error)}")
         return CANNOT
-    print(
+    _say(
         f"kornia-tidy: error: this is a fault of kornia-tidy, not yours ({type(error).__name__}: {_sentence(error)}); "
-        f"please report it with the output of the same command with {DEBUG}=1 in the environment",
-        file=sys.stderr,
+        f"please report it with the output of the same command with {DEBUG}=1 in the environment"
     )
     return BUG
 
@@ -145,14 +152,6 @@ def _is_out_of_memory(error: Exception) -> bool:
         return True
     text = str(error)
     return (isinstance(error, RuntimeError) and "allocate memory" in text) or "Insufficient memory" in text
-
-
-def _forget_stdout() -> None:
-    """Redirect standard output to the null device, so that the interpreter's final flush does not fail again."""
-    with suppress(OSError, ValueError):
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, sys.stdout.fileno())
-        os.close(nothing)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -179,7 +178,7 @@ def _print_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    print(f"kornia-tidy: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    _say(f"kornia-tidy: warning: {' '.join(str(message).split())}")
 
 
 if __name__ == "__main__":

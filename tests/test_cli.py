@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -12,6 +13,9 @@ import torch
 from kornia_tidy import cli
 from tests.base import BaseTester
 from tests.forks import fork, wait
+
+FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
+SHOW = ("masks", "show", "heights.npy")
 
 
 class TestMain(BaseTester):
@@ -106,24 +110,64 @@ class TestMain(BaseTester):
         assert self.printing_to(write, tmp_path) == 141
         assert capfd.readouterr().err == ""
 
-    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
-    def test_exception_a_full_disk_under_the_report(self, tmp_path, capfd):
-        assert self.printing_to(os.open("/dev/full", os.O_WRONLY), tmp_path) == 2
+    @FULL
+    @pytest.mark.parametrize("argv", [SHOW, ("--help",)], ids=["report", "help"])
+    def test_exception_a_full_disk_under_the_output(self, argv, tmp_path, capfd):
+        assert self.printing_to(os.open("/dev/full", os.O_WRONLY), tmp_path, argv) == 2
         assert capfd.readouterr().err == "kornia-tidy: error: [Errno 28] No space left on device\n"
 
     @staticmethod
-    def printing_to(file, folder):
+    def printing_to(file, folder, argv=SHOW):
         """Return the exit status of a command that prints to a file of the system."""
         np.save(folder / "heights.npy", np.zeros((1, 3, 3)))
         status = folder / "status"
 
         def child():
+            os.chdir(folder)
             sys.stdout = os.fdopen(file, "w")
-            status.write_text(str(cli.main(["masks", "show", str(folder / "heights.npy")])))
+            status.write_text(str(cli.main(argv)))
 
         assert wait(fork(child)) == 0
         os.close(file)
         return int(status.read_text())
+
+    @pytest.mark.parametrize(
+        "names", [("stdin",), ("stdout",), ("stderr",), ("stdin", "stdout", "stderr")], ids="+".join
+    )
+    def test_feature_closed_streams_lead_to_the_null_device(self, names, tmp_path):
+        """As of some daemons: a file that is written must not get the number of a stream."""
+        np.save(tmp_path / "heights.npy", np.zeros((1, 3, 3)))
+        numbers = [("stdin", "stdout", "stderr").index(name) for name in names]
+
+        def child():
+            os.chdir(tmp_path)
+            for name, number in zip(names, numbers, strict=True):
+                os.close(number)
+                setattr(sys, name, None)  # as Python does at its start
+            assert cli.main(SHOW) == 0
+            assert cli.main(["masks", "show", "missing.npy"]) == 2
+            for number in numbers:
+                assert os.path.samestat(os.fstat(number), os.stat(os.devnull))
+                assert os.get_inheritable(number)
+
+        assert wait(fork(child)) == 0
+
+    @FULL
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize(
+        ("streams", "status", "told"),
+        [
+            ("<&- >&- 2>&-", 0, ""),
+            (">&-", 0, ""),
+            (">/dev/full", 2, "kornia-tidy: error: [Errno 28] No space left on device\n"),
+            (">/dev/full 2>/dev/full", 2, ""),
+        ],
+    )
+    def test_feature_a_whole_process_without_streams(self, streams, status, told):
+        """From its start to its end, where Python writes out what is left and may change the exit status."""
+        command = ["sh", "-c", f'"$0" -m kornia_tidy info {streams}', sys.executable]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (status, told)
 
     def test_feature_interruption_returns_130(self, command_that, capsys):
         def interrupt():

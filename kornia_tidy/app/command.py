@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import socket
 import sys
 import tempfile
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from kornia_tidy.app.guard import host_name
 from kornia_tidy.commands.report import tell
 from kornia_tidy.figures.style import require_matplotlib
 
@@ -18,7 +20,8 @@ DESCRIPTION = """\
 Open a page for the browser on which a scene, a camera and its masks are chosen, and
 which shows masks, point spread functions (PSFs) over depth, the coded capture, the
 reconstruction and the depth. The settings can be saved as a Python script that takes
-the same capture. Only this machine can open the page. Ctrl+C ends it.
+the same capture. Only this machine can open the page, and other web sites in its
+browser cannot use it. Ctrl+C ends it.
 """
 
 EPILOG = """\
@@ -28,10 +31,11 @@ examples:
   kornia-tidy app                 then open the address that it prints
   kornia-tidy app --port 8080
   ssh -L 7860:localhost:7860 HOST   the page of another machine, at localhost:7860
+  kornia-tidy app --allow-host lab.example    behind a proxy of that name
 """
 
 HOST = "127.0.0.1"
-FIRST_PORT, PORTS = 7860, range(1024, 65536)
+FIRST_PORT, TRIED, PORTS = 7860, 100, range(1024, 65536)
 
 
 def add_parser(subparsers: Any) -> None:
@@ -47,6 +51,22 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--port", type=port, metavar="N", help=f"of the page (default: the first free one from {FIRST_PORT} on)"
     )
+    parser.add_argument(
+        "--allow-host",
+        type=host,
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="name by which the page is asked for, besides localhost, 127.0.0.1 and [::1]; may be repeated",
+    )
+
+
+def host(text: str) -> str:
+    """Parse the name of a host."""
+    try:
+        return host_name(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def port(text: str) -> int:
@@ -78,22 +98,22 @@ def run(args: argparse.Namespace) -> None:
 
             page = page_module.make_page(progress, Path(folder))
             progress(0.95, "server")
-            try:
-                page.launch(
-                    server_name=HOST,
-                    server_port=args.port,
-                    share=False,
-                    prevent_thread_lock=True,
-                    quiet=True,
-                    footer_links=[],
-                    theme=page_module.THEME,
-                    css=page_module.STYLE,
-                    max_file_size="256mb",
-                    ssr_mode=False,
-                    _frontend=False,  # or it would look whether the page answers in 3 s, which a busy machine does not
-                )
-            except OSError as error:
-                raise OSError(f"cannot open port {args.port or FIRST_PORT}: give another one by --port") from error
-        tell("open", page.local_url)
-        tell("end", "Ctrl+C")
-        page.block_thread()
+            server = page_module.make_server(page, Path(folder), args.allow_host)
+        with listening(args.port) as opened:
+            tell("open", "http://{}:{}/".format(*opened.getsockname()))
+            tell("end", "Ctrl+C")
+            server.run(sockets=[opened])
+
+
+def listening(number: int | None) -> socket.socket:
+    """Return a socket that listens on this machine only, at a port or at the first free one.
+
+    Raises:
+        OSError: if the port is taken.
+    """
+    for each in range(FIRST_PORT, FIRST_PORT + TRIED) if number is None else [number]:
+        try:
+            return socket.create_server((HOST, each))
+        except OSError as error:
+            taken = error
+    raise OSError(f"cannot open port {number or FIRST_PORT}: give another one by --port") from taken

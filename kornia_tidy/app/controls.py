@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from decimal import Decimal, InvalidOperation
 from typing import Any, Literal, NamedTuple
 
 from kornia_tidy.app.settings import AS_SYSTEM, CHART, FILES, FLAT, MOST_MASKS, OWN, SCENES, SEEDS, SIDES, Settings
@@ -51,21 +53,40 @@ class Control(NamedTuple):
     def value(self) -> Any:
         """Default, in the unit of the label."""
         default = getattr(Settings(), self.name)
-        return default if self.per_unit == 0 else float(f"{default * 10.0**-self.per_unit:.12g}")
+        return default if self.per_unit == 0 else _scaled(Decimal(repr(default)), -self.per_unit)
 
     def setting(self, value: Any) -> Any:
         """Return a value of the control as the value of the setting.
 
         Raises:
-            ValueError: if a number is missing.
+            ValueError: if a number is missing, or is none, or not whole where it must be.
+
+        Example:
+            >>> by_name("noise").setting(0.00001), by_name("pixel_pitch").setting("3,45")
+            (1e-07, 3.45e-06)
         """
         if self.kind in {"choice", "check", "file"}:
             return value
         if value is None:
             raise ValueError(f"{self.label}: give a number")
-        if self.kind == "whole" or self.name in {"masks", "side"}:
-            return int(value)
-        return float(f"{float(value):.12g}e{self.per_unit}") if self.per_unit else float(value)
+        try:
+            number = Decimal(str(value).strip().replace(",", "."))
+        except InvalidOperation:
+            number = Decimal("nan")
+        if not (number.is_finite() and math.isfinite(float(number))):
+            raise ValueError(f"{self.label}: give a number, got {value!s:.40}")
+        if self.kind != "whole" and self.name not in {"masks", "side"}:
+            return _scaled(number, self.per_unit)
+        if number != number.to_integral_value():
+            raise ValueError(f"{self.label}: give a whole number, got {value!s:.40}")
+        return int(number)
+
+
+def _scaled(number: Decimal, power: int) -> float:
+    """Return a number times a power of ten, rounded once."""
+    sign, digits, exponent = number.as_tuple()
+    assert isinstance(exponent, int)  # of finite numbers
+    return float(Decimal((sign, digits, exponent + power)))
 
 
 def camera_name(name: str) -> str:
@@ -171,8 +192,12 @@ def settings_of(values: Mapping[str, Any]) -> Settings:
         >>> settings_of({"focal_length": 35, "noise": 1.0}).focal_length
         0.035
     """
-    by_name = {control.name: control for control in CONTROLS}
-    return Settings(**{name: by_name[name].setting(value) for name, value in values.items()})
+    return Settings(**{name: by_name(name).setting(value) for name, value in values.items()})
+
+
+def by_name(name: str) -> Control:
+    """Return the control of a setting."""
+    return next(control for control in CONTROLS if control.name == name)
 
 
 def shown(group: Group, scene: str, camera: str, stretch: bool) -> bool:

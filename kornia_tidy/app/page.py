@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from kornia_tidy.app.answers import PICTURES, Answer, answer
 from kornia_tidy.app.capture import Tell
 from kornia_tidy.app.controls import CONTROLS, Control, Group, shown
+from kornia_tidy.app.guard import LARGEST_UPLOAD, Guard
 from kornia_tidy.app.settings import SIDES, Settings
 from kornia_tidy.files import write_bytes
 
 try:
+    import fastapi  # ty: ignore[import-not-found]
     import gradio as gr  # ty: ignore[import-not-found]
+    import uvicorn  # ty: ignore[import-not-found]
 except ImportError as error:
     raise ImportError(f"the app needs Gradio: pip install 'kornia-tidy[app]' ({error})") from error
 
@@ -85,6 +89,30 @@ def make_page(tell: Tell, folder: Path) -> Any:
             api_visibility="private",
         )
     return page
+
+
+def make_server(page: Any, folder: Path, hosts: Sequence[str] = ()) -> uvicorn.Server:
+    """Return the server of a page.
+
+    Args:
+        page: from :func:`make_page`.
+        folder: with all files of the page.
+        hosts: see :class:`~kornia_tidy.app.guard.Guard`.
+    """
+    application = gr.mount_gradio_app(
+        fastapi.FastAPI(openapi_url=None),
+        page,
+        path="/",
+        footer_links=[],
+        theme=THEME,
+        css=STYLE,
+        max_file_size=LARGEST_UPLOAD,
+        ssr_mode=False,
+        run_history=False,  # which the browser could store with Hugging Face
+    )
+    # Open pages wait for messages, and would keep the server from ending.
+    guard = Guard(application, folder, hosts)
+    return uvicorn.Server(uvicorn.Config(guard, log_level="warning", timeout_graceful_shutdown=1))
 
 
 def updates(found: Answer, folder: Path) -> list[Any]:

@@ -260,8 +260,8 @@ class RandomDepthBlur(DepthAugmentation):
         check_choice("compositing", compositing, ("gather", "scatter", "occlusion"))
         check_positive("max_radius", max_radius, "pixels")
         check_positive("pixel_pitch", pixel_pitch)
-        ends = torch.tensor(checked_range("f_number", f_number))
-        focus = torch.tensor([nearest, farthest])
+        ends = torch.tensor(checked_range("f_number", f_number), device="cpu")
+        focus = torch.tensor([nearest, farthest], device="cpu")
         self._param_generator = PlainUniformGenerator(
             (focus, "focus_distance", None, None), (ends, "f_number", None, None)
         )

@@ -100,7 +100,7 @@ class RandomTiDyOptics(DepthAugmentation):
         }
         ranges = {name: checked_range(name, *given) for name, given in units.items() if given[0] is not None}
         self._check_ends(ranges)
-        samplers = [(torch.tensor(ends), name, None, None) for name, ends in ranges.items()]
+        samplers = [(torch.tensor(ends, device="cpu"), name, None, None) for name, ends in ranges.items()]
         self._param_generator = PlainUniformGenerator(*samplers)
 
     def _check_ends(self, ranges: Mapping[str, tuple[float, float]]) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, DepthTap, container_leaves, moves_pixels
 from kornia_tidy.augmentation.holes import fill_holes
-from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.checks import check_float_tensor, check_values
 
 KNOWN = (
     "IMAGE",
@@ -113,6 +113,7 @@ class SceneGeometry(nn.Module):
         """
         check_float_tensor("image", image, 3 if image.ndim == 3 else 4, "(B, C, H, W) or (C, H, W)")
         check_float_tensor("depth", depth, image.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
+        check_values("a new tensor", torch.empty(0))  # kornia makes some
         size = (1, *image.shape[-2:])
         if tuple(depth.shape[-3:]) != size or (image.ndim == 4 and len(depth) not in (1, len(image))):
             raise ValueError(

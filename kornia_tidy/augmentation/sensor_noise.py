@@ -155,7 +155,7 @@ class RandomSensorNoise(K.IntensityAugmentationBase2D):
         SensorNoise(bits=bits)  # checks the bits
         reads = checked_range("read_noise", read_noise, "electrons", zero=True)
         given = {"full_well": wells, "read_noise": reads, "dark": darks}
-        samplers = [(torch.tensor(ends), name, None, None) for name, ends in given.items()]
+        samplers = [(torch.tensor(ends, device="cpu"), name, None, None) for name, ends in given.items()]
         self._param_generator = PlainUniformGenerator(*samplers)
         self.flags = {"bits": bits, "color_space": color_space}
 

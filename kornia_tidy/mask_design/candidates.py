@@ -176,13 +176,13 @@ def initial_phase(task: DesignTask, start: str, f_number: float, focus: float, s
     shape = task.masks, task.mask_size, task.mask_size
     generator = torch.Generator().manual_seed(keyed_seed(seed, start))
     to_radians = metres_to_radians(constant_index(1.5))
-    noise = SMALL_NOISE * to_radians * torch.randn(shape, generator=generator)
+    noise = SMALL_NOISE * to_radians * torch.randn(shape, generator=generator, dtype=torch.float32)
     if start == "Fisher":
         return noise + (fisher_mask(task.mask_size) * to_radians).float()
     if start == "random":
-        waves = 2 * math.pi * torch.rand(shape, generator=generator)
+        waves = 2 * math.pi * torch.rand(shape, generator=generator, dtype=torch.float32)
         return torch.nn.functional.avg_pool2d(waves[:, None], 3, 1, 1, count_include_pad=False)[:, 0] * 2
     lo, hi = task.camera(f_number, focus).defocus_range
-    fractions = (torch.arange(task.masks) + 0.5) / task.masks
+    fractions = (torch.arange(task.masks, dtype=torch.float32) + 0.5) / task.masks
     y, x = mask_axes(task.mask_size)
     return noise - ((lo + fractions * (hi - lo))[:, None, None] * (x.square() + y.square())).float()

@@ -223,7 +223,8 @@ def design_fisher_mask(
         (torch.Size([1, 23, 23]), True)
     """
     check_positive("limit", limit, "radians")
-    start = 0.5 / math.sqrt(num_modes) * torch.randn(num_modes, generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    start = 0.5 / math.sqrt(num_modes) * torch.randn(num_modes, generator=generator, dtype=torch.float32)
     mask = ZernikeMask(1, size, num_modes, initial=start).double()
     aperture = circular_aperture(size, 2.3 / size)
     nodes = torch.linspace(-limit, limit, 21, dtype=torch.float64).tolist()

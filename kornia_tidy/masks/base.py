@@ -119,7 +119,10 @@ class PhaseMasks(nn.Module):
 
     def extra_repr(self) -> str:
         """Return a one-line description of the masks."""
-        masks, rows, columns = self.phase.shape
+        try:
+            masks, rows, columns = self.phase.shape
+        except AttributeError:  # of the base class, or before a family has registered its parameters
+            return "no masks yet"
         learnable = "learnable" if any(p.requires_grad for p in self.parameters()) else "fixed"
         limit = ""
         if self.constraint != "none":
@@ -267,7 +270,8 @@ def initial_values(
     check_choice("initial", initial, ("noise", "flat"))
     if initial == "flat":
         return torch.zeros(num_masks, *shape)
-    return rms * torch.randn(num_masks, *shape, generator=generator)
+    noise = rms * torch.randn(num_masks, *shape, generator=generator, dtype=torch.float32)
+    return noise.to(torch.get_default_dtype())  # another type draws other numbers
 
 
 def adam_groups(masks: nn.Module, lr_metres: float, **options: float) -> dict[str, object]:

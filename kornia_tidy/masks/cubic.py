@@ -49,7 +49,7 @@ class CubicMask(PhaseMasks):
     ) -> None:
         super().__init__(material, constraint, max_height)
         values = torch.as_tensor(strength, dtype=torch.get_default_dtype()).detach().clone().reshape(-1)
-        if not (len(values) and bool(torch.isfinite(values).all())):
+        if not (len(values) and (values.is_meta or bool(torch.isfinite(values).all()))):
             raise ValueError(f"strength must be one finite number of radians for each mask, got {strength}")
         y, x = mask_axes(size)
         self.register_buffer("shape", (x**3 + y**3).to(values), persistent=False)

@@ -10,7 +10,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_generator
 from kornia_tidy.masks.base import mask_axes
 from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.masks.zernike import ZernikeMask
+from kornia_tidy.masks.zernike import ZernikeMask, quarter_polynomials
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 CLEAN = {"noisy fishers": 0, "fisher, noisy fishers": 1, "3 fishers, 2 noisy": 3}  # Fisher masks without noise
@@ -56,6 +56,7 @@ def fisher_mask(size: int = 23) -> Tensor:
     """
     coefficients = torch.tensor(FISHER_COEFFICIENTS, dtype=torch.float64)
     mask = ZernikeMask(1, size, len(coefficients), initial=torch.zeros(len(coefficients))).double()
+    mask.polynomials = quarter_polynomials(len(coefficients), size).float().double()  # under any default data type
     with torch.no_grad():
         mask.coefficients.copy_(coefficients)
         heights = mask.heights()[0]

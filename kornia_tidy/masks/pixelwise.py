@@ -78,6 +78,7 @@ class PixelwiseMask(PhaseMasks):
             y, x = mask_axes(size)
             check_number_of_masks(num_masks, len(y) * len(x))
             phase = torch.zeros(num_masks, len(y), len(x))
-            if initial == "noise":
-                phase = torch.rand(phase.shape, generator=generator) * (self.NOISE_HEIGHT * to_radians)
+            if initial == "noise":  # another type would draw other numbers
+                noise = torch.rand(phase.shape, generator=generator, dtype=torch.float32)
+                phase = (noise * (self.NOISE_HEIGHT * to_radians)).to(phase)
         self.register_parameter("phase", nn.Parameter(unlimited_phase(phase, constraint, self.max_phase)))

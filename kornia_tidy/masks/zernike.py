@@ -63,18 +63,13 @@ class ZernikeMask(PhaseMasks):
         max_height: float | None = None,
     ) -> None:
         super().__init__(material, constraint, max_height)
-        y, x = mask_axes(size)
+        (y, x), polynomials = mask_axes(size), quarter_polynomials(num_modes, size)
         self.odd_sides = len(y) % 2 == 1  # of both sides or neither; then a middle row and column lie on the axes
-        # Every polynomial is even or odd along each axis, so a quarter of the mask determines the rest.
-        y, x = y[len(y) // 2 :], x[len(x) // 2 :]
-        inward = torch.hypot(y, x).clamp(min=1)
-        polynomials = zernike_polynomials(num_modes, y / inward, x / inward).to(torch.get_default_dtype())
         parities = [_parity(index) for index in range(num_modes)]
-        order = sorted(range(num_modes), key=parities.__getitem__)
         self.group_sizes = [parities.count(kind) for kind in ((0, 0), (0, 1), (1, 0), (1, 1))]
-        self.register_buffer("polynomials", polynomials[order].flatten(1), persistent=False)
-        self.register_buffer("order", torch.tensor(order), persistent=False)
-        self.quarter = (len(y), len(x))
+        self.register_buffer("polynomials", polynomials.to(torch.get_default_dtype()), persistent=False)
+        self.register_buffer("order", torch.tensor(_order(num_modes)), persistent=False)
+        self.quarter = (len(y) - len(y) // 2, len(x) - len(x) // 2)
         rms = NOISE_RMS / math.sqrt(num_modes)
         self.coefficients = nn.Parameter(initial_values(initial, num_masks, (num_modes,), rms, generator))
 
@@ -94,6 +89,25 @@ class ZernikeMask(PhaseMasks):
         middle = int(self.odd_sides)
         negative = (even - odd).narrow(axis, middle, even.shape[axis] - middle).flip(axis)
         return torch.cat([negative, even + odd], axis)
+
+
+def quarter_polynomials(num_modes: int, size: Size) -> Tensor:
+    """Return the polynomials on the lower right quarter of a mask, those of one parity together, (M, pixels) float64.
+
+    Every polynomial is even or odd along each axis, so a quarter of the mask determines the rest.
+
+    Example:
+        >>> quarter_polynomials(55, 23).shape
+        torch.Size([55, 144])
+    """
+    y, x = mask_axes(size)
+    y, x = y[len(y) // 2 :], x[len(x) // 2 :]
+    inward = torch.hypot(y, x).clamp(min=1)
+    return zernike_polynomials(num_modes, y / inward, x / inward)[_order(num_modes)].flatten(1)
+
+
+def _order(num_modes: int) -> list[int]:
+    return sorted(range(num_modes), key=_parity)
 
 
 def _parity(index: int) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self, cast
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_part, described
+from kornia_tidy.checks import check_part, described, printed
 
 READS = 100  # attempts to read masks while another thread changes them; then the last reading is taken
 
@@ -235,7 +235,7 @@ class LearnableDwellTimes(Modulator):
 
     def extra_repr(self) -> str:
         """Return a one-line description of the dwell times."""
-        return f"learnable dwell shares {tuple(round(s, 4) for s in self.logits.detach().softmax(0).tolist())}"
+        return f"learnable dwell shares {printed(self.logits.softmax(0), 4)}"
 
 
 class DiffractionEfficiency(Modulator):

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_positive, unmasked
+from kornia_tidy.checks import check_choice, check_positive, check_values, unmasked
 
 Edges = Literal["binary", "area"]
 
@@ -175,6 +175,7 @@ def _check_grid(size: int, pitch: float, edges: str) -> None:
 
 def _require_light(amplitude: Tensor) -> Tensor:
     """Return the amplitude, or raise if every cell is closed: such a pupil has no point spread function."""
+    check_values("aperture", amplitude)
     if not bool((amplitude > 0).any()):
         raise ValueError("aperture must let some light through, got 0 open cells")
     return amplitude

@@ -8,7 +8,7 @@ from typing import overload
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_depth, check_metres, check_number, check_part, check_positive
+from kornia_tidy.checks import check_depth, check_metres, check_number, check_part, check_positive, check_values
 from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
@@ -210,7 +210,7 @@ class ThinLensCamera(nn.Module):
         Raises:
             ValueError: if a depth is NaN or not positive.
         """
-        if check_inputs and depth.numel() and not bool(depth.detach().amin() > 0):  # NaN too
+        if check_inputs and depth.numel() and (depth.is_meta or not bool(depth.detach().amin() > 0)):  # NaN too
             check_depth(depth)
         return thin_lens_defocus(depth, self.aperture_diameter / 2, self.focus_distance)
 
@@ -380,6 +380,7 @@ class DefocusRange(nn.Module):
             ValueError: if a value is NaN or outside [0, 1].
         """
         if check_inputs and depth.numel():
+            check_values("depth", depth)
             lowest, highest = torch.aminmax(depth.detach())
             if not bool((lowest >= 0) & (highest <= 1)):  # False for NaN too
                 bad = depth[~((depth >= 0) & (depth <= 1))][0].item()

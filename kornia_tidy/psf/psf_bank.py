@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.checks import check_choice, check_finite, check_values
 from kornia_tidy.files import write_bytes
 from kornia_tidy.tensor_files import read_tensors
 
@@ -142,6 +142,7 @@ class PSFBank:
             ValueError: if a value is negative or not finite, a PSF holds no light, or the nodes do not ascend.
         """
         check_finite("defocus of measured psfs", defocus)
+        check_values("measured psfs", psfs)
         if not bool((torch.isfinite(psfs) & (psfs >= 0)).all()):
             raise ValueError(f"measured psfs must be finite and not negative, got a minimum of {float(psfs.min())}")
         if not bool((defocus.diff() > 0).all()):

@@ -8,7 +8,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.checks import check_positive, check_values
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
@@ -87,6 +87,7 @@ def depth_likelihood(light: Tensor, filters: Tensor, log_determinants: Tensor) -
         >>> depth_likelihood(torch.rand(1, 1, 20, 30), *likelihood_filters(psfs)).shape
         torch.Size([1, 4, 20, 30])
     """
+    check_values("a new tensor", torch.empty(0))  # kornia makes some
     energy = convolve_kernels(light - MEAN, filters.unsqueeze(1)).squeeze(2).square().clamp(max=LARGEST)
     samples = _SPARE * 2 * math.pi * PATCH**2
     fit = -0.5 * samples * (_patch_mean(energy) + log_determinants.view(-1, 1, 1))

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.checks import printed
 from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels, with_image
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes, layer_weights
@@ -121,8 +122,8 @@ class JointClosedFormHead(ClosedFormHead):
 
     def extra_repr(self) -> str:
         """Return layers, classes and temperature."""
-        classes, temperature = self.out_channels - 3, self.temperature.item()
-        return f"layers={self.closed_form.layers}, classes={classes}, temperature={temperature:.3g}"
+        classes, temperature = self.out_channels - 3, printed(self.temperature)
+        return f"layers={self.closed_form.layers}, classes={classes}, temperature={temperature}"
 
 
 def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) -> dict[str, Tensor]:

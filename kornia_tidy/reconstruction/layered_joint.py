@@ -8,7 +8,7 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.checks import check_positive, printed
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form import LEAST, SHARPNESS
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, interpolated_classes, layer_weights
@@ -184,7 +184,7 @@ class LayeredJointHead(ReconstructionHead):
 
     def extra_repr(self) -> str:
         """Return layers, classes and temperature."""
-        return f"layers={self.layers}, classes={self.out_channels - 3}, temperature={self.temperature.item():.3g}"
+        return f"layers={self.layers}, classes={self.out_channels - 3}, temperature={printed(self.temperature)}"
 
     def _to_light(self, image: Tensor) -> Tensor:
         return rgb_to_linear_rgb(image) if self.encoded else image

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_float_tensor, check_positive
+from kornia_tidy.checks import check_choice, check_float_tensor, check_positive, printed
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.render.borders import next_fast_size
@@ -147,7 +147,7 @@ class Inversion(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the weight and the options."""
-        return f"weight={self.weight.item():.3g}, border={self.border!r}, correlate={self.correlate}"
+        return f"weight={printed(self.weight)}, border={self.border!r}, correlate={self.correlate}"
 
 
 class Tikhonov(Inversion):

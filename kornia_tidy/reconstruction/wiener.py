@@ -158,7 +158,8 @@ def inverse_spectrum(statistics: SceneStatistics, size: tuple[int, int]) -> Tens
         True
     """
     rows, columns = size
-    down, across = torch.fft.fftfreq(rows, dtype=torch.float64), torch.fft.rfftfreq(columns, dtype=torch.float64)
+    down = torch.fft.fftfreq(rows, dtype=torch.float64, device="cpu")  # not every default device has float64
+    across = torch.fft.rfftfreq(columns, dtype=torch.float64, device="cpu")
     return statistics.spectrum(torch.hypot(down[:, None], across)).reciprocal()
 
 

@@ -56,7 +56,7 @@ def disc_defocus(height: int, width: int, discs: int, generator: torch.Generator
     y, x = (torch.linspace(0, 1, n, dtype=torch.float32, device="cpu") for n in (height, width))
     defocus = (0.5 * y[:, None] + 0.2 * x - 1) * DEFOCUS
     for number in range(discs):
-        row, column, size, depth, slant = torch.rand(5, generator=generator, device="cpu").tolist()
+        row, column, size, depth, slant = torch.rand(5, generator=generator, dtype=torch.float32, device="cpu").tolist()
         inside = (y[:, None] - row) ** 2 + (x - column) ** 2 < (0.02 + 0.15 * size**2) ** 2
         level = -0.9 + 1.8 * depth * ((number + 1) / discs) ** 0.3
         defocus = torch.where(inside, (level + 0.2 * slant * (x - column)) * DEFOCUS, defocus)

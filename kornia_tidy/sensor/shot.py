@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from kornia_tidy.checks import check_values
 from kornia_tidy.runtime.precision import widest
 
 # Expected electrons from which a Gaussian replaces the Poisson distribution. Its mean and variance are exact; its skew
@@ -50,6 +51,7 @@ def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
         >>> shot_noise(torch.tensor([0.0, 2.0, 2.0, 900.0]), torch.tensor([0.9, 0.1, 0.9, 0.5]))
         tensor([  0.,   0.,   4., 900.])
     """
+    check_values("electrons", electrons)
     if uniform.shape != electrons.shape:
         raise ValueError(
             f"uniform must have the shape of electrons, {tuple(electrons.shape)}, got {tuple(uniform.shape)}"

@@ -76,7 +76,7 @@ def _ikoma_camera() -> ThinLensCamera:
 
 def _ikoma_masks(generator: torch.Generator | None) -> PhaseMasks:
     """Return a radial mask with a smooth random profile: noise at 13 radii, linear between them."""
-    knots = 2.05 * torch.randn(1, 1, 13, generator=generator)
+    knots = 2.05 * torch.randn(1, 1, 13, generator=generator, dtype=torch.float32)
     profile = nn.functional.interpolate(knots, size=61, mode="linear", align_corners=True)[0]
     return RadialMask(1, 138, 61, initial=profile, material=NOA61)
 

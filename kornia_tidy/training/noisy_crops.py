@@ -175,8 +175,8 @@ def random_gain(peak: Tensor) -> Tensor:
         (torch.Size([3, 1, 1]), True)
     """
     least, largest = (math.log(end) for end in GAIN)
-    exposure = least + (largest - least) * torch.rand(1)
-    gain = (exposure + TINT * torch.randn(len(peak))).exp()
+    exposure = least + (largest - least) * torch.rand(1, dtype=torch.float32)
+    gain = (exposure + TINT * torch.randn(len(peak), dtype=torch.float32)).exp()
     return torch.minimum(gain, 1 / peak.clamp(min=1e-6))[:, None, None]
 
 
@@ -191,7 +191,7 @@ def random_error(largest: float = TOLD_ERROR) -> float:
         >>> 0.4 <= min(factors) < 0.7 and 1.4 < max(factors) <= 2.5
         True
     """
-    return largest ** (2 * float(torch.rand(())) - 1)
+    return largest ** (2 * float(torch.rand((), dtype=torch.float32)) - 1)
 
 
 def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, float] = FULL_WELL) -> SensorNoise:
@@ -208,7 +208,7 @@ def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, floa
         >>> all(0.001 <= sensor.sigma <= 0.03 for sensor in sensors if sensor.full_well is None)
         True
     """
-    with_shot, place = torch.rand(2).tolist()
+    with_shot, place = torch.rand(2, dtype=torch.float32).tolist()
     least, largest = electrons if with_shot < SHOT_SHARE else noise_range
     level = least * (largest / least) ** place
     if with_shot < SHOT_SHARE:

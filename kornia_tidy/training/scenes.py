@@ -141,7 +141,7 @@ def augmented(image: Tensor, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tenso
         >>> 0.8 <= float(bright.max()) <= 1.0
         True
     """
-    across, down, gain = torch.rand(3).tolist()
+    across, down, gain = torch.rand(3, dtype=torch.float32).tolist()
     axes = [axis for axis, toss in ((-1, across), (-2, down)) if toss < 0.5]
     image = (image * (GAIN[0] + (GAIN[1] - GAIN[0]) * gain)).clamp(max=1)
     return image.flip(axes), depth.flip(axes), mask.flip(axes)

@@ -2,14 +2,18 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from fractions import Fraction
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
-from kornia_tidy.app.controls import CONTROLS, settings_of, shown
+from kornia_tidy.app.controls import CONTROLS, by_name, settings_of, shown
 from kornia_tidy.app.settings import Settings
 from tests.base import BaseTester
 
 UNITS = ("(m)", "(mm)", "(µm)", "(% of full scale)", "(pixels)")
+UNITED = [control for control in CONTROLS if control.per_unit]
 WITHOUT_UNIT = {"f_number", "masks", "seed", "mask_seed", "noise_seed"}
 
 
@@ -56,9 +60,37 @@ class TestControls(BaseTester):
         assert len(numbers) == 7
         assert [c.label for c in numbers if not c.label.endswith(UNITS)] == []
 
+    @pytest.mark.parametrize("text", ["1e-5", "1E-5", ".00001", "0.00001", "0,00001", " 1e-05 ", "10e-6", 1e-5])
+    def test_feature_a_number_is_read_however_it_is_written(self, text):
+        assert settings_of({"noise": text}).noise == 1e-7
+
+    @settings(max_examples=300, deadline=None)
+    @given(number=st.floats(allow_nan=False, allow_infinity=False), name=st.sampled_from([c.name for c in UNITED]))
+    @example(number=-0.0, name="noise")
+    @example(number=5e-324, name="focal_length")
+    @example(number=1.7976931348623157e308, name="pixel_pitch")
+    def test_property_any_number_is_scaled_exactly_and_rounded_once(self, number, name):
+        """Against fractions, which are exact: the float nearest to the decimal that Python writes."""
+        control = by_name(name)
+        exact = Fraction(repr(number)) * Fraction(10) ** control.per_unit
+        for typed in (number, repr(number)):
+            assert control.setting(typed) == float(exact)
+
+    @pytest.mark.parametrize(
+        "typed", ["", "x", "1e", "1,000.5", "nan", "inf", float("nan"), float("inf"), "1e400", True]
+    )
+    @pytest.mark.parametrize("name", ["noise", "seed"])
+    def test_exception_no_number(self, typed, name):
+        with pytest.raises(ValueError, match=rf"^{re.escape(by_name(name).label)}: give a number, got "):
+            by_name(name).setting(typed)
+
+    def test_exception_a_part_of_a_whole_number(self):
+        with pytest.raises(ValueError, match=r"Number of the painted scene: give a whole number, got 2\.5"):
+            settings_of({"seed": 2.5})
+
     def test_feature_millimetres_micrometres_and_percent_become_si_units_exactly(self):
-        settings = settings_of({"focal_length": 35, "pixel_pitch": 3.45, "noise": 1.1, "masks": 3.0})
-        assert (settings.focal_length, settings.pixel_pitch, settings.noise, settings.masks) == (
+        found = settings_of({"focal_length": 35, "pixel_pitch": 3.45, "noise": 1.1, "masks": 3.0})
+        assert (found.focal_length, found.pixel_pitch, found.noise, found.masks) == (
             0.035,
             3.45e-6,
             0.011,

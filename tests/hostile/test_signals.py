@@ -12,6 +12,9 @@ import os
 import random
 import shutil
 import signal
+import subprocess
+import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -128,16 +131,20 @@ class TestSignals(BaseTester):
         assert os.listdir(tmp_path) == []
 
     @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-    @pytest.mark.parametrize("hidden", [False, True])
-    def test_feature_a_signal_that_an_import_took_for_its_failure_is_told(self, hidden, number, monkeypatch, capsys):
-        """As modules of C++ do, and our own sentence of a package that is missing."""
+    @pytest.mark.parametrize("taken", ["pass", "raise ImportError('initialization failed') from None"])
+    def test_feature_a_signal_in_an_import_that_would_take_it_waits_for_its_end(
+        self, taken, number, monkeypatch, capsys, tmp_path
+    ):
+        """Some modules go on after any exception, others tell it as their own failure, as those of C++ do."""
+        told = (
+            f"import os, time\ntry:\n os.kill(os.getpid(), {number:d})\n time.sleep(0.1)\nexcept BaseException: {taken}"
+        )
+        (tmp_path / "takes_all.py").write_text(told)
+        monkeypatch.syspath_prepend(tmp_path)
 
         def load(_):
-            try:
-                os.kill(os.getpid(), number)
-                time.sleep(60)
-            except KeyboardInterrupt as stop:
-                raise ImportError("initialization failed") from (None if hidden else stop)
+            importlib.import_module("takes_all")
+            time.sleep(10)
 
         run_instead(monkeypatch, load)
         before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
@@ -145,6 +152,7 @@ class TestSignals(BaseTester):
             assert cli.main([]) == STATUS[number]
         finally:
             signal.signal(signal.SIGINT, before)
+            sys.modules.pop("takes_all", None)
         assert capsys.readouterr().err == f"kornia-tidy: {WORD[number]}\n"
 
     def test_convention_a_handler_of_the_caller_stays(self, monkeypatch):
@@ -161,3 +169,62 @@ class TestSignals(BaseTester):
             signal.signal(signal.SIGTERM, before)
         assert cli.main([]) == 0
         assert signal.getsignal(signal.SIGTERM) is before
+
+
+class TestStart(BaseTester):
+    """Signals while the command imports what it needs, in a process of its own with a torch that sends them."""
+
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+    @pytest.mark.parametrize("started", ["script", "module"])
+    def test_feature_a_signal_during_the_imports_ends_the_command_with_a_word(self, started, number, tmp_path):
+        """Even where the import would take any exception for its own failure."""
+        assert self.started(started, tmp_path, number, ignored=False) == (
+            STATUS[number],
+            f"kornia-tidy: {WORD[number]}\n",
+        )
+
+    def test_convention_an_interruption_that_is_ignored_stays_so(self, tmp_path):
+        """As of jobs in the background of a shell."""
+        assert self.started("module", tmp_path, signal.SIGINT, ignored=True) == (7, "")
+
+    def test_convention_a_program_that_imports_us_handles_its_own_signals(self, tmp_path):
+        (tmp_path / "mine.py").write_text("import kornia_tidy")
+        self.write_torch(tmp_path, signal.SIGINT)
+        assert self.run(["mine.py"], tmp_path)[0] == 8
+
+    def started(self, how, folder, number, *, ignored):
+        """Return exit status and standard error of the command, whose import of torch sends a signal."""
+        self.write_torch(folder, number)
+        (folder / "kornia-tidy").write_text("import sys\nfrom kornia_tidy.cli import main\nsys.exit(main())\n")
+        arguments = ["kornia-tidy"] if how == "script" else ["-m", "kornia_tidy"]
+        return self.run([*arguments, "info"], folder, ignored=ignored)
+
+    @staticmethod
+    def write_torch(folder, number):
+        text = f"""
+            import os, time
+            try:
+                os.kill(os.getpid(), {number:d})
+                time.sleep(0.1)
+            except BaseException:
+                os._exit(8)
+            os._exit(7)
+        """
+        (folder / "torch.py").write_text(textwrap.dedent(text))
+
+    @staticmethod
+    def run(arguments, folder, *, ignored=False):
+        def handle():
+            signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.SIG_DFL)
+
+        root = Path(__file__).resolve().parents[2]
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{root}"},
+            preexec_fn=handle,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.returncode, done.stderr

@@ -14,7 +14,7 @@ TWO_MASKS = {"pixelwise": lambda **o: PixelwiseMask(2, **o)}
 ONE_MASK = {
     "flat": lambda g: PixelwiseMask(1, initial="flat"),
     "random": lambda g: PixelwiseMask(1, generator=g),
-    "random, 3 um": lambda g: PixelwiseMask(initial=3e-6 * torch.rand(1, 23, 23, generator=g)),
+    "random, 3 um": lambda g: PixelwiseMask(initial=3e-6 * torch.rand(1, 23, 23, generator=g, dtype=torch.float32)),
 }
 
 
