@@ -66,7 +66,9 @@ class Fidelity:
             700 nm (``tests/psf/test_exact.py``). Only for exact propagation.
         layers: interpolation of PSFs over defocus: ``"nearest"``, ``"linear"``, ``"cubic"``, or ``"bandlimited"``,
             which is nearly exact and takes more layers where the aperture and the wavelengths ask for it: see
-            :func:`kornia_tidy.psf.defocus_interpolation.interpolable_spacing`.
+            :func:`kornia_tidy.psf.defocus_interpolation.interpolable_spacing`. Gradients to depth converge more
+            slowly than images: with layers 2 rad apart they are off by 24 to 37 % (linear), 9 to 18 % (cubic) and 4 to
+            7 % (band-limited), relative L2 on textured ramps of depth behind random masks.
         layer_spacing: distance between the computed PSFs in radians of defocus.
         wavelengths: at most so many, where the camera's spectrum has more: neighbours then stand together for one, see
             :func:`kornia_tidy.psf.spectral_binning.bin_spectrum`. Default: all that the spectrum has.

@@ -23,7 +23,15 @@ from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.files import only_here, write_bytes
 from kornia_tidy.mask_design.candidates import coded_candidate, flat_candidate
 from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design, planned_work
-from kornia_tidy.mask_design.design_report import CAMERA, DATA, PICTURE, REPORT, design_files, focus_distance
+from kornia_tidy.mask_design.design_report import (
+    CAMERA,
+    DATA,
+    PICTURE,
+    REPORT,
+    design_files,
+    exposure_in_words,
+    focus_distance,
+)
 from kornia_tidy.mask_design.design_task import DesignTask
 from kornia_tidy.mask_design.simulated_captures import leaf_scenes, score_candidate
 from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
@@ -37,7 +45,8 @@ more light, a lens that is stopped down is sharper over a larger range of depths
 the two is ahead depends on the light and on the range of depths.
 
 Everything is compared at the same exposure time: light is given as the electrons of a
-white pixel at one f-number, and falls with the square of the f-number.
+white pixel at one f-number, and falls with the square of the f-number. Where white would
+exceed the full well of a pixel the exposure is shorter.
 
   search    flat lenses and masks at f-numbers one stop apart, by the error of the best linear
             restoration (and of depth by texture); masks start from a
@@ -140,6 +149,13 @@ def add_parser(subparsers: Any) -> None:
         help="f-number at which they are counted (default: 17.6)",
     )
     camera.add_argument(
+        "--full-well",
+        type=float,
+        default=default.full_well_electrons,
+        metavar="N",
+        help="capacity of a pixel in electrons, which limits the exposure (default: by its area, 57000 at 8 um)",
+    )
+    camera.add_argument(
         "--read-noise",
         type=float,
         default=default.read_noise_electrons,
@@ -189,6 +205,7 @@ def run(args: argparse.Namespace) -> None:
         _write(folder, design)
     tell("verdict", design.words)
     focus, f_number = focus_distance(task, design.recommended), design.recommended.f_number
+    tell("exposure", exposure_in_words(design))
     tell("camera", f"f/{f_number:.3g}, aperture {task.focal_length / f_number:.3g} m, focus at {focus:.3g} m")
     tell("wrote", f"{folder / REPORT}: read this one")
     for name in (PICTURE, DATA, "masks.npy", CAMERA):
@@ -213,6 +230,7 @@ def make_task(args: argparse.Namespace) -> DesignTask:
         modulator=_modulator(args),
         depth_weight=args.depth_weight,
         mask_size=args.mask_size,
+        full_well_electrons=args.full_well,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_metres, check_part
+from kornia_tidy.checks import check_metres, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
@@ -16,7 +16,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLensCamera
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS, SceneStatistics
-from kornia_tidy.sensor.exposure import exposed_sensor
+from kornia_tidy.sensor.exposure import exposed_sensor, full_well_of
 from kornia_tidy.sensor.noise import SensorNoise
 
 MOST_MASKS = 64
@@ -33,7 +33,8 @@ class DesignTask:
         depth_range: nearest and farthest depth. The farthest may be ``inf``.
         focal_length: of the lens.
         pixel_pitch: of the sensor.
-        electrons: of a white pixel at the reference f-number. The exposure time is the same at every f-number.
+        electrons: of a white pixel at the reference f-number. The exposure time is the same at every f-number, but
+            for those at which white would exceed the full well: there it is shorter.
         reference_f_number: f-number at which the electrons were counted.
         read_noise_electrons: standard deviation.
         masks: number K of masks in one exposure.
@@ -42,6 +43,8 @@ class DesignTask:
         statistics: of the scenes: power spectrum, light, and the distribution of inverse depth over the range.
         depth_weight: share of depth in what matters: 0 is the image alone, 1 depth alone.
         mask_size: pixels along a side of a mask.
+        full_well_electrons: capacity of a pixel. Default: that of a common pixel of this pitch, see
+            :func:`kornia_tidy.sensor.full_well_of`.
 
     Raises:
         ValueError: if a value is out of its range, a length is not in metres, or nothing is out of focus.
@@ -67,6 +70,7 @@ class DesignTask:
     statistics: SceneStatistics = PHOTOGRAPHS
     depth_weight: float = 0.0
     mask_size: int = 23
+    full_well_electrons: float | None = None
 
     def __post_init__(self) -> None:
         check_metres("focal_length", self.focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
@@ -80,6 +84,8 @@ class DesignTask:
         timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
         if not 0 <= self.depth_weight <= 1:
             raise ValueError(f"depth_weight must be from 0 (image alone) to 1 (depth alone), got {self.depth_weight}")
+        if self.full_well_electrons is not None:
+            check_positive("full_well_electrons", self.full_well_electrons)
         self.sensor(self.reference_f_number)  # refuses light and noise out of range
         self.camera(max(self.reference_f_number, FASTEST), 0.5)  # and depths out of order
         near, far = self.depth_range
@@ -131,7 +137,18 @@ class DesignTask:
 
     def sensor(self, f_number: float) -> SensorNoise:
         """Return the sensor, with the light that the f-number admits. See :func:`exposed_sensor`."""
-        return exposed_sensor(f_number, self.electrons, self.reference_f_number, self.read_noise_electrons)
+        light = self.electrons, self.reference_f_number, self.read_noise_electrons
+        return exposed_sensor(f_number, *light, self.full_well)
+
+    @property
+    def full_well(self) -> float:
+        """Capacity of a pixel in electrons."""
+        return full_well_of(self.pixel_pitch) if self.full_well_electrons is None else self.full_well_electrons
+
+    @property
+    def saturating_f_number(self) -> float:
+        """F-number at which white just fills the well; at wider apertures the exposure is shorter."""
+        return self.reference_f_number * math.sqrt(self.electrons / self.full_well)
 
     def noise(self, f_number: float) -> float:
         """Return the standard deviation of the noise at the scenes' mean light, full scale 1."""

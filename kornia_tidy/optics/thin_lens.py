@@ -16,6 +16,7 @@ FASTEST = 0.5  # f-number at a numerical aperture of 1, the limit of a lens in a
 # Limits in metres: from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
 FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
 NEAREST_DEPTH = 1e-18  # metres
+DEFAULT_DIAMETER = 2.835e-3  # metres; psi of the paper's range at the default focus
 
 
 def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: float | Tensor) -> Tensor:
@@ -78,7 +79,7 @@ class ThinLensCamera(nn.Module):
 
     Args:
         focal_length: in metres.
-        aperture_diameter: diameter of the pupil in metres.
+        aperture_diameter: diameter of the pupil in metres. Default: 2.835 mm, f/17.6 at 50 mm.
         focus_distance: distance in focus, in metres; ``inf`` is allowed. A float stays fixed. A tensor becomes a
             learnable parameter; then the PSF sampling changes with it, and a capture no longer compiles to a single
             graph.
@@ -87,14 +88,15 @@ class ThinLensCamera(nn.Module):
             infinity, which is symmetric in defocus.
         lens_material: glass of a single-element lens, which has chromatic aberration; ``focal_length`` is then the one
             at 530 nm. Default: a lens corrected for colour.
+        f_number: focal length over diameter of the pupil, in place of ``aperture_diameter``.
 
     Shape:
         - ``defocus(depth)``: any shape to the same shape.
 
     Raises:
         ValueError: if a length is out of range (focal length 0.01 mm to 10 m, aperture 1 um to 10 m, pixels 0.1 um to
-            1 mm), the lens is faster than f/0.5, the focus distance is not beyond the focal length, ``depth_range`` is
-            empty, or it is missing for a focus at infinity.
+            1 mm), the lens is faster than f/0.5, both ``aperture_diameter`` and ``f_number`` are given, the focus
+            distance is not beyond the focal length, ``depth_range`` is empty, or it is missing for a focus at infinity.
         TypeError: if an argument is of another type.
 
     Convention:
@@ -111,19 +113,31 @@ class ThinLensCamera(nn.Module):
         tensor([ 19.9500,  -0.0000, -20.0200])
         >>> round(camera.f_number, 1), round(float(camera.image_distance), 5)
         (17.6, 0.05459)
+        >>> ThinLensCamera(f_number=8).aperture_diameter
+        0.00625
     """
 
     def __init__(
         self,
         focal_length: float = 50e-3,
-        aperture_diameter: float = 2.835e-3,
+        aperture_diameter: float | None = None,
         focus_distance: float | Tensor = 0.595,
         pixel_pitch: float = 8e-6,
         depth_range: tuple[float, float] | None = None,
         lens_material: Material | None = None,
+        f_number: float | None = None,
     ) -> None:
         super().__init__()
         check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+        if f_number is not None:
+            if aperture_diameter is not None:
+                raise ValueError(
+                    f"aperture_diameter or f_number sets the aperture, got both: {aperture_diameter} and {f_number}"
+                )
+            check_positive("f_number", f_number)
+            aperture_diameter = focal_length / f_number
+        elif aperture_diameter is None:
+            aperture_diameter = DEFAULT_DIAMETER
         check_metres("aperture_diameter", aperture_diameter, *DIAMETERS, "2.8 mm is 2.8e-3")
         check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
         check_number("focus_distance", focus_distance, "metres")

@@ -4,8 +4,8 @@ A linear-light image in units of full scale comes in. The same image with noise,
 ``noise.py`` first; ``shot.py`` has the Poisson noise, ``exposure.py`` the light that an f-number admits.
 """
 
-from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor
+from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor, full_well_of
 from kornia_tidy.sensor.noise import SensorNoise, quantize
 from kornia_tidy.sensor.shot import shot_noise
 
-__all__ = ["SensorNoise", "electrons_at", "exposed_sensor", "quantize", "shot_noise"]
+__all__ = ["SensorNoise", "electrons_at", "exposed_sensor", "full_well_of", "quantize", "shot_noise"]

@@ -55,6 +55,36 @@ def slopes(loss, masks: dict[str, Tensor], *, again: bool = False) -> dict[str, 
     return dict(zip(leaves, torch.autograd.grad(loss(leaves), list(leaves.values()), create_graph=again), strict=True))
 
 
+class TestDepth(BaseTester):
+    @pytest.mark.takes_seconds
+    def test_feature_gradients_to_depth_are_as_exact_as_the_documentation_says(self):
+        """Dense linear layers are the reference, which differences of captures confirm."""
+        ramp = torch.linspace(0, 1, 24, dtype=torch.float64)
+        depth = 1 / (3.3 - 2.5 * (ramp[:, None] + ramp) / 2)[None, None]
+        generator = torch.Generator().manual_seed(0)
+        image, weights = (torch.rand(1, 3, 24, 24, generator=generator).double() for _ in range(2))
+        masks = PixelwiseMask(1, generator=generator)
+
+        def loss(depth: Tensor, layers: str = "linear", spacing: float = 1 / 16) -> Tensor:
+            fidelity = Fidelity(window=17, layers=layers, layer_spacing=spacing, double=True)
+            optics = TiDyOptics(masks, fidelity=fidelity, color_space="linear", sensor=None)
+            return ((weights - 0.5) * optics(image, depth)).sum()
+
+        def gradient(*layers) -> Tensor:
+            moved = depth.clone().requires_grad_()
+            return torch.autograd.grad(loss(moved, *layers), moved)[0]
+
+        truth = gradient()
+        step = 1e-2 * truth / truth.norm()  # many layers, whose PSFs are exact
+        with torch.no_grad():
+            assert float(loss(depth + step) - loss(depth - step)) == pytest.approx(2e-2 * float(truth.norm()), rel=2e-2)
+        errors = {
+            layers: float((gradient(layers, 2.0) - truth).norm() / truth.norm()) for layers in ("linear", "bandlimited")
+        }
+        assert errors["bandlimited"] < 0.08
+        assert 0.24 < errors["linear"] < 0.4
+
+
 class TestSecondDerivatives(BaseTester):
     """Hessian-vector products of the masks against central differences of the gradient.
 

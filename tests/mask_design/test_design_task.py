@@ -7,6 +7,7 @@ import pytest
 
 from kornia_tidy.mask_design.candidates import flat_candidate
 from kornia_tidy.mask_design.design_task import DesignTask
+from kornia_tidy.sensor import full_well_of
 from tests.base import BaseTester
 
 
@@ -25,6 +26,7 @@ class TestDesignTask(BaseTester):
             ({"mask_size": 0}, "mask_size must be a whole number from 1 to 1024, got 0"),
             ({"mask_size": 5000}, "mask_size must be a whole number from 1 to 1024, got 5000"),
             ({"mask_size": 23.0}, "mask_size must be a whole number from 1 to 1024, got 23.0"),
+            ({"full_well_electrons": 0}, "full_well_electrons must be positive and finite, got 0"),
             ({"depth_weight": 1.5}, r"depth_weight must be from 0 \(image alone\) to 1 \(depth alone\), got 1.5"),
         ],
     )
@@ -67,6 +69,16 @@ class TestDesignTask(BaseTester):
     def test_feature_light_falls_with_the_square_of_the_f_number(self):
         task = DesignTask(electrons=1000, reference_f_number=10)
         assert task.sensor(20.0).full_well == pytest.approx(250)
+
+    def test_feature_the_full_well_limits_the_exposure(self):
+        """57,000 electrons at f/17.6 are 1.54 million at f/3.39, more than a pixel of 8 um holds."""
+        task = DesignTask()
+        assert task.sensor(3.39).full_well == full_well_of(8e-6)
+        assert task.sensor(35.2).full_well == 57_000 / 4
+        small = DesignTask(full_well_electrons=20_000)
+        assert small.sensor(17.6).full_well == 20_000
+        assert small.sensor(small.saturating_f_number * 1.001).full_well < 20_000
+        assert small.noise(5.0) == small.noise(17.6)
 
     def test_feature_focus_is_a_fraction_of_inverse_depth(self):
         task = DesignTask(depth_range=(0.5, 2.0))

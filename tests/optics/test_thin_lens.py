@@ -138,6 +138,26 @@ class TestThinLensCamera(BaseTester):
         assert camera.image_distance == camera.focal_length
         assert camera.defocus_range[0] == 0.0
 
+    @pytest.mark.parametrize("focal_length", [35e-3, 50e-3])
+    def test_feature_an_f_number_is_the_focal_length_over_the_diameter(self, focal_length):
+        camera = ThinLensCamera(focal_length, f_number=8)
+        assert camera.aperture_diameter == pytest.approx(focal_length / 8, rel=1e-15)
+        assert camera.defocus_range == ThinLensCamera(focal_length, focal_length / 8).defocus_range
+        assert camera.resized(0.5).f_number == pytest.approx(8, rel=1e-15)
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            ({"f_number": 8, "aperture_diameter": 5e-3}, "got both: 0.005 and 8"),
+            ({"f_number": 0}, "f_number must be"),
+            ({"f_number": float("nan")}, "f_number must be"),
+            ({"f_number": 0.4}, "which is f/0.5"),
+        ],
+    )
+    def test_exception_f_number(self, options, sentence):
+        with pytest.raises(ValueError, match=sentence):
+            ThinLensCamera(**options)
+
     def test_smoke_repr_tells_the_lens(self):
         words = repr(ThinLensCamera())
         assert "50 mm f/17.6" in words

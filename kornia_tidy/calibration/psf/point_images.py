@@ -148,11 +148,11 @@ def _point_image(
     near = start[0] - corner[0], start[1] - corner[1]
     light, variance = merge_exposures(frames[..., rows, columns], exposures, sensor, saturation)
     try:
-        light = light - annulus_background(light, near, window, 1.5 * window)[:, None, None]
+        light = light - annulus_background(light, near, window, 1.5 * window)
         clear, centre = light, centre_of_light
         if reference is not None:
             clear, centre = reference[..., rows, columns].double(), centre_of_symmetry
-            clear = clear - annulus_background(clear, near, window, 1.5 * window)[:, None, None]
+            clear = clear - annulus_background(clear, near, window, 1.5 * window)
         places = torch.tensor([centre(channel[None], near, window) for channel in clear], dtype=torch.float64)
         places = places + _phases(tile, len(places))
         weight = cut_out(clear, near, window).sum((1, 2)).clamp(min=0)

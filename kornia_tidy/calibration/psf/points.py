@@ -9,6 +9,9 @@ from torch.nn.functional import avg_pool2d
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.psf.psf_bank import enclosing_window
 
+MOST_SAMPLES = 100_000  # of a picture, from which its background is estimated
+FITS = 8  # of a plane to the background, each without the outliers of the one before
+
 
 def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]:
     """Detect the brightest points of a picture, brightest first.
@@ -35,7 +38,12 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
     height, width = image.shape
     if window > min(height, width):
         raise ValueError(f"a window of {window} pixels does not fit into a picture of {height}x{width}")
-    value = image.double() - image.double().median()
+    # A plane, so that a gradient of the background is not taken for a point at the edge of the picture.
+    rows, columns = (torch.linspace(-1, 1, length, dtype=torch.float64, device=image.device) for length in image.shape)
+    basis = torch.stack(torch.broadcast_tensors(torch.ones_like(image).double(), rows[:, None], columns))
+    every = max(1, image.numel() // MOST_SAMPLES)
+    factors = _plane(basis.flatten(1)[:, ::every], image.double().flatten()[None, ::every])
+    value = image.double() - torch.einsum("ci,ihw->hw", factors, basis)
     # A box of half the window collects enough light. Two passes give a peak where one would give a plateau.
     box = max(1, window // 4) * 2 + 1
     smooth = value[None, None]
@@ -54,10 +62,12 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
 
 
 def annulus_background(image: Tensor, centre: tuple[float, float], inner: float, outer: float) -> Tensor:
-    """Return the background around a point: the mean over an annulus without outliers.
+    r"""Return the background around a point: a plane through the pixels of an annulus, without outliers.
 
-    Values farther from the median than three standard deviations, estimated by the median absolute deviation, are
-    rejected. The median itself would not do, because in an even background it is rounded to a step of the converter.
+    .. math:: b(r, c) = b_0 + b_r r + b_c c
+
+    A lamp beside the point or vignetting leaves a gradient. The plane is fitted by least squares, and values farther
+    from it than three standard deviations, estimated by the median absolute deviation, are rejected, eight times over.
 
     Args:
         image: (C, H, W) linear light.
@@ -66,29 +76,41 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
         outer: outer radius in pixels.
 
     Returns:
-        (C,) mean over the part of the annulus within the picture.
+        (C, H, W) the plane at each pixel of the picture.
 
     Raises:
         ValueError: if fewer than 32 pixels are within the picture.
 
     Example:
-        >>> image = torch.full((1, 32, 32), 0.1)
+        >>> image = torch.full((1, 32, 32), 0.1) + 1e-3 * torch.arange(32)
         >>> image[0, 16, 16], image[0, 4, 16] = 1.0, 0.7
-        >>> annulus_background(image, (16, 16), 10, 14)
-        tensor([0.1000])
+        >>> annulus_background(image, (16, 16), 10, 14)[0, 16, 14:19]
+        tensor([0.1140, 0.1150, 0.1160, 0.1170, 0.1180])
     """
     rows = torch.arange(image.shape[-2], dtype=torch.float64, device=image.device) - centre[0]
     columns = torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - centre[1]
     radius = torch.hypot(rows[:, None], columns)
-    ring = image[:, (radius >= inner) & (radius <= outer)]
+    within = (radius >= inner) & (radius <= outer)
+    ring = image[:, within].double()
     if ring.shape[1] < 32:
         raise ValueError(
             f"the background needs 32 pixels between {inner:g} and {outer:g} px of a point at row {centre[0]:.0f}, "
             f"column {centre[1]:.0f}, the picture of {image.shape[-2]}x{image.shape[-1]} has {ring.shape[1]}"
         )
-    deviation = (ring - ring.median(1, keepdim=True).values).abs()
-    kept = deviation <= 3 * 1.4826 * deviation.median(1, keepdim=True).values
-    return (ring * kept).sum(1) / kept.sum(1)
+    basis = torch.stack(torch.broadcast_tensors(torch.ones_like(radius), rows[:, None] / outer, columns / outer))
+    return torch.einsum("ci,ihw->chw", _plane(basis[:, within], ring), basis).to(image.dtype)
+
+
+def _plane(at: Tensor, values: Tensor) -> Tensor:
+    """Return the factors (C, 3) of planes through values (C, n) where the basis is ``at``, (3, n), without outliers."""
+    kept, rounding = torch.ones_like(values), 1e-12 * values.abs().amax(1, keepdim=True)
+    for _ in range(FITS):
+        normal = torch.einsum("cn,in,jn->cij", kept, at, at)
+        factors = torch.linalg.solve(normal, torch.einsum("cn,in,cn->ci", kept, at, values))
+        deviation = (values - factors @ at).abs()
+        spread = deviation.median(1, keepdim=True).values.maximum(rounding)
+        kept = (deviation <= 3 * 1.4826 * spread).double()
+    return factors
 
 
 def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:

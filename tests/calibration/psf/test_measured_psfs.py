@@ -48,7 +48,7 @@ def truth(coded):
     return psfs / psfs.sum((2, 3), keepdim=True)
 
 
-def captured(coded, flat, count, seed=0, spoil=None):
+def captured(coded, flat, count, seed=0, spoil=None, background=0.0):
     """Return point images at random sub-pixel positions; the long exposure saturates the core."""
     generator = torch.Generator().manual_seed(seed)
     images = {}
@@ -57,9 +57,9 @@ def captured(coded, flat, count, seed=0, spoil=None):
         for n in range(count):
             ninths = tuple(torch.randint(-4, 5, (2,), generator=generator).tolist())
             light = on_pixels(coded[z], ninths)
-            frames = exposed(0.5 * light / light.max(), EXPOSURES, generator, 10500, 2.4, 0.003)
+            frames = exposed(0.5 * light / light.max() + background, EXPOSURES, generator, 10500, 2.4, 0.003)
             clear = on_pixels(flat[z], ninths)
-            clear = exposed(0.8 * clear / clear.max(), torch.ones(1), generator, 10500, 2.4, 0.003)[0]
+            clear = exposed(0.8 * clear / clear.max() + background, torch.ones(1), generator, 10500, 2.4, 0.003)[0]
             if spoil is not None:
                 frames = spoil(n, frames)
             images[z] += point_images(frames, EXPOSURES, SENSOR, WINDOW, reference=clear)
@@ -98,6 +98,14 @@ class TestMeasurePSFs(BaseTester):
         expected = 0.798 * measured.uncertainty.sum((2, 3))
         assert bool(((measured.bank.psfs - truth).abs().sum((2, 3)) < 1.6 * expected).all())
         assert bool(((measured.bank.psfs - truth).abs().sum((2, 3)) > 0.4 * expected).all())
+
+    @pytest.mark.parametrize("gradient", [3e-5, 1e-3])
+    def test_feature_a_gradient_of_the_background_is_taken_off(self, coded, flat, truth, gradient):
+        """Full scales a pixel, per unit of exposure: a lamp beside the point, or vignetting."""
+        background = gradient * torch.arange(SIDE, dtype=torch.float64)
+        found = measure_psfs(captured({0.8: coded[0.8]}, flat, 12, background=background), CAMERA, WINDOW, CUTOFF)
+        error = (found.bank.psfs[0] - truth[0]).abs().sum((1, 2))
+        assert bool((error < 1.6 * 0.798 * found.uncertainty[0].sum((1, 2))).all())
 
     def test_feature_the_bank_is_that_of_the_cameras_defocus(self, measured):
         self.assert_close(measured.bank.defocus, CAMERA.defocus(torch.tensor([0.8, 0.5])))
