@@ -149,8 +149,6 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
         place += 2 + struct.unpack_from(">H", data, place + 2)[0]
 
 
-
-
 def _bmp(data: bytes) -> Size:
     """Return the size of a BMP; refuse kinds whose colours OpenCV takes for others."""
     (length,) = struct.unpack_from("<I", data, 14)
