@@ -36,7 +36,7 @@ from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.mask_design.candidates import Candidate
 from kornia_tidy.mask_design.design_memory import DesignMemory
-from kornia_tidy.mask_export import read_heights, read_slm_frames
+from kornia_tidy.mask_export import read_heights, read_response, read_slm_frames
 from kornia_tidy.mask_export.mask_files import read_dwell_shares
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.raw.capture import RawCapture
@@ -164,9 +164,14 @@ def _numbers(folder: Path) -> list[Case]:
     reports = (PointReport(0.5, 1.0, 2.0, 1.0, None, None),)
     MeasuredPSFs(bank, torch.zeros_like(bank.psfs), distances, reports).save(folder / "measured.safetensors")
     frames = folder / "frames"
+    columns = "".join(f"{level};{level / 40.6:.6f}\n" for level in range(256))
+    (folder / "columns.csv").write_text(f"Level;Phase (rad)\n{columns}")
 
     def read_frames(path: Path) -> object:
         return read_slm_frames(path.parent)
+
+    def read_levels(path: Path) -> object:
+        return read_response(path, bits=8)
 
     return [
         Case("npy", "npy", folder / "heights.npy", read_heights),
@@ -177,6 +182,8 @@ def _numbers(folder: Path) -> list[Case]:
         Case("frames", "json", frames / "frames.json", read_frames, (), frames),
         Case("frames", "npy", frames / "turns.npy", read_frames, (), frames),
         Case("frames", "png", frames / "frame_000.png", read_frames, (), frames),
+        Case("response", "raw", folder / "lut.txt", read_levels),
+        Case("response", "raw", folder / "columns.csv", read_levels),
     ]
 
 
