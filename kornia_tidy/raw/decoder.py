@@ -17,7 +17,7 @@ from typing import Any
 
 LARGEST_TILE = 6  # X-Trans
 LOADED = "loaded"  # printed once NumPy and LibRaw are imported: an earlier crash is not caused by the file
-PACKAGE = "kornia_tidy_raw"  # by which this folder is imported here
+PACKAGE = "kornia_tidy_raw"  # name of this folder in the decoder process
 C330_LENGTHS = (2247168, 3370752)  # bytes; LibRaw recognises the headerless files of a Kodak C330 by their length
 
 
@@ -86,7 +86,7 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         "pixel_aspect": raw.sizes.pixel_aspect,
         "info": {**tags.camera_tags(data), **libraw_info(raw)},
     }
-    if sensor is not None and (counts.ndim == 2) == (sensor.samples == 1):
+    if sensor is not None and (picture is not None or (counts.ndim == 2) == (sensor.samples == 1)):
         header["info"]["ignored_opcodes"] = dng_sensor.ignored_opcodes(data, sensor)
         counts = dng_levels.described(header, counts if picture is None else picture, sensor, raw)
     else:

@@ -111,7 +111,7 @@ def read_samples(data: bytes, sensor: Sensor) -> np.ndarray:
 
 
 def plain_version(data: bytes, sensor: Sensor) -> bytearray:
-    """Return the file with tags of 16-bit samples in one strip, for LibRaw to read what else there is: the colours.
+    """Return the file with tags of 16-bit samples in one strip, from which LibRaw reads colours and orientation.
 
     LibRaw opens a file only if it knows how to decode it, and decodes it before it tells the white balance.
     """

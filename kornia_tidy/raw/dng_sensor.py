@@ -183,7 +183,7 @@ def ignored_opcodes(data: bytes, sensor: Sensor) -> list[str]:
 
 
 def opcodes(data: bytes, directory: Directory, tag: int) -> list[tuple[int, bool, bytes]]:
-    """Return the opcodes of a list: code, whether a reader may skip it, and parameters. What is cut short ends it."""
+    """Return the opcodes of a list: code, whether a reader may skip it, and parameters; up to a truncated one."""
     values = directory.long_values(data, tag)
     text = values[0] if values and isinstance(values[0], bytes) else b""
     found: list[tuple[int, bool, bytes]] = []

@@ -1,4 +1,4 @@
-"""DNGs of every kind, seeded, with the light and colours that were written: what a reader must find in them.
+"""Seeded DNGs with random properties, and the light and colours that a reader must find in them.
 
 `python -m tests.raw.dng_kinds 0 3000` reads as many and prints how many were read right and which were refused.
 """
