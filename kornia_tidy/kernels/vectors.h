@@ -27,17 +27,17 @@ const int64_t vector_bytes = VECTOR_BYTES;
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
 INLINE REAL sum_of(vec lanes) {
-    typedef REAL half __attribute__((vector_size(32)));
     typedef REAL quarter __attribute__((vector_size(16)));
-    quarter quarters[4] = {0};
 #if VECTOR_BYTES == 64
+    typedef REAL half __attribute__((vector_size(32)));
     half halves[2];
     memcpy(halves, &lanes, sizeof lanes);
     halves[0] += halves[1];
-    memcpy(quarters, halves, sizeof halves[0]);
 #else
-    memcpy(quarters, &lanes, sizeof lanes);
+    vec halves[1] = {lanes};
 #endif
+    quarter quarters[2] = {0};
+    memcpy(quarters, halves, sizeof halves[0]);
     quarters[0] += quarters[1];
     REAL sum = 0;
     for (int i = 0; i < 16 / (int)sizeof(REAL); i++) sum += quarters[0][i];
