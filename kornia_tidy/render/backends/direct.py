@@ -2,8 +2,8 @@
 
 A block of 4 x 32 pixels (in float32) is convolved with the PSFs of its own layers and with no other: P x P products a
 pixel for each. For PSFs of up to some 40 pixels that is faster than transforms, whose tiles are larger and hold more
-layers. The work is done in C (``direct.c``), see :mod:`kornia_tidy.kernels.build`. The gradient with respect to the image is made by overlapping windows
-(``overlap.c``): a pixel's light goes to pixels of many layers.
+layers. The work is done in C (``direct.c``), see :mod:`kornia_tidy.kernels.build`. The gradient with respect to the
+image is made by overlapping windows (``overlap.c``): a pixel's light goes to pixels of many layers.
 """
 
 from __future__ import annotations
