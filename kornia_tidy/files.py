@@ -10,6 +10,7 @@ import json
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +22,7 @@ try:
 except ImportError:  # missing on Windows, where nothing is locked
     fcntl = None
 
+LONGEST_JSON, DEEPEST_JSON, MOST_DIGITS = 1 << 23, 100, 300
 _LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of files and folders until they are complete
 
 
@@ -80,21 +82,56 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a text of JSON.
+    """Parse a text of JSON, which may come from anybody.
 
     Raises:
-        ValueError: if it is not JSON, or is nested too deep.
+        ValueError: if it is not JSON; is longer than 8 MiB, of which objects make up to 50 times as much; is nested
+            deeper than 100 levels; names a value twice; or holds a whole number of more than 300 digits, beyond floats.
+
+    Convention:
+        ``NaN`` and ``Infinity`` are numbers: Python writes infinite distances like this.
 
     Example:
-        >>> parse_json("[" * 100_000)
+        >>> parse_json("[" * 101 + "]" * 101)
         Traceback (most recent call last):
         ...
-        ValueError: its JSON is nested too deep
+        ValueError: its JSON is nested deeper than 100 levels
     """
+    if len(text) > LONGEST_JSON:
+        raise ValueError(f"its JSON must have at most {LONGEST_JSON} characters, got {len(text)}")
     try:
-        return json.loads(text)
+        value = json.loads(text, object_pairs_hook=_unique, parse_int=_whole)
     except RecursionError:
-        raise ValueError("its JSON is nested too deep") from None
+        raise ValueError(f"its JSON is nested deeper than {DEEPEST_JSON} levels") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"its JSON is not UTF-8: {error.reason} at byte {error.start}") from None
+    _check_depth(value)
+    return value
+
+
+def _check_depth(value: Any) -> None:
+    """Raise ``ValueError`` for values that are nested so deep that a function that calls itself for them may fail."""
+    level, depth = [value], 0
+    while level := [part for part in level if isinstance(part, (dict, list))]:
+        depth += 1
+        if depth > DEEPEST_JSON:
+            raise ValueError(f"its JSON is nested deeper than {DEEPEST_JSON} levels")
+        level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; of two values under one name, programs differ in which they take."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"its JSON names {twice!r:.80} twice")
+    return values
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"a whole number in its JSON must have at most {MOST_DIGITS} digits, got {len(digits)}")
+    return int(digits)
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

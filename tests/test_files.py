@@ -43,15 +43,29 @@ class TestReading(BaseTester):
         with pytest.raises(ValueError, match=r"cannot read .{60,100}\.\.\.: the name is too long$"):
             read_bytes(tmp_path / ("a" * 5000))
 
-    def test_exception_json_nested_too_deep(self, tmp_path):
-        for text in ("[" * 100_000 + "]" * 100_000, '{"a":' * 100_000 + "1" + "}" * 100_000):
+    @pytest.mark.parametrize("levels", [101, 600, 100_000])
+    def test_exception_json_nested_too_deep(self, levels, tmp_path):
+        for text in ("[" * levels + "]" * levels, '{"a":' * levels + "1" + "}" * levels, '[{"a":' * levels):
             (tmp_path / "a.json").write_text(text)
-            with pytest.raises(ValueError, match=r"cannot read .*a\.json: its JSON is nested too deep"):
+            with pytest.raises(ValueError, match=r"cannot read .*a\.json: (its JSON is nested deeper|Expecting)"):
                 read_json(tmp_path / "a.json")
 
-    @pytest.mark.parametrize("text", [b"{", b"\xff\xfe\x00", b"[1" + b"0" * 5000 + b"]"])
-    def test_exception_what_is_no_json(self, text):
-        with pytest.raises(ValueError, match=r"\w"):
+    def test_feature_json_of_a_hundred_levels_is_read(self):
+        assert repr(parse_json("[" * 100 + "]" * 100)) == "[" * 100 + "]" * 100
+
+    @pytest.mark.parametrize(
+        ("text", "sentence"),
+        [
+            (b"{", "Expecting"),
+            (b'{"a": "\xff"}', "its JSON is not UTF-8: invalid start byte at byte 7"),
+            (b"[1" + b"0" * 300 + b"]", "must have at most 300 digits, got 301"),
+            (b"[-1" + b"0" * 5000 + b"]", "must have at most 300 digits, got 5002"),
+            (b'{"a": 1, "b": {"c": 1, "c": 2}}', "its JSON names 'c' twice"),
+            (b'{"a": "' + b" " * (1 << 23) + b'"}', r"its JSON must have at most 8388608 characters, got 8388617"),
+        ],
+    )
+    def test_exception_json_that_is_none_or_may_do_harm(self, text, sentence):
+        with pytest.raises(ValueError, match=sentence):
             parse_json(text)
 
 

@@ -63,3 +63,11 @@ class TestReadTensors(BaseTester):
         path.write_bytes(damage(path.read_bytes()))
         with pytest.raises(ValueError, match=r"cannot read .*x\.safetensors: it is no mask or is damaged: "):
             read_tensors(path, "mask")
+
+    def test_exception_a_header_of_very_many_tensors(self, tmp_path):
+        """Each takes 26 times its entry: 100 MB, which safetensors allows, would take 2.5 GB."""
+        entry = '"%x":{"dtype":"F32","shape":[0],"data_offsets":[0,0]}'
+        header = f"{{{','.join(entry % i for i in range(320_000))}}}".encode()
+        (tmp_path / "x.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
+        with pytest.raises(ValueError, match=r"its header must have at most 16777216 bytes, got 1[78]\d{6}"):
+            read_tensors(tmp_path / "x.safetensors")

@@ -155,7 +155,9 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
 
 def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> TrainedSystem:
     """Return the system of a state that was read; the path is for messages. See :func:`load_trained`."""
-    _check_parts(state, path)
+    weights_of(state, path)
+    if not isinstance(state.get("global_step"), int) or "settings" not in state:
+        raise ValueError(f"cannot read {path}: it is a checkpoint without step or settings, or is damaged")
     if state["settings"] is None:
         raise ValueError(
             f"{path} does not say how its camera and network were made, as they were given as objects: make them anew "
@@ -175,13 +177,17 @@ def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> T
     return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]), run)
 
 
-def _check_parts(state: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` for a state without weights, step or settings."""
-    weights, step = state.get("state_dict"), state.get("global_step")
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+def weights_of(state: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Return the weights of a state that was read; the path is for the message.
+
+    Raises:
+        ValueError: if it has none.
+    """
+    weights = state.get("state_dict")
+    named = isinstance(weights, dict) and all(isinstance(name, str) for name in weights)
+    if not named or not all(isinstance(value, Tensor) for value in weights.values()):
         raise ValueError(f"cannot read {path}: it is a checkpoint without weights, or is damaged")
-    if not isinstance(step, int) or "settings" not in state:
-        raise ValueError(f"cannot read {path}: it is a checkpoint without step or settings, or is damaged")
+    return weights
 
 
 def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) -> None:
@@ -222,7 +228,7 @@ def load_weights(
     """
     state = checkpoint if isinstance(checkpoint, Mapping) else read_state(checkpoint)
     name = name or str(checkpoint)
-    weights: dict[str, Tensor] = state["state_dict"]
+    weights = weights_of(state, name)
     parts = [(optics, "optics."), (head, head_prefix(weights))]
     wanted = [(part, below(weights, prefix), prefix) for part, prefix in parts if part is not None]
     for part, own, prefix in wanted:
@@ -244,7 +250,7 @@ def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
     """
     tensors, header = read_tensors(checkpoint, WHAT)
     prefix = "masks." if header.get("format") is None else "optics.masks."
-    own = below(tensors if prefix == "masks." else read_state(checkpoint)["state_dict"], prefix)
+    own = below(tensors if prefix == "masks." else weights_of(read_state(checkpoint), checkpoint), prefix)
     check_weights(optics.masks, own, f"{checkpoint}, {prefix.removesuffix('.')}")
     optics.masks.load_state_dict(own)
 

@@ -19,6 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.files import parse_json
+
 EXTRA_STATE = "_extra_state"  # how PyTorch calls the entry of a state that is neither parameter nor buffer
 _PAGE = 4096  # bytes; settings of about the same length fill the same tensor, as distributed checkpoints want it
 _MOST_VALUES = 1 << 16  # of a tensor written in full; of larger ones the digest is written
@@ -86,10 +88,10 @@ def read_settings(stored: Any) -> dict[str, Any]:
         text = stored.cpu().numpy().tobytes().rstrip(b" ")
         if int(text[:8], 16) != zlib.crc32(text[8:]):
             raise ValueError("their check sum is wrong")
-        settings = json.loads(text[8:])
+        settings = parse_json(text[8:])
         if not isinstance(settings, dict):
             raise ValueError("they have no names")
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"cannot read the camera's settings in the state: {error}; {_REMEDY}") from None
     return settings
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.files import check_file
+from kornia_tidy.files import check_file, parse_json
 from kornia_tidy.raw.decoder import C330_LENGTHS, LOADED
 from kornia_tidy.raw.validation import is_c330
 from kornia_tidy.runtime.search_path import ROOT, package_folders
@@ -202,7 +202,7 @@ def _header(result: IO[bytes]) -> dict[str, Any]:
     """Read the decoder's JSON header, and leave the file at the counts after it."""
     result.seek(0)
     try:
-        header = json.loads(result.readline(LONGEST_HEADER))
+        header = parse_json(result.readline(LONGEST_HEADER))
     except ValueError:
         return {}
     return header if isinstance(header, dict) else {}

@@ -19,6 +19,7 @@ from typing import Any
 
 import torch
 
+from kornia_tidy.files import parse_json
 from kornia_tidy.kernels.build import KERNELS, cache_folder, is_ours, maker
 from kornia_tidy.kernels.processor import processor_features
 from kornia_tidy.render.cost_profile import EPYC, RATES, XEON, CostProfile
@@ -142,9 +143,9 @@ def read_profile(threads: int) -> StoredProfile | None:
         status = path.lstat()
         if not (stat.S_ISREG(status.st_mode) and is_ours(status) and status.st_size <= LARGEST_FILE):
             return None
-        document = json.loads(path.read_text())
+        document = parse_json(path.read_bytes())
         return _stored(document)
-    except (OSError, ValueError, RecursionError):
+    except (OSError, ValueError):
         return None
 
 

@@ -1,8 +1,8 @@
 """Where later imports and started processes look for code: installed packages, not the folder that is current by then.
 
-Python puts the current folder on the path of ``python -c``, notebooks and the prompt, and looks it up anew at each import.
-Worker processes and programs are looked up in a similar way. After a change into a folder of downloads, a ``rawpy.py`` or
-``git`` that lies there would be run.
+Python puts the current folder on the path of ``python -c``, notebooks and the prompt, and looks it up anew at each
+import. Worker processes and programs are looked up in a similar way. After a change into a folder of downloads, a
+``rawpy.py`` or ``git`` that lies there would be run.
 """
 
 from __future__ import annotations

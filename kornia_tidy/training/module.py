@@ -34,6 +34,7 @@ from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import FIXED_OPTICS, LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
+STEPPED = "weights_stepped"  # entry of a checkpoint: the number of weights of which the optimiser has a state
 HELD_OUT_STEP = 4  # the temperature is fitted to every fourth pixel of every fourth row
 
 
@@ -291,22 +292,28 @@ class TidyTraining(pl.LightningModule):
             if isinstance(module, JointClosedFormHead | LayeredJointHead):
                 module.temperature.fill_(temperature)
 
-    def configure_optimizers(self) -> Any:
-        """Return one Adam, with the masks' rate in metres of height, and the schedule of the rates unless constant."""
+    def adam(self) -> torch.optim.Optimizer:
+        """Return the optimiser, before its first step: one Adam, with the masks' rate in metres of height."""
         if self.fixed_optics:
-            learnt = (weight for weight in self.head.parameters() if weight.requires_grad)
-            return self._scheduled(torch.optim.AdamW(learnt, lr=self.lr))
+            return torch.optim.AdamW((weight for weight in self.head.parameters() if weight.requires_grad), lr=self.lr)
         groups = self.optics.parameter_groups(self.lr_metres, self.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
         if self.learn == "both":
             groups.append({"params": list(self.head.parameters()), "lr": self.lr})
-        return self._scheduled(torch.optim.Adam(groups, lr=self.lr, betas=self.betas))
+        return torch.optim.Adam(groups, lr=self.lr, betas=self.betas)
 
-    def _scheduled(self, adam: torch.optim.Optimizer) -> Any:
+    def configure_optimizers(self) -> Any:
+        """Return the optimiser, and the schedule of its rates unless they are constant."""
+        adam = self.adam()
         if self.schedule == "constant":
             return adam
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: cosine_rate(step / max(1, steps)))
+
+        def rate(step: int) -> float:
+            # Not before the first step: asking for the number of steps sets up the data, and a resumed run would then
+            # begin its epoch anew.
+            return cosine_rate(step / max(1, int(self.trainer.estimated_stepping_batches)) if step else 0.0)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(adam, rate)
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_fit_start(self) -> None:
@@ -331,7 +338,9 @@ class TidyTraining(pl.LightningModule):
     # ------------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add settings, task and description of camera and network."""
+        """Add settings, task and description of camera and network, and how many weights the optimiser has stepped."""
+        if "optimizer_states" in checkpoint:
+            checkpoint[STEPPED] = sum(len(optimiser["state"]) for optimiser in checkpoint["optimizer_states"])
         checkpoint["settings"] = None if self.settings is None else self.settings.as_dict()
         checkpoint["task"] = self.task
         checkpoint["description"] = describe(self.optics, self.head)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -37,10 +38,54 @@ def set_random_state(state: Mapping[str, Any]) -> None:
     torch.set_rng_state(state["torch"])
     if len(state["cuda"]) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all(state["cuda"])
-    name, words, position, has_gauss, gauss = state["numpy"]
-    np.random.set_state((name, words.numpy().astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
-    version, own, spare = state["python"]
-    random.setstate((version, tuple(own.tolist()), spare))
+    np.random.set_state(_of_numpy(state["numpy"]))  # noqa: NPY002
+    random.setstate(_of_python(state["python"]))
+
+
+def check_random_states(states: Any, place: str) -> None:
+    """Raise ``ValueError`` unless generators take the states that :func:`random_states` returned, of every process.
+
+    They are tried on generators that nobody draws from.
+
+    Example:
+        >>> check_random_states(random_states(), "random")
+        >>> check_random_states([{"torch": torch.zeros(3)}], "random")
+        Traceback (most recent call last):
+        ...
+        ValueError: random/0 must be states of the generators of torch, NumPy and Python
+    """
+    states = [states] if isinstance(states, Mapping) else states
+    if not isinstance(states, (list, tuple)) or not states:
+        raise ValueError(f"{place} must be the states of the generators of every process, got {states!r:.80}")
+    for number, state in enumerate(states):
+        try:
+            if not isinstance(state, Mapping) or not isinstance(state["cuda"], (list, tuple)):
+                raise TypeError
+            torch.Generator().set_state(state["torch"])
+            if not all(isinstance(each, torch.Tensor) and each.dtype == torch.uint8 for each in state["cuda"]):
+                raise TypeError
+            np.random.RandomState().set_state(_of_numpy(state["numpy"]))
+            random.Random().setstate(_of_python(state["python"]))  # noqa: S311 (the same generator)
+        except (AttributeError, KeyError, OverflowError, RuntimeError, TypeError, ValueError):
+            raise ValueError(f"{place}/{number} must be states of the generators of torch, NumPy and Python") from None
+
+
+def _of_numpy(state: Any) -> tuple[Any, ...]:
+    name, words, position, has_gauss, gauss = state
+    if not isinstance(words, torch.Tensor) or not isinstance(gauss, (int, float)) or not math.isfinite(gauss):
+        raise TypeError
+    if not isinstance(position, int) or not 0 <= position <= len(words) or not isinstance(has_gauss, int):
+        raise ValueError
+    return name, words.numpy().astype(np.uint32), position, has_gauss, gauss
+
+
+def _of_python(state: Any) -> tuple[Any, ...]:
+    version, own, spare = state
+    if not isinstance(own, torch.Tensor) or not isinstance(spare, (int, float, type(None))):
+        raise TypeError
+    if not math.isfinite(spare or 0):
+        raise ValueError
+    return version, tuple(own.tolist()), spare
 
 
 def random_states() -> list[dict[str, Any]]:

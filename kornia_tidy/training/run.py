@@ -22,7 +22,7 @@ from torch.utils.data import Dataset
 from kornia_tidy.files import only_here
 from kornia_tidy.inference.heads import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights
+from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights, weights_of
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.nafnet import deepened
@@ -35,6 +35,7 @@ from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 from kornia_tidy.training.noisy_crops import NoisyCrops, electrons_of
 from kornia_tidy.training.settings import TrainingSettings, differences
+from kornia_tidy.training.stored_run import check_stored_run
 
 SETTINGS = "settings.json"
 SCENE_SETTINGS = ("data", "root", "size", "depth_range", "seed")  # the scene of a number follows from them
@@ -121,6 +122,7 @@ def _train(
 ) -> TidyTraining:
     """Train in a folder that is locked."""
     checkpoint = _prepare(folder, settings, resume)
+    stored = None if checkpoint is None else _read_run(checkpoint)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
         stage: dict[str, Any] = {
@@ -152,8 +154,8 @@ def _train(
             module.average.network.load_state_dict(module.head.state_dict())
     module.settings.write(folder / SETTINGS)
     if settings.fixed_optics:
-        if checkpoint is not None:  # the masks may have been designed
-            load_weights(checkpoint, module.optics)
+        if stored is not None:  # the masks may have been designed
+            load_weights(stored, module.optics, name=str(checkpoint))
         parts = {"train": scenes, "validation": validation}
         scenes, validation = (_crops(part, parts[part], module, captures / part) for part in parts)
     data = SceneData(scenes, validation, settings.batch, settings.seed, settings.augment, workers)
@@ -186,8 +188,28 @@ def _train(
             enable_model_summary=False,
             **options,
         )
+        if stored is not None:
+            _check_run(stored, checkpoint, trainer, module, data)
         _fit(trainer, module, data, checkpoint)
     return module
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """Return the state of a run, which has weights at least."""
+    state = read_state(path)
+    weights_of(state, path)
+    return state
+
+
+def _check_run(
+    state: Mapping[str, Any], path: Path | None, trainer: pl.Trainer, module: TidyTraining, data: SceneData
+) -> None:
+    """Raise ``ValueError`` with the path unless a run can go on from a state."""
+    batches = len(data.train_dataloader()) // trainer.world_size  # not yet divided among processes
+    try:
+        check_stored_run(state, trainer, module, batches)
+    except ValueError as error:
+        raise ValueError(f"cannot resume from {path}: {error}") from None
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
@@ -219,6 +241,7 @@ def _begin_refiner(path: str | os.PathLike[str], head: nn.Module) -> None:
 def _read_network(path: str | os.PathLike[str], head: nn.Module) -> dict[str, Any]:
     """Read a checkpoint whose network begins a head. Fine maps are not taken for further depths."""
     state = read_state(path)
+    weights_of(state, path)
     if not isinstance(state.get("settings"), Mapping):
         raise ValueError(f"{path} holds no settings of a system")
     if state["settings"].get("fine") and not _is_fine(head):

@@ -102,9 +102,47 @@ class TestStateFile(BaseTester):
         assert [file.name for file in tmp_path.iterdir()] == ["last.safetensors"]
 
     @pytest.mark.parametrize(
-        "state", ["[1, 2]", "[" * 100_000, '{"a": {"$tensor": ["x"]}}', '{"a": {"$pairs": 3}}', "\x00"]
+        "state",
+        [
+            "[1, 2]",
+            "[" * 100_000,
+            '{"a": ' + "[" * 600 + "]" * 600 + "}",
+            '{"a": {"$tensor": ["x"]}}',
+            '{"a": {"$pairs": 3}}',
+            "\x00",
+        ],
     )
     def test_exception_a_state_that_cannot_be(self, state, tmp_path):
         save_file({"weight": torch.ones(2)}, tmp_path / "a", {"format": FORMAT, "state": state})
         with pytest.raises(ValueError, match="it is no checkpoint of kornia_tidy or is damaged"):
             read_state(tmp_path / "a")
+
+    @pytest.mark.parametrize(
+        ("state", "sentence"),
+        [
+            ('[{"$tensor": "q"}, {"$tensor": "q"}]', "'q' stands in two places"),
+            ('[{"$tensor": "q", "$scale": "s"}, {"$tensor": "q", "$scale": "s"}]', "'q' stands in two places"),
+            ('[{"$tensor": "q", "$scale": "s"}, {"$tensor": "p", "$scale": "s"}]', "'s' stands in two places"),
+            ('[{"$tensor": "q", "$scale": "q"}]', "'q' stands in two places"),
+            ('[{"$tensor": "row", "$scale": "s"}]', r"a scale of \(2, 1\) does not fit a weight of \(1, 4\)"),
+            ('[{"$tensor": "q", "$scale": "wide"}]', r"a scale of \(2, 4\) does not fit a weight of \(2, 4\)"),
+            ('[{"$tensor": "none"}]', "no tensor 'none'"),
+        ],
+    )
+    def test_exception_a_tensor_cannot_unfold(self, state, sentence, tmp_path):
+        """Neither by standing in many places nor by a scale that it would be expanded to."""
+        tensors = {name: torch.ones(2, 4, dtype=torch.int8) for name in "pq"}
+        tensors |= {"row": torch.ones(1, 4, dtype=torch.int8), "s": torch.ones(2, 1), "wide": torch.ones(2, 4)}
+        save_file(tensors, tmp_path / "a", {"format": FORMAT, "state": f'{{"a": {state}}}'})
+        with pytest.raises(ValueError, match=sentence):
+            read_state(tmp_path / "a")
+
+    def test_feature_names_with_slashes_keep_their_tensors_apart(self, tmp_path):
+        state = {
+            "a/b": torch.zeros(1),
+            "a": {"b": torch.ones(1), "b'": torch.full((1,), 2.0)},
+            "$a": {1: torch.ones(2)},
+        }
+        write_state(tmp_path / "a", state)
+        back = read_state(tmp_path / "a")
+        assert [back["a/b"].item(), back["a"]["b"].item(), back["a"]["b'"].item()] == [0, 1, 2]
