@@ -307,8 +307,13 @@ class TidyTraining(pl.LightningModule):
         adam = self.adam()
         if self.schedule == "constant":
             return adam
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: cosine_rate(step / max(1, steps)))
+
+        def rate(step: int) -> float:
+            # Not before the first step: asking for the number of steps sets up the data, and a resumed run would then
+            # begin its epoch anew.
+            return cosine_rate(step / max(1, int(self.trainer.estimated_stepping_batches)) if step else 0.0)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(adam, rate)
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_fit_start(self) -> None:

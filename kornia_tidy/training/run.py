@@ -122,9 +122,7 @@ def _train(
 ) -> TidyTraining:
     """Train in a folder that is locked."""
     checkpoint = _prepare(folder, settings, resume)
-    stored = None if checkpoint is None else read_state(checkpoint)
-    if stored is not None:
-        weights_of(stored, str(checkpoint))
+    stored = None if checkpoint is None else _read_run(checkpoint)
     if settings.pretrain_epochs and checkpoint is None:
         first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
         stage: dict[str, Any] = {
@@ -191,13 +189,27 @@ def _train(
             **options,
         )
         if stored is not None:
-            try:
-                check_stored_run(stored, trainer, module, len(data.train_dataloader()) // trainer.world_size)
-            except ValueError as error:
-                raise ValueError(f"cannot resume from {checkpoint}: {error}") from None
-            del stored  # Lightning reads it again
+            _check_run(stored, checkpoint, trainer, module, data)
         _fit(trainer, module, data, checkpoint)
     return module
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """Return the state of a run, which has weights at least."""
+    state = read_state(path)
+    weights_of(state, path)
+    return state
+
+
+def _check_run(
+    state: Mapping[str, Any], path: Path | None, trainer: pl.Trainer, module: TidyTraining, data: SceneData
+) -> None:
+    """Raise ``ValueError`` with the path unless a run can go on from a state."""
+    batches = len(data.train_dataloader()) // trainer.world_size  # not yet divided among processes
+    try:
+        check_stored_run(state, trainer, module, batches)
+    except ValueError as error:
+        raise ValueError(f"cannot resume from {path}: {error}") from None
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:

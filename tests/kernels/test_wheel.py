@@ -200,18 +200,39 @@ from kornia_tidy.kernels import build
 level = sys.argv[1]
 if level != "compiled":
     build.levels_here = lambda: [level]
-image, depth = dead_leaves(96, 96, depth_range=(0.3, 10.0), generator=torch.Generator().manual_seed(1))
+image, depth = dead_leaves(96, 96, num_leaves=300)
+masks = PixelwiseMask(2, generator=torch.Generator().manual_seed(2))
 captures = []
 for compositing in ("gather", "occlusion"):
     for dtype in build.REALS:
-        optics = TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(2)), compositing=compositing)
-        capture = optics.to(dtype)(image.to(dtype), depth.to(dtype))
-        capture.square().sum().backward()
-        captures += [capture.detach(), *(mask.grad for mask in optics.masks.parameters())]
+        optics = TiDyOptics(masks, compositing=compositing, sensor=None).to(dtype)
+        with torch.no_grad():
+            captures.append(optics(image.to(dtype), depth.to(dtype)))
+        optics(image.to(dtype), depth.to(dtype)).square().sum().backward()
+        captures += [mask.grad.clone() for mask in masks.parameters()]
+        masks.zero_grad()
 origins = {build.build(s, d).origin for s in build.KERNELS.glob("*.c") for d in build.REALS}
 torch.save(captures, sys.argv[2])
 print(json.dumps(sorted(origins)))
 """
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """The wheel that `make wheel` would leave in dist/."""
+    folder = tmp_path_factory.mktemp("wheel")
+    tools = os.path.dirname(sys.executable) + os.pathsep + os.environ["PATH"]
+    environment = {**os.environ, "PATH": tools, "KORNIA_TIDY_LIBRARIES": str(folder / "libraries")}
+
+    def run(name: str, *arguments: str | Path) -> None:
+        words = [sys.executable, "-m", name, *map(str, arguments)]
+        subprocess.run(words, check=True, env=environment, cwd=ROOT)
+
+    run("kornia_tidy.kernels.make_libraries", folder / "libraries")
+    run("build", "--wheel", "--no-isolation", "--outdir", folder / "built", ROOT)
+    run("auditwheel", "repair", "--wheel-dir", folder, *(folder / "built").glob("*.whl"))
+    (wheel,) = folder.glob("*.whl")
+    return wheel
 
 
 @pytest.mark.slow
@@ -219,23 +240,6 @@ print(json.dumps(sorted(origins)))
 @pytest.mark.skipif(not can_make, reason="needs Linux and what `make wheel` installs")
 class TestMake(CompiledTester):
     """`make wheel`: as the Makefile does it, without its environment."""
-
-    @pytest.fixture(scope="class")
-    def made(self, tmp_path_factory):
-        """The wheel that `make wheel` would leave in dist/."""
-        folder = tmp_path_factory.mktemp("wheel")
-        tools = os.path.dirname(sys.executable) + os.pathsep + os.environ["PATH"]
-        environment = {**os.environ, "PATH": tools, "KORNIA_TIDY_LIBRARIES": str(folder / "libraries")}
-
-        def run(name: str, *arguments: str | Path) -> None:
-            words = [sys.executable, "-m", name, *map(str, arguments)]
-            subprocess.run(words, check=True, env=environment, cwd=ROOT)
-
-        run("kornia_tidy.kernels.make_libraries", folder / "libraries")
-        run("build", "--wheel", "--no-isolation", "--outdir", folder / "built", ROOT)
-        run("auditwheel", "repair", "--wheel-dir", folder, *(folder / "built").glob("*.whl"))
-        (wheel,) = folder.glob("*.whl")
-        return wheel
 
     def test_feature_a_wheel_for_a_platform_and_any_python(self, made):
         assert re.fullmatch(r"kornia_tidy-[\d.]+-py3-none-manylinux.*_\d+_\d+_(x86_64|aarch64)\.whl", made.name)
@@ -256,7 +260,7 @@ class TestMake(CompiledTester):
             archive.extractall(tmp_path / "installed")
 
         def captures(name: str, root: Path, **changes: str) -> tuple[list[str], list[torch.Tensor]]:
-            environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "2", **changes}
+            environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1", **changes}
             command = [sys.executable, "-c", CAPTURES, name, str(tmp_path / f"{name}.pt")]
             done = subprocess.run(command, check=True, env=environment, cwd=tmp_path, capture_output=True, text=True)
             return json.loads(done.stdout), torch.load(tmp_path / f"{name}.pt")

@@ -1,8 +1,8 @@
 """The overlap backend: overlapping windows, transformed in C with the PSFs of the layers in their tiles.
 
 It does what the tiled backend does, overlap-save for gather and overlap-add for scatter, on processors with transforms
-of its own (``overlap.c``), see :mod:`kornia_tidy.kernels.build`. They take a
-third of the time of torch's, and labels, products and sums are made while a window is in the processor's cache.
+of its own (``overlap.c``), see :mod:`kornia_tidy.kernels.build`. They take a third of the time of torch's, and labels,
+products and sums are made while a window is in the processor's cache.
 """
 
 from __future__ import annotations
