@@ -165,6 +165,14 @@ def _compression(directory: Directory, bits: int, kind: int) -> int:
     compression, predictor = directory.number(COMPRESSION, 1), directory.number(PREDICTOR, 1)
     if compression not in UNFOLDS:
         raise ValueError(f"its compression is {compression} ({COMPRESSIONS.get(compression, 'unknown')}), not read")
+    if compression != 1:
+        import tifffile  # noqa: PLC0415 - needed for compressed TIFF only
+
+        try:
+            tifffile.TIFF.DECOMPRESSORS[compression]
+        except KeyError:
+            said = f"its compression is {compression}: that needs newer packages (pip install -U tifffile imagecodecs)"
+            raise ValueError(said) from None
     if (compression in CCITT and (bits, kind) != (1, 1)) or (compression == JPEG and (bits, kind) != (8, 1)):
         what = f"{bits}-bit {_FORMATS[kind]}"
         raise ValueError(f"its compression is {compression} with {what}: JPEG is read of 8 bits, CCITT of 1 bit")

@@ -217,7 +217,7 @@ class TestRefused(BaseTester):
             ({"fields": {262: (3, [6])}}, r"its pixels are YCbCr \(photometric interpretation 6\)"),
             ({"bits": 4, "format": 2}, r"its samples are 4-bit signed integers \(SampleFormat 2\), which are not read"),
             ({"bits": 16, "compression": 7}, "its compression is 7 with 16-bit unsigned integers"),
-            ({"fields": {254: (4, [1])}}, r"only a reduced-resolution preview \(NewSubfileType 1\) .* raw develop"),
+            ({"fields": {254: (4, [1])}}, r"only a reduced-resolution preview \(NewSubfileType 1\).* raw develop"),
             ({"fields": {254: (4, [4])}}, r"only a transparency mask \(NewSubfileType 4\)"),
         ],
     )

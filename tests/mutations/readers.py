@@ -67,7 +67,7 @@ SHARES = {
 }
 """Of slow readers fewer cases are tried than of the others, which count 1."""
 
-TIFFS = 300
+TIFFS = 150
 """Combinations of properties that are damaged."""
 
 CANDIDATE = Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3))
