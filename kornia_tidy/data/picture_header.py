@@ -14,6 +14,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 LARGEST = 1 << 28  # pixels
@@ -86,21 +87,39 @@ def _png(data: bytes) -> Size:
     return size
 
 
-def jpeg_size(data: bytes) -> Size:
-    """Return the size of a JPEG; raise ``ValueError`` unless an end marker follows the last start of a scan.
+class JpegFrame(NamedTuple):
+    """Header of a JPEG's frame."""
+
+    process: int
+    """0: baseline, 1: extended, 2: progressive, 3: lossless, and others; the number of the start of frame."""
+    bits: int
+    rows: int
+    columns: int
+    components: int
+
+
+def jpeg_frame(data: bytes) -> JpegFrame:
+    """Return the header of a JPEG's frame; raise ``ValueError`` unless an end marker follows the last start of a scan.
 
     Entropy-coded data cannot contain either marker.
     """
-    size, scan = None, None
-    for marker, place in _segments(data):
-        if marker in _STARTS_OF_FRAME and size is None:
-            rows, columns = struct.unpack_from(">HH", data, place + 5)
-            size = rows, columns
-        if marker == _START_OF_SCAN:
-            scan = place
-    if size is None or scan is None or data.rfind(b"\xff\xd9") < scan:
+    frame, scan = None, None
+    try:
+        for marker, place in _segments(data):
+            if marker in _STARTS_OF_FRAME and frame is None:
+                frame = JpegFrame(marker - min(_STARTS_OF_FRAME), *struct.unpack_from(">BHHB", data, place + 4))
+            if marker == _START_OF_SCAN:
+                scan = place
+    except struct.error:
+        scan = None
+    if frame is None or scan is None or data.rfind(b"\xff\xd9") < scan:
         raise ValueError("the file is cut short")
-    return size
+    return frame
+
+
+def _jpeg(data: bytes) -> Size:
+    frame = jpeg_frame(data)
+    return frame.rows, frame.columns
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int]]:
@@ -147,7 +166,7 @@ def _webp(data: bytes) -> Size:
 
 _READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], Size]], ...] = (
     ((PNG,), _png),
-    ((JPEG,), jpeg_size),
+    ((JPEG,), _jpeg),
     (tuple(b"P%d" % kind for kind in range(1, 7)), _netpbm),
     ((b"BM",), _bmp),
     ((b"RIFF",), _webp),
