@@ -39,7 +39,8 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
 
     Convention:
         Alpha is dropped. The orientation in EXIF is ignored: a depth map of the same camera has none, and calibrations
-        refer to the pixels of the sensor.
+        refer to the pixels of the sensor. A TIFF holds one picture, of 1 to 16 bits, and is read as
+        :func:`~kornia_tidy.data.tiff.decode_tiff` says.
 
     Example:
         >>> import tempfile
