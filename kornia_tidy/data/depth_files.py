@@ -76,6 +76,9 @@ def read_depth(
     Convention:
         - Always unknown: NaN, a stored integer 0 (as Kinect, KITTI and Middlebury mean it), depth of 0 or less, and
           disparity that is infinite or, with d added, negative.
+        - Unknown in a TIFF: pixels with GDAL's missing value, behind a mask, transparent, or left out of the file; see
+          :func:`~kornia_tidy.data.tiff.decode_tiff`. A factor that the file gives for its numbers is not applied. A
+          warning, once per folder, names it if ``scale`` is another.
         - Infinite depth is valid, such as a sky, and so is a floating-point disparity that is 0 with d added. List
           them in ``invalid`` for a data set that means *unknown* by them.
         - A warning, once per folder, names values that look like *unknown* and are not listed: 65535 far above all

@@ -46,6 +46,7 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     Convention:
         - Alpha is dropped. Integers are divided by the maximum that a PGM, PPM or PAM file gives, else by the largest
           of their bits.
+        - A TIFF holds one picture, of 1 to 16 bits, and is read as :func:`~kornia_tidy.data.tiff.decode_tiff` says.
         - The orientation is not applied: a depth map of the same camera has none, and calibrations refer to the pixels
           of the sensor. Depth that was estimated from the upright picture must be turned, as the warning says.
 

@@ -13,6 +13,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 LARGEST = 1 << 28  # pixels
@@ -29,7 +30,7 @@ OTHERS = (
 """Kinds of files that are not read: where they begin, with what, and their name."""
 
 _STARTS_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # tables, reserved, arithmetic conditioning
-_DECODED_FRAMES = {0xC0, 0xC1, 0xC2, 0xC9, 0xCA}  # baseline, extended and progressive, with either entropy coding
+_DECODED_PROCESSES = {0, 1, 2, 9, 10}  # baseline, extended and progressive, with either entropy coding
 _START_OF_SCAN, _END = 0xDA, 0xD9
 _ANIMATED = 0x02  # flag of an extended WebP
 _BYTES = {0xFF << shift for shift in range(0, 32, 8)}  # masks of a BMP
@@ -108,27 +109,46 @@ def _png(data: bytes) -> Size:
     return size or (0, 0)
 
 
-def jpeg_size(data: bytes) -> Size:
-    """Return the size of a JPEG; raise ``ValueError`` unless an end marker follows the last start of a scan.
+class JpegFrame(NamedTuple):
+    """Header of a JPEG's frame."""
+
+    process: int
+    """0: baseline, 1: extended, 2: progressive, 3: lossless, and others; the number of the start of frame."""
+    bits: int
+    rows: int
+    columns: int
+    components: int
+
+
+def jpeg_frame(data: bytes) -> JpegFrame:
+    """Return the header of a JPEG's frame; raise ``ValueError`` unless an end marker follows the last start of a scan.
 
     Entropy-coded data cannot contain either marker.
     """
-    size, scan = None, None
-    for marker, place in jpeg_segments(data):
-        if marker in _STARTS_OF_FRAME and size is None:
-            bits, rows, columns, components = struct.unpack_from(">BHHB", data, place + 4)
-            if marker not in _DECODED_FRAMES:
-                raise ValueError(f"it is a lossless or hierarchical JPEG (SOF{marker - 0xC0}), which is not read")
-            if bits != 8:
-                raise ValueError(f"it is a JPEG of {bits} bits a sample, and read are those of 8")
-            if components not in {1, 3}:
-                raise ValueError(f"it is a JPEG of {components} components, such as CMYK, and read are grey and colour")
-            size = rows, columns
-        if marker == _START_OF_SCAN:
-            scan = place
-    if size is None or scan is None or data.rfind(b"\xff\xd9") < scan:
+    frame, scan = None, None
+    try:
+        for marker, place in jpeg_segments(data):
+            if marker in _STARTS_OF_FRAME and frame is None:
+                frame = JpegFrame(marker - min(_STARTS_OF_FRAME), *struct.unpack_from(">BHHB", data, place + 4))
+            if marker == _START_OF_SCAN:
+                scan = place
+    except struct.error:
+        scan = None
+    if frame is None or scan is None or data.rfind(b"\xff\xd9") < scan:
         raise ValueError("the file is cut short")
-    return size
+    return frame
+
+
+def _jpeg(data: bytes) -> Size:
+    """Return the size of a JPEG; raise ``ValueError`` for the kinds that OpenCV does not decode, or changes."""
+    frame = jpeg_frame(data)
+    if frame.process not in _DECODED_PROCESSES:
+        raise ValueError(f"it is a lossless or hierarchical JPEG (SOF{frame.process}), which is not read")
+    if frame.bits != 8:
+        raise ValueError(f"it is a JPEG of {frame.bits} bits a sample, and read are those of 8")
+    if frame.components not in {1, 3}:
+        raise ValueError(f"it is a JPEG of {frame.components} components, such as CMYK, and read are grey and colour")
+    return frame.rows, frame.columns
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
@@ -182,7 +202,7 @@ def _webp(data: bytes) -> Size:
 
 _READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], Size]], ...] = (
     ((PNG,), _png),
-    ((JPEG,), jpeg_size),
+    ((JPEG,), _jpeg),
     ((b"BM",), _bmp),
     ((b"RIFF",), _webp),
 )

@@ -1,4 +1,4 @@
-"""TIFF files that hold one picture or map: its numbers, and what the file says of them.
+"""TIFF decoding: the numbers of the one picture or map in a file, and the meaning that the file gives them.
 
 OpenCV's reader is not used: it gives back freed memory for separate planes, turns the picture by its orientation,
 multiplies colours by alpha and packed values by powers of two, and takes a preview for the picture.
@@ -27,7 +27,7 @@ _REFUSED = {
     4: "a transparency mask", 5: "separated inks such as CMYK", 8: "CIE L*a*b*", 9: "ICC L*a*b*", 10: "ITU L*a*b*",
     32844: "LogL", 32845: "LogLuv", 51177: "a depth map of a DNG", 52527: "a photometric mask of a DNG",
 }  # fmt: skip
-_ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha by which colours are multiplied, and not
+_ASSOCIATED, _UNASSOCIATED = 1, 2  # kinds of alpha: colours are multiplied by the first
 _UNSIGNED, _SIGNED, _FLOAT = 1, 2, 3  # SampleFormat
 _SCALE = re.compile(rb'<Item [^<>]{0,200}role="(scale|offset)"[^<>]{0,200}>([^<>]{1,40})</Item>')
 _CALIBRATION = re.compile(rb"\n(cf|c\d)=([^\n]{1,40})")
@@ -40,16 +40,16 @@ def decode_tiff(
 
     Args:
         data: bytes of the file.
-        depth: whether depth is wanted and not a picture. Palettes and numbers of which 0 is white are then refused.
+        depth: whether depth is wanted and not a picture. Palettes and WhiteIsZero are refused then.
 
     Returns:
-        values: (H, W, C) as they are stored, rows and columns too, without alpha and other extra samples. Grey levels
-            of which 0 is white are inverted, palettes replaced by their colours, and JPEG's converted to RGB.
+        values: (H, W, C) in the stored rows and columns, without alpha and other extra samples. WhiteIsZero is
+            inverted, palette indices are replaced by colours, and JPEG's YCbCr is converted to RGB.
         white: the number that means 1 in a picture of integers.
         unknown: (H, W), True where the file says that nothing was measured: by GDAL's missing value, by a mask, by
             transparency or by a strip or tile that is left out. None if it says so nowhere.
         orientation: 1 to 8 as in EXIF.
-        scale: factor by which the numbers are to be multiplied, by GDAL's or ImageJ's metadata; usually 1.
+        scale: factor for the numbers in GDAL's or ImageJ's metadata; 1 if there is none.
 
     Raises:
         ValueError: if the file is damaged, of a kind that is not read, or holds several pictures or none.
@@ -90,7 +90,7 @@ def decode_tiff(
 
 
 def _photometric(directory: Directory, layout: Layout) -> int:
-    """Return what the numbers mean; raise ``ValueError`` for meanings that are not read."""
+    """Return the photometric interpretation; raise ``ValueError`` for those that are not read."""
     photometric = directory.number(PHOTOMETRIC, _RGB if layout.samples > 2 else _BLACK_IS_ZERO)
     if photometric not in _COLOURS:
         name = _REFUSED.get(photometric, "of an unknown meaning")
@@ -107,7 +107,7 @@ def _photometric(directory: Directory, layout: Layout) -> int:
 
 
 def _channels(directory: Directory, layout: Layout, photometric: int) -> tuple[int, int]:
-    """Return the number of samples of colours, and the kind of alpha behind them, 0 if there is none.
+    """Return the number of colour samples, and the kind of alpha behind them or 0.
 
     Three grey samples are R, G and B: GDAL calls them grey unless they are bytes.
     """
@@ -126,7 +126,7 @@ def _channels(directory: Directory, layout: Layout, photometric: int) -> tuple[i
 
 
 def _missing_value(directory: Directory, dtype: np.dtype[Any]) -> Any:
-    """Return GDAL's value of pixels that were not measured; None if there is none, or none of the data type."""
+    """Return GDAL's value for missing pixels; None without such a value, or where the data type cannot hold it."""
     if GDAL_NODATA not in directory:
         return None
     text = directory.text(GDAL_NODATA).decode("latin-1").strip()
@@ -146,7 +146,7 @@ def _scale(directory: Directory) -> float:
     """Return the factor that GDAL or ImageJ gives for the numbers, 1 if they give none.
 
     Raises:
-        ValueError: if the numbers are to be changed in another way too.
+        ValueError: if they give an offset or a curve too.
     """
     if directory.text(DESCRIPTION).startswith(b"ImageJ="):
         given, source = dict(_CALIBRATION.findall(directory.text(DESCRIPTION))), "calibration of ImageJ"

@@ -1,6 +1,6 @@
 """Directories of a TIFF: the fields of each, and which one describes the picture.
 
-They are read here and not by tifffile, which parses the metadata of many vendors on the way and trusts what it finds.
+tifffile does not read them: it parses the metadata of many vendors at the same time, without bounds.
 
 Source: TIFF 6.0, section 2; Adobe PageMaker 6.0 TIFF Technical Notes (subdirectories); the BigTIFF file format
 proposal; DNG 1.7 (NewSubfileType).

@@ -1,7 +1,7 @@
 """Decoding of the strips or tiles of a TIFF to one array.
 
-tifffile decodes each strip or tile. It is shown a directory made here of checked fields alone, so that none of its
-parsers of metadata runs, and nothing is allocated that the compressed bytes cannot fill.
+tifffile decodes each strip or tile. It sees a directory that is made here of checked fields, so that none of its
+parsers of metadata runs. Nothing is allocated that the compressed bytes cannot fill.
 
 Source: TIFF 6.0, sections 3, 8 to 11, 13 to 15 and 22; Adobe Photoshop TIFF Technical Notes (Deflate, predictor 3).
 """
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_tidy.data.picture_header import check_pixels, jpeg_size
+from kornia_tidy.data.picture_header import check_pixels, jpeg_frame
 from kornia_tidy.data.tiff_directories import COLUMNS, COMPRESSION, PHOTOMETRIC, ROWS, SAMPLES, Directory
 
 BITS, FILL_ORDER, STRIP_OFFSETS, ROWS_PER_STRIP, STRIP_BYTES, PLANES, T4_OPTIONS = 258, 266, 273, 278, 279, 284, 292
@@ -28,7 +28,7 @@ MOST_SEGMENTS = 1 << 18
 JPEG, CCITT = 7, (2, 3, 4)
 UNFOLDS = {1: 1, 2: 1 << 16, 3: 1 << 16, 4: 1 << 16, 5: 1 << 12, 7: 1 << 11, 8: 1 << 11, 32773: 64, 32946: 1 << 11,
            34925: 1 << 14, 50000: 1 << 16}  # fmt: skip
-"""Compressions that are read, and how many bytes at most come of one."""
+"""Compressions that are read, and the most bytes that one byte can unfold to."""
 COMPRESSIONS = {
     6: "old-style JPEG", 9: "JBIG", 10: "JBIG", 32766: "NeXT", 32771: "CCITT with words", 32809: "ThunderScan",
     32908: "PixarFilm", 32909: "PixarLog", 33003: "JPEG 2000", 33004: "JPEG 2000", 33005: "JPEG 2000",
@@ -36,6 +36,8 @@ COMPRESSIONS = {
     34887: "LERC", 34892: "lossy JPEG", 34926: "Zstandard, old number", 34927: "WebP, old number", 34933: "PNG",
     34934: "JPEG XR", 48124: "Jetraw", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL",
 }  # fmt: skip
+_RGB, _YCBCR = 2, 6  # photometric interpretations
+_JPEG_PROCESSES = (0, 1, 2)  # baseline, extended, progressive
 _PREDICTED = (5, 8, 32946, 34925, 50000)  # compressions that may come with a predictor
 _FORMATS = {1: "unsigned integers", 2: "signed integers", 3: "floating-point numbers", 4: "values of undefined meaning",
             5: "complex integers", 6: "complex numbers"}  # fmt: skip
@@ -132,14 +134,16 @@ def decode_segments(
         if not size and missing is not None:
             missing[area] = True
             continue
+        coded, title = data[offset : offset + size], f"{name} {number + 1} of {len(places)}"
+        rows = high if layout.compression != JPEG else _jpeg_rows(coded, high, layout, title)
         try:
-            segment = decode(data[offset : offset + size], high)
+            segment = decode(coded, rows)[:high]
             if segment.dtype != dtype:
                 raise ValueError(f"it holds {segment.dtype}")
         except MemoryError:
             raise
         except Exception as error:
-            raise ValueError(f"the file is damaged: {name} {number + 1} of {len(places)} ({error!s:.100})") from None
+            raise ValueError(f"the file is damaged: {title} ({error!s:.100})") from None
         if len(places) == 1:
             return segment[: layout.rows, : layout.columns], None
         if pixels is None:
@@ -165,6 +169,14 @@ def _compression(directory: Directory, bits: int, kind: int) -> int:
     compression, predictor = directory.number(COMPRESSION, 1), directory.number(PREDICTOR, 1)
     if compression not in UNFOLDS:
         raise ValueError(f"its compression is {compression} ({COMPRESSIONS.get(compression, 'unknown')}), not read")
+    if compression != 1:
+        import tifffile  # noqa: PLC0415 - needed for compressed TIFF only
+
+        try:
+            tifffile.TIFF.DECOMPRESSORS[compression]
+        except KeyError:
+            said = f"its compression is {compression}: that needs newer packages (pip install -U tifffile imagecodecs)"
+            raise ValueError(said) from None
     if (compression in CCITT and (bits, kind) != (1, 1)) or (compression == JPEG and (bits, kind) != (8, 1)):
         what = f"{bits}-bit {_FORMATS[kind]}"
         raise ValueError(f"its compression is {compression} with {what}: JPEG is read of 8 bits, CCITT of 1 bit")
@@ -238,31 +250,42 @@ def _decoder(directory: Directory, layout: Layout, data: bytes) -> Callable[[byt
         return decoded.view(np.uint8) if decoded.dtype == bool else decoded
 
     def decode(segment: bytes, rows: int) -> NDArray[Any]:
-        if layout.compression == JPEG:
-            try:
-                size = jpeg_size(segment)
-            except (IndexError, struct.error):
-                raise ValueError("its JPEG is cut short") from None
-            if size not in {(rows, layout.segment[1]), layout.segment}:
-                raise ValueError(f"its JPEG has {size[0]} x {size[1]} pixels")
-            return decode_rows(segment, size[0])[:rows]
         try:
             return decode_rows(segment, rows)
         except Exception:
             if rows == layout.segment[0]:
                 raise
-            return decode_rows(segment, layout.segment[0])[:rows]  # some programs fill up the last strip
+            return decode_rows(segment, layout.segment[0])  # some programs fill up the last strip
 
     return decode
 
 
+def _jpeg_rows(coded: bytes, high: int, layout: Layout, title: str) -> int:
+    """Return the rows of a JPEG that is a strip or tile: as many as the strip shows, or as others have.
+
+    Raises:
+        ValueError: if it is of another size or kind.
+    """
+    try:
+        frame = jpeg_frame(coded)
+    except ValueError:
+        raise ValueError(f"the file is cut short or damaged: {title} is no whole JPEG") from None
+    if frame.process not in _JPEG_PROCESSES or frame.bits != layout.bits:
+        raise ValueError(f"its JPEG is of process {frame.process} and {frame.bits} bits: 0, 1 or 2 and 8 bits are read")
+    if frame.columns != layout.segment[1] or frame.rows not in {high, layout.segment[0]}:
+        raise ValueError(f"the file is damaged: {title} is a JPEG of {frame.rows} x {frame.columns} pixels")
+    return frame.rows
+
+
 def _tifffile_decoder(directory: Directory, layout: Layout, rows: int, first: bytes) -> Callable[..., Any]:
-    """Return tifffile's decoder of a strip or tile, from a directory with its fields alone."""
+    """Return tifffile's decoder of strips or tiles with some rows."""
     import tifffile  # noqa: PLC0415 - needed for TIFF only
 
     samples = layout.samples if layout.planes == 1 else 1
-    photometric = directory.number(PHOTOMETRIC, 1)  # tells JPEG whether there are colours to convert
-    head = first[:16]  # tells whether it is JFIF
+    # JPEG's colours are converted if they are called YCbCr, or called RGB with a JFIF header, which says otherwise.
+    given = directory.number(PHOTOMETRIC, _RGB)
+    photometric = given if given == _YCBCR else _RGB
+    head = first[:16] if given == _RGB else b""
     fields = {
         COLUMNS: [layout.segment[1]], ROWS: [rows], BITS: [layout.bits] * samples, COMPRESSION: [layout.compression],
         PHOTOMETRIC: [photometric if layout.compression == JPEG and samples == 3 else 1],

@@ -10,6 +10,7 @@ import warnings
 from collections import Counter
 
 import cv2
+import imagecodecs
 import numpy as np
 import pytest
 from PIL import Image
@@ -44,6 +45,12 @@ def by_opencv(data: bytes) -> np.ndarray:
 
 def jpeg(picture: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", picture)[1].tobytes()
+
+
+def unconverted_jpeg(picture: np.ndarray) -> bytes:
+    space = {1: "grayscale", 3: "rgb", 4: "cmyk"}.get(picture.shape[2], "unknown")
+    picture = picture[..., 0] if picture.shape[2] == 1 else picture
+    return imagecodecs.jpeg8_encode(picture, level=95, colorspace=space, outcolorspace=space, subsampling="444")
 
 
 def walked(count: int, seed: int, folder) -> Counter[str]:
@@ -107,6 +114,25 @@ class TestReadsWhatIsStored(BaseTester):
             pytest.skip(f"this tiffcp does not write {options}")
         data = (tmp_path / "b.tif").read_bytes()
         assert np.array_equal(decoded(data).values, by_opencv(data) if "jpeg" in options else RGB)
+
+    @pytest.mark.parametrize("picture", [RGB, GREY, np.concatenate([RGB, GREY], 2), np.concatenate([GREY, GREY], 2)])
+    @pytest.mark.parametrize("layout", [{}, {"rows_per_strip": 16}, {"tile": (16, 32)}])
+    def test_feature_jpeg_of_rgb_grey_and_alpha(self, picture, layout):
+        """Without conversion of colours, as GDAL writes it, and whether they are called RGB or grey."""
+        size = layout.get("tile", (layout.get("rows_per_strip", 40), 60))
+        shape = (*RGB.shape[:2], picture.shape[2])
+        places = [(y, x) for y in range(0, 40, size[0]) for x in range(0, 60, size[1])]
+        parts = [picture[y : y + size[0], x : x + size[1]] for y, x in places]
+        if "tile" in layout:
+            parts = [np.pad(p, ((0, size[0] - p.shape[0]), (0, size[1] - p.shape[1]), (0, 0)), "edge") for p in parts]
+        coded = [unconverted_jpeg(np.ascontiguousarray(part)) for part in parts]
+        extra = {} if picture.shape[2] % 2 else {"extra": (2,)}
+        for photometric in (1, 2) if shape[2] == 3 else (2 if shape[2] == 4 else 1,):
+            data = tiff(Page(picture, photometric=photometric, compression=7, segments=coded, **layout, **extra))
+            values = decoded(data).values
+            assert np.abs(values.astype(int) - picture[..., : values.shape[2]]).max() < 25
+            if (shape[2], photometric) in {(1, 1), (3, 2)}:
+                assert np.array_equal(values, by_opencv(data))
 
     def test_feature_lzw_of_before_1992(self):
         """With the bits of codes the other way round."""
@@ -217,7 +243,7 @@ class TestRefused(BaseTester):
             ({"fields": {262: (3, [6])}}, r"its pixels are YCbCr \(photometric interpretation 6\)"),
             ({"bits": 4, "format": 2}, r"its samples are 4-bit signed integers \(SampleFormat 2\), which are not read"),
             ({"bits": 16, "compression": 7}, "its compression is 7 with 16-bit unsigned integers"),
-            ({"fields": {254: (4, [1])}}, r"only a reduced-resolution preview \(NewSubfileType 1\) .* raw develop"),
+            ({"fields": {254: (4, [1])}}, r"only a reduced-resolution preview \(NewSubfileType 1\).* raw develop"),
             ({"fields": {254: (4, [4])}}, r"only a transparency mask \(NewSubfileType 4\)"),
         ],
     )
@@ -245,8 +271,8 @@ class TestRefused(BaseTester):
             ({"fields": {277: (3, [1])}}, "damaged: it is RGB with 1 samples a pixel"),
             ({"compression": 8, "segments": [b"\x78\x9c" + bytes(500)]}, r"damaged: strip 1 of 1 \("),
             ({"compression": 5, "segments": [lzw(bytes(99)) + bytes(60)]}, r"damaged: strip 1 of 1 \("),
-            ({"compression": 7, "segments": [jpeg(RGB[:32])]}, "its JPEG has 32 x 60 pixels"),
-            ({"compression": 7, "segments": [jpeg(RGB)[:-40]]}, "is cut short"),
+            ({"compression": 7, "segments": [jpeg(RGB[:32])]}, "damaged: strip 1 of 1 is a JPEG of 32 x 60 pixels"),
+            ({"compression": 7, "segments": [jpeg(RGB)[:-40]]}, "cut short or damaged: strip 1 of 1 is no whole"),
             ({"rows_per_strip": 20, "fields": {273: (4, [8, 8]), 279: (4, [5000] * 2)}, "compression": 8,
               "segments": [bytes(4000)] * 2},
              "damaged: its strips lie over each other"),

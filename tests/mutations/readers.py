@@ -67,7 +67,7 @@ SHARES = {
 }
 """Of slow readers fewer cases are tried than of the others, which count 1."""
 
-TIFFS = 300
+TIFFS = 150
 """Combinations of properties that are damaged."""
 
 KINDS = {"png", "tiff", "jpeg", "pfm", "npy", "npz", "ppm", "pam", "bmp", "webp", "hdf5", "exr"}
