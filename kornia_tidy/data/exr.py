@@ -63,10 +63,9 @@ class _Header(NamedTuple):
 def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     """Decode the depth in an OpenEXR file. It needs ``pip install 'kornia-tidy[exr]'``.
 
-    Depth is the only channel of the file; else the only one that is named for it: ``Z``, ``V`` or ``depth`` in any
-    layer, or a grey layer with *depth* in its name; else the red of a picture whose red, green and blue are equal.
-    Blender's layers of mist and of denoising data, and coordinates of vectors (``X``, ``Y``, ``Z``; ``U``, ``V``), are
-    not.
+    A single channel is depth. Of several, depth is the one that is named ``Z``, ``V`` or ``depth`` in any layer, or a
+    grey layer with *depth* in its name. Coordinates of vectors (``X``, ``Y``, ``Z``; ``U``, ``V``) and Blender's mist
+    and denoising data do not count. Without such a name, depth is red if red, green and blue are equal.
 
     Args:
         data: bytes of the file.

@@ -82,7 +82,7 @@ def _header(data: bytes) -> tuple[Shape, int, int, int]:
 
 
 def _pam_header(data: bytes) -> tuple[Shape, int, int, int]:
-    """Return the same as :func:`_header` of a PAM file, whose header is lines of a name and a value."""
+    """Return shape, maximum, grey or colour channels and the offset behind the header of a PAM file."""
     found: dict[bytes, int] = {}
     kinds = []
     name, end = b"", data.find(b"\n")

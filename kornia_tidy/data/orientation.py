@@ -1,7 +1,7 @@
-"""Orientation of photographs: how viewers turn them for display, told because pictures are read as they are stored.
+"""Orientation of photographs in EXIF and XMP, and the warning that it is not applied.
 
-Tools that estimate depth from a photograph usually turn it upright before. Their depth does not fit the stored pixels,
-and where the sides are as long as before nothing else shows it.
+Programs that estimate depth from a photograph usually rotate it upright before. Their depth does not fit the stored
+pixels. Where both have the same size, only the orientation shows it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ STORED = {
 
 _TAG = 0x0112
 _APP1, _START_OF_SCAN = 0xE1, 0xDA
-_EXIF, _XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
+_EXIF, _XMP = b"Exif\0\0", b"ns.adobe.com/xap/1.0/\0"
 _XMP_TURN = re.compile(rb"""tiff:Orientation(?:\s*=\s*["']|>)\s*([1-8])\s*[<"']""")
 _LONGEST = 1 << 20  # bytes of a compressed text that are unfolded
 
@@ -57,7 +57,7 @@ def orientation_of(data: bytes) -> int:
 def tell_orientation(
     path: str | os.PathLike[str], orientation: int, size: tuple[int, ...], of: Literal["picture", "depth"]
 ) -> None:
-    """Warn that a file is read as it is stored, if viewers turn it: once for each folder, size and orientation.
+    """Warn, once for each folder, format, size and orientation, that the orientation of a file is not applied.
 
     Args:
         path: the file.
@@ -75,7 +75,7 @@ def tell_orientation(
 
 
 def told(path: str | os.PathLike[str], orientation: int, of: Literal["picture", "depth"] = "picture") -> str:
-    """Return the sentence about a file that viewers turn.
+    """Return the warning about a file whose orientation is not 1.
 
     Example:
         >>> told("lamp.jpg", 3)
@@ -117,7 +117,7 @@ def _jpeg(data: bytes) -> Iterator[bytes]:
         if marker == _START_OF_SCAN:
             return
         block = data[place + 4 : place + 2 + int.from_bytes(data[place + 2 : place + 4], "big")]
-        if marker == _APP1 and block.startswith((_EXIF, _XMP)):
+        if marker == _APP1 and (block.startswith(_EXIF) or _XMP in block[:40]):
             yield block
 
 
