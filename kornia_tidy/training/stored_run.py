@@ -71,6 +71,8 @@ def _check_schedule(state: Mapping[str, Any], adam: torch.optim.Optimizer, modul
     for schedule, stored in zip(schedules, state[place], strict=True):
         own = {"last_epoch": done, "_step_count": done + 1, "base_lrs": schedule.base_lrs}
         _check_same(stored, own, f"{place}/0")
+        for group, rate in zip(adam.param_groups, stored["_last_lr"], strict=True):
+            group["lr"] = rate  # of the next step
 
 
 def _check_optimiser(state: Mapping[str, Any], adam: torch.optim.Optimizer) -> None:
@@ -83,9 +85,7 @@ def _check_optimiser(state: Mapping[str, Any], adam: torch.optim.Optimizer) -> N
         where = f"{place}/0/param_groups/{number}"
         if group["params"] != like["param_groups"][number]["params"]:
             raise ValueError(f"{where}/params are not the numbers of this run's weights")
-        numbers = {name: own for name, own in like["param_groups"][number].items() if isinstance(own, (float, tuple))}
-        if "initial_lr" in numbers:
-            del numbers["lr"]  # changes by a schedule
+        numbers = {name: own for name, own in like["param_groups"][number].items() if type(own) in (int, float, tuple)}
         _check_same(group, numbers, where)
     _check_kind(moments, {}, f"{place}/0/state")
     stepped = state.get(STEPPED, max(1, len(moments)))  # runs of earlier versions do not tell
@@ -113,6 +113,7 @@ def _check_loops(state: Mapping[str, Any], trainer: pl.Trainer, batches: int) ->
         ("global_step", state["global_step"], (steps,)),
         ("epoch", state["epoch"], (epochs["processed"], epochs["processed"] - 1)),
         (f"{place}/state_dict/combined_loader/0/batches", loader["batches"], (done["current"]["ready"],)),
+        (f"{place}/epoch_loop.batch_progress/current/processed", done["current"]["processed"], (loader["batches"],)),
         (f"{place}/state_dict/combined_loader/0/epoch", loader["epoch"], (epochs["ready"] - 1,)),
     ):
         if value not in same:
@@ -131,8 +132,11 @@ def _check_counts(stored: Any, place: str) -> None:
         return
     if "ready" in stored:
         counts = [stored[name] for name in COUNTED if name in stored]
-        if any(later > earlier for earlier, later in pairwise(counts)):
-            raise ValueError(f"{place} must not count more of a later stage than of an earlier one, got {dict(stored)}")
+        one = int("processed" in stored)  # saved while a batch or an epoch is not completed yet
+        if any(later > earlier for earlier, later in pairwise(counts)) or counts[0] - counts[-1] > one:
+            raise ValueError(f"{place} must be equal counts, or one more that are not completed, got {counts}")
+        if stored["ready"] != stored.get("started", stored["ready"]):
+            raise ValueError(f"{place} must have started what is ready, got {counts}")
     for name, inner in stored.items():
         _check_counts(inner, f"{place}/{name}")
     if "total" in stored and any(stored["current"][name] > stored["total"][name] for name in stored["total"]):
