@@ -26,7 +26,7 @@ from kornia_tidy.training.scenes import augmented
 from tests.base import BaseTester
 from tests.masks.registry import ONE_MASK, TWO_MASKS
 
-KINDS = [torch.float64, torch.float16, torch.bfloat16]
+HALVES = [pytest.param(kind, marks=pytest.mark.takes_seconds) for kind in (torch.float16, torch.bfloat16)]
 SINGLE = torch.float32
 LENS: dict[str, Any] = {"focal_length": 10e-3, "pixel_pitch": 4e-6}
 
@@ -113,7 +113,7 @@ def under(kind: torch.dtype, draw: Callable[[], Any]) -> list[Tensor]:
 
 
 class TestDefaultDtype(BaseTester):
-    @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: str(kind).removeprefix("torch."))
+    @pytest.mark.parametrize("kind", [torch.float64, *HALVES], ids=lambda kind: str(kind).removeprefix("torch."))
     @pytest.mark.parametrize("name", DRAWS)
     def test_feature_a_seed_draws_the_same(self, name, kind):
         expected, found = tensors(DRAWS[name]()), under(kind, DRAWS[name])

@@ -70,6 +70,7 @@ class TestMetaDevice(BaseTester):
         shape_or_sentence(lambda: call(given.to("meta")))
         shape_or_sentence(lambda: under_meta(lambda: call(given)))
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("name", HEADS)
     def test_exception_of_a_head_or_loss(self, name):
         call, given = HEADS[name](), torch.rand(2, 3, 16, 16)
