@@ -11,7 +11,7 @@ import traceback
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import TextIO
+from typing import Any, TextIO
 
 import torch
 
@@ -154,9 +154,17 @@ def _is_out_of_memory(error: Exception) -> bool:
     return (isinstance(error, RuntimeError) and "allocate memory" in text) or "Insufficient memory" in text
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose help does not vanish without a word where nothing can be written."""
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        if message:
+            (file or sys.stderr).write(message)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command and all its subcommands."""
-    parser = argparse.ArgumentParser(prog="kornia-tidy", description=DESCRIPTION)
+    parser = _Parser(prog="kornia-tidy", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"kornia-tidy {kornia_tidy.__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     for command in COMMANDS:

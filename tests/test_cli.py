@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -112,19 +113,20 @@ class TestMain(BaseTester):
 
     @FULL
     @pytest.mark.parametrize("argv", [SHOW, ("--help",)], ids=["report", "help"])
-    def test_exception_a_full_disk_under_the_output(self, argv, tmp_path, capfd):
-        assert self.printing_to(os.open("/dev/full", os.O_WRONLY), tmp_path, argv) == 2
+    @pytest.mark.parametrize("unbuffered", [False, True])
+    def test_exception_a_full_disk_under_the_output(self, argv, unbuffered, tmp_path, capfd):
+        assert self.printing_to(os.open("/dev/full", os.O_WRONLY), tmp_path, argv, unbuffered) == 2
         assert capfd.readouterr().err == "kornia-tidy: error: [Errno 28] No space left on device\n"
 
     @staticmethod
-    def printing_to(file, folder, argv=SHOW):
+    def printing_to(file, folder, argv=SHOW, unbuffered=False):
         """Return the exit status of a command that prints to a file of the system."""
         np.save(folder / "heights.npy", np.zeros((1, 3, 3)))
         status = folder / "status"
 
         def child():
             os.chdir(folder)
-            sys.stdout = os.fdopen(file, "w")
+            sys.stdout = io.TextIOWrapper(os.fdopen(file, "wb", 0), write_through=unbuffered)
             status.write_text(str(cli.main(argv)))
 
         assert wait(fork(child)) == 0

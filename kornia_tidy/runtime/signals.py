@@ -37,6 +37,8 @@ def is_command() -> bool:
         >>> is_command()
         False
     """
+    if "--multiprocessing-fork" in sys.orig_argv:  # a worker, which has the arguments of its parent
+        return False
     name = sys.argv[0] if getattr(sys, "argv", None) else ""
     if name == "-m":  # while Python looks for the module
         return any(argument.removeprefix("-m") == "kornia_tidy" for argument in sys.orig_argv)

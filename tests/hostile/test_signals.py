@@ -23,6 +23,7 @@ import torch
 
 from kornia_tidy import cli
 from kornia_tidy.files import replacing
+from kornia_tidy.runtime.signals import is_command
 from tests.base import BaseTester
 from tests.coded_datasets.samples import contents
 from tests.forks import fork, wait
@@ -191,6 +192,25 @@ class TestStart(BaseTester):
         (tmp_path / "mine.py").write_text("import kornia_tidy")
         self.write_torch(tmp_path, signal.SIGINT)
         assert self.run(["mine.py"], tmp_path)[0] == 8
+
+    @pytest.mark.parametrize(
+        ("name", "original", "expected"),
+        [
+            ("/usr/bin/kornia-tidy", ["python", "/usr/bin/kornia-tidy", "info"], True),
+            ("C:/Scripts/kornia-tidy.exe", ["python", "C:/Scripts/kornia-tidy.exe"], True),
+            ("-m", ["python", "-m", "kornia_tidy", "info"], True),
+            ("-m", ["python", "-mkornia_tidy"], True),
+            ("-m", ["python", "-m", "mine", "kornia-tidy"], False),
+            ("-c", ["python", "-c", "import kornia_tidy"], False),
+            ("", ["python"], False),
+            ("kornia_tidy_plots.py", ["python", "kornia_tidy_plots.py"], False),
+            ("/usr/bin/kornia-tidy", ["python", "-c", "spawn_main()", "--multiprocessing-fork"], False),
+        ],
+    )
+    def test_convention_which_processes_are_the_command(self, name, original, expected, monkeypatch):
+        monkeypatch.setattr(sys, "argv", [name])
+        monkeypatch.setattr(sys, "orig_argv", original)
+        assert is_command() == expected
 
     def started(self, how, folder, number, *, ignored):
         """Return exit status and standard error of the command, whose import of torch sends a signal."""
