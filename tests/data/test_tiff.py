@@ -160,6 +160,12 @@ class TestReadsWhatIsStored(BaseTester):
         assert np.array_equal(found.values, RGB)
         assert found.orientation == (orientation if 1 <= orientation <= 8 else 1)
 
+    def test_feature_a_turned_picture_is_told(self, tmp_path):
+        (tmp_path / "a.tif").write_bytes(tiff(Page(RGB, photometric=2, fields={274: (3, [3])})))
+        with pytest.warns(UserWarning, match=r"a.tif is stored rotated by 180 degrees \(orientation 3\)"):
+            image = read_image(tmp_path / "a.tif")
+        assert np.array_equal((image * 255).round().byte().numpy().transpose(1, 2, 0), RGB)
+
     def test_feature_metadata_of_microscopes_are_not_looked_at(self, capfd):
         """LSM, NDPI, ImageJ, STK of one plane, OME with another file, ScanImage, Philips, SIS: tifffile parses them."""
         texts = (
