@@ -30,6 +30,8 @@ from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tensor_files import read_tensors
 
+MOST_PSFS = 1 << 27  # bytes; a small file could name a window that takes gigabytes
+
 
 class TrainedSystem(NamedTuple):
     """A camera and the network that reads its captures."""
@@ -199,6 +201,12 @@ def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) 
             raise ValueError(f"{told} {len(masks)} masks, and its settings tell of {settings.masks}")
         if (side := masks.shape[-1]) != settings.mask_size:
             raise ValueError(f"{told} masks of {side} pixels along a side, its settings tell of {settings.mask_size}")
+    depths = max(NODES, settings.refocus)
+    if (size := 12 * (settings.window or 0) ** 2 * depths) > MOST_PSFS:  # three colours in float32
+        raise ValueError(
+            f"cannot read {name}: PSFs of window {settings.window} at {depths} depths must take at most "
+            f"{MOST_PSFS >> 20} MiB, got {size >> 20}"
+        )
     try:
         with torch.device("meta"):  # shapes without memory
             head = build_head(settings)

@@ -45,7 +45,7 @@ class PSFBank:
 
     def __post_init__(self) -> None:
         shape = tuple(self.psfs.shape)
-        if len(shape) != 4 or shape[2] != shape[3] or shape[2] % 2 == 0:
+        if len(shape) != 4 or shape[2] != shape[3] or shape[2] % 2 == 0 or 0 in shape:
             raise ValueError(f"psfs must have shape (D, C, P, P) with P odd, got {shape}")
         if tuple(self.defocus.shape) != shape[:1]:
             raise ValueError(f"defocus must have shape ({shape[0]},) as psfs have, got {tuple(self.defocus.shape)}")

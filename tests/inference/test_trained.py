@@ -56,6 +56,7 @@ class TestLoadTrained(BaseTester):
             ({"depth_range": [1]}, "depth_range must be two numbers"),
             ({"depth_range": [1, None]}, "depth_range must be two numbers"),
             ({"window": "9"}, "window must be a whole number"),
+            ({"window": 4001}, "PSFs of window 4001 at [0-9]+ depths must take at most 128 MiB, got [0-9]+"),
             ({"residual": 1}, "residual must be true or false"),
             ({"depth_classes": 1, "refocus": 2}, "a distribution of depth needs depth_classes of at least 2, got 1"),
             ({"depth_classes": 8, "refocus": 1}, "a distribution of depth needs refocus of at least 2, got 1"),

@@ -74,6 +74,7 @@ class TestPSFBank(BaseTester):
         [
             (torch.ones(2, 3, 4, 4), torch.zeros(2), "P odd"),
             (torch.ones(2, 3, 5), torch.zeros(2), "P odd"),
+            (torch.ones(0, 3, 5, 5), torch.zeros(0), "P odd"),
             (torch.ones(2, 3, 5, 5), torch.zeros(3), "defocus must have shape"),
         ],
     )
