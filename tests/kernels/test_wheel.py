@@ -268,7 +268,7 @@ class TestMake(CompiledTester):
         (origin,), expected = captures("compiled", ROOT)
         assert origin.startswith("compiled for this processor by ")
         for level in levels_here():
-            cache = tmp_path / "cache"
+            cache = tmp_path / "empty"
             origins, got = captures(level, tmp_path / "installed", PATH="", XDG_CACHE_HOME=str(cache))
             assert origins == [f"from the wheel, for {level}"]
             assert not list(cache.rglob("*.so"))
