@@ -18,7 +18,7 @@ import kornia_tidy
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.tune import in_words
 from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops
-from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler
+from kornia_tidy.kernels.build import REALS, Compiler, build, cache_folder, find_compiler, vector_bytes
 from kornia_tidy.render.cost_store import read_profile
 
 DESCRIPTION = """\
@@ -70,7 +70,8 @@ def lines() -> Iterator[tuple[str, str]]:
             yield "kernel", f"{name}: not there: {built.remark}"
         else:
             threads = "" if built.threads else f", in one thread: {built.remark}"
-            yield "kernel", f"{name}: {built.path.name}, {built.path.stat().st_size >> 10} KiB{threads}"
+            size, width = built.path.stat().st_size >> 10, vector_bytes(built.library)
+            yield "kernel", f"{name}: {built.path.name}, {size} KiB, vectors of {width} bytes{threads}"
     yield "costs", _costs()
     yield "cache", _cache()
 

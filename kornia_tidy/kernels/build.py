@@ -15,6 +15,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
@@ -87,8 +88,8 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
     """Return a C source as a library in which ``REAL`` is the given type, or None where it cannot be had.
 
     The library is kept under ``$XDG_CACHE_HOME/kornia_tidy`` (``~/.cache/kornia_tidy``, or a private temporary folder
-    where that cannot be written to), named after all that it depends on: source, compiler with its version, flags and
-    processor. ``$CC`` chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``).
+    where that cannot be written to), named after all that it depends on: source, width of the vectors in bytes, compiler
+    with its version, flags and processor. ``$CC`` chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``).
 
     Args:
         source: a file of C.
@@ -124,6 +125,11 @@ def load(source: Path, dtype: torch.dtype) -> ctypes.CDLL:
     return library
 
 
+def vector_bytes(library: ctypes.CDLL) -> int:
+    """Return the width in bytes of the vectors that a library of this package computes with, see ``vectors.h``."""
+    return ctypes.c_int64.in_dll(library, "vector_bytes").value
+
+
 @cache
 def build(source: Path, dtype: torch.dtype) -> Build:
     """Build a C source and report the library's path or the reason for its absence, without a warning."""
@@ -141,7 +147,7 @@ def _build(source: Path, dtype: torch.dtype, compiler: Compiler, folder: Path) -
     remark = ""
     for extra in ((THREADS,), ()):
         flags = (*FLAGS, NATIVE.get(platform.machine(), "-mcpu=native"), *extra, f"-DREAL={REALS[dtype]}")
-        name = f"{source.stem}-{_digest(source, compiler, flags)}"
+        name = f"{source.stem}-{target_vector_bytes(compiler)}-{_digest(source, compiler, flags)}"
         path = _find(folder, name)
         if path is None:
             if extra and (why := _no_threads(compiler)):
@@ -175,6 +181,18 @@ def find_compiler() -> Compiler:
     program, options = tuple(words[:first_option]), tuple(words[first_option:])
     version = _run([*program, "--version"]).strip().splitlines()
     return Compiler(program, options, version[0] if version else "a compiler that tells no version")
+
+
+@cache
+def target_vector_bytes(compiler: Compiler) -> int:
+    """Return the width in bytes of the vectors that ``vectors.h`` makes of a compiler's target; 0 if it is not told.
+
+    The compiler is asked, as wrappers, environment and configuration files change what it targets, not options alone.
+    """
+    native = NATIVE.get(platform.machine(), "-mcpu=native")
+    macros = _run([*compiler.program, *FLAGS, native, *compiler.options, "-E", "-dM", str(SHARED)])
+    found = re.search(r"^#define VECTOR_BYTES (\d+)$", macros, re.MULTILINE)
+    return int(found[1]) if found else 0
 
 
 def _words(command: str) -> list[str]:

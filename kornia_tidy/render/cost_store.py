@@ -19,7 +19,15 @@ from typing import Any
 
 import torch
 
-from kornia_tidy.kernels.build import KERNELS, NotBuiltError, cache_folder, find_compiler, is_ours, processor_features
+from kornia_tidy.kernels.build import (
+    KERNELS,
+    NotBuiltError,
+    cache_folder,
+    find_compiler,
+    is_ours,
+    processor_features,
+    target_vector_bytes,
+)
 from kornia_tidy.render.cost_profile import EPYC, RATES, XEON, CostProfile
 from kornia_tidy.render.repeatable import of_thread
 from kornia_tidy.runtime.threads import SharedLock
@@ -116,13 +124,13 @@ def forget_in_process() -> None:
 def profile_path(threads: int) -> Path:
     """Return the file of a number of threads, named after all that times depend on.
 
-    That is the processor, the threads, torch, the C compiler and the C sources, and the terms of the profile.
+    That is the processor, the threads, torch, the C compiler with its vectors and the C sources, and the terms of the profile.
 
     Raises:
         OSError: if there is no folder that can be used.
     """
     try:
-        compiler = find_compiler().version
+        compiler = f"{find_compiler().version}, vectors of {target_vector_bytes(find_compiler())} bytes"
     except NotBuiltError:
         compiler = "no compiler"
     terms = [f"{name}: {', '.join(kind.__dataclass_fields__)}" for name, kind in RATES.items()]
