@@ -20,6 +20,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.kernels.widths import AVX2, AVX512, V2
+
 ROOT = Path(__file__).resolve().parents[1]
 
 KERNELS = (
@@ -67,11 +69,6 @@ NUMBERS = (
     "tests/training/test_parts.py",
     "tests/inference/test_pretrained.py",
 )
-
-# What /proc/cpuinfo calls what code for these processors uses.
-AVX2 = frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"})
-AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512dq", "avx512vl"}
-V2 = frozenset({"sse4_2", "ssse3", "popcnt", "cx16"})
 
 # Prints, in the environment of a factor, the vector width, compiler and threads in use.
 PROBE = """

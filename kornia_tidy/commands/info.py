@@ -19,7 +19,7 @@ import kornia_tidy
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.tune import in_words
 from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops
-from kornia_tidy.kernels.build import REALS, build, cache_folder
+from kornia_tidy.kernels.build import REALS, build, cache_folder, vector_bytes
 from kornia_tidy.kernels.compiler import Compiler, find_compiler
 from kornia_tidy.render.cost_store import read_profile
 
@@ -69,12 +69,13 @@ def lines() -> Iterator[tuple[str, str]]:
     for source, dtype in product(SOURCES, REALS):
         name = f"{source.name}, {str(dtype).removeprefix('torch.')}"
         built = build(source, dtype)
-        if built.path is None:
+        if built.path is None or built.library is None:
             yield "kernel", f"{name}: not there: {built.remark}"
         else:
             threads = "" if built.threads else ", in one thread"
             remark = f": {built.remark}" if built.remark else ""
-            yield "kernel", f"{name}: {built.origin}{threads}, {built.path.name}{remark}"
+            width = f"vectors of {vector_bytes(built.library)} bytes"
+            yield "kernel", f"{name}: {built.origin}{threads}, {width}, {built.path.name}{remark}"
     yield "costs", _costs()
     yield "cache", _cache()
 

@@ -17,6 +17,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import re
 import stat
 import tempfile
 import warnings
@@ -79,8 +80,9 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
 
     A library of the wheel is taken if there is one for this processor. Else the source is compiled, and kept under
     ``$XDG_CACHE_HOME/kornia_tidy`` (``~/.cache/kornia_tidy``, or a private temporary folder where that cannot be
-    written to), named after all that it depends on: source, compiler with its version, flags and processor. ``$CC``
-    chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``), and is preferred to the wheel.
+    written to), named after all that it depends on: source, width of the vectors in bytes, compiler with its version,
+    flags and processor. ``$CC`` chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``),
+    and is preferred to the wheel.
 
     Args:
         source: a file of C.
@@ -116,6 +118,11 @@ def load(source: Path, dtype: torch.dtype) -> ctypes.CDLL:
     return library
 
 
+def vector_bytes(library: ctypes.CDLL) -> int:
+    """Return the width in bytes of the vectors that a library of this package computes with, see ``vectors.h``."""
+    return ctypes.c_int64.in_dll(library, "vector_bytes").value
+
+
 @cache
 def build(source: Path, dtype: torch.dtype) -> Build:
     """Load or build a C source and report the library's path or the reason for its absence, without a warning."""
@@ -141,7 +148,8 @@ def maker() -> str:
     if level and not named_compiler():
         return level
     try:
-        return find_compiler().version
+        compiler = find_compiler()
+        return f"{compiler.version}, vectors of {target_vector_bytes(compiler)} bytes"
     except NotBuiltError:
         return level or "no compiler"
 
@@ -193,7 +201,7 @@ def _from_compiler(source: Path, dtype: torch.dtype) -> Build:
     origin, remark = f"compiled for this processor by {compiler.version}", ""
     for extra in ((THREADS,), ()):
         flags = (*FLAGS, NATIVE.get(platform.machine(), "-mcpu=native"), *extra, f"-DREAL={REALS[dtype]}")
-        name = f"{source.stem}-{_digest(source, compiler, flags)}"
+        name = f"{source.stem}-{target_vector_bytes(compiler)}-{_digest(source, compiler, flags)}"
         try:
             path, library = _cached(source, name, [*compiler.program, *flags, *compiler.options])
         except NotBuiltError:
@@ -222,6 +230,18 @@ def _cached(source: Path, name: str, command: list[str]) -> tuple[Path, ctypes.C
         with suppress(OSError):
             return library()
     return library()
+
+
+@cache
+def target_vector_bytes(compiler: Compiler) -> int:
+    """Return the width in bytes of the vectors that ``vectors.h`` makes of a compiler's target; 0 if it is not told.
+
+    The compiler is asked, as wrappers, environment and configuration files change what it targets, not options alone.
+    """
+    native = NATIVE.get(platform.machine(), "-mcpu=native")
+    macros = run([*compiler.program, *FLAGS, native, *compiler.options, "-E", "-dM", str(SHARED)])
+    found = re.search(r"^#define VECTOR_BYTES (\d+)$", macros, re.MULTILINE)
+    return int(found[1]) if found else 0
 
 
 def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:

@@ -18,9 +18,10 @@ from torch.nn.functional import conv_transpose2d
 
 from kornia_tidy.kernels import triton_ops
 from kornia_tidy.kernels.build import KERNELS, load
+from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "direct.c"
-STRIP_ROWS, STRIP_BYTES = 4, 64  # a strip of pixels, see direct.c
+STRIP_ROWS = 4  # of a strip of pixels, see direct.c
 SLABS = 4  # partial sums of a correlation for each thread: enough for all threads to end together
 SLAB_BYTES = 64 << 20  # limit of the memory of all partial sums
 
@@ -124,7 +125,7 @@ def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
         >>> smallest_output(torch.float32), smallest_output(torch.float64)
         ((4, 32), (4, 16))
     """
-    return STRIP_ROWS, 2 * STRIP_BYTES // dtype.itemsize
+    return STRIP_ROWS, size_step(dtype)
 
 
 class _Scene(ctypes.Structure):

@@ -1,4 +1,4 @@
-// PSF energies of partially coherent light by mutual intensity, without gradients. The formulas are in
+// PSF energies of partially coherent light by mutual intensity, and the gradient of the field. The formulas are in
 // mutual_intensity.py.
 //
 // For each depth and row of pixels this computes the waves over the pupil's columns, one for each state and quadrature
@@ -61,62 +61,207 @@ static void products(const vec *re, const vec *im, const vec *one, const vec *tw
         }
 }
 
+// Sums B over pixels with `count` rows of weights: a row's gradient of J.
+INLINE void add_pixels(const vec *pixels, const REAL *gradient, int64_t window, int64_t plane, int count, vec *total) {
+    for (int64_t n = 0; n < plane; n += 2) {
+        const int64_t next = least(n + 1, plane - 1);
+        vec sums[4][2];
+        memset(sums, 0, sizeof sums);
+        for (int64_t s = 0; s < window; s++) {
+            vec x = pixels[s * plane + n], y = pixels[s * plane + next];
+#pragma GCC unroll 4
+            for (int i = 0; i < count; i++) {
+                sums[i][0] += gradient[i * window + s] * x;
+                sums[i][1] += gradient[i * window + s] * y;
+            }
+        }
+        for (int i = 0; i < count; i++) total[i * plane + n] = sums[i][0], total[i * plane + next] = sums[i][1];
+    }
+}
+
+// The sizes of one call. Rows of planes are `vecs` vectors of `pitch` numbers.
+typedef struct {
+    const REAL *weights;
+    int64_t states, depths, window, order, cells, vecs, pitch, waves, rows, plane;
+} sizes;
+
+static sizes sizes_of(const REAL *weights, int64_t states, int64_t depths, int64_t window, int64_t order, int64_t cells) {
+    int64_t vecs = (cells + STEP - 1) / STEP * (STEP / LANES), rows = (cells + BLOCK - 1) / BLOCK * BLOCK;
+    return (sizes){weights, states, depths, window, order, cells, vecs, vecs * LANES, states * order, rows, rows * vecs};
+}
+
+// Returns the field with real and imaginary parts of each row by turns, to be freed, or null.
+static vec *alternate(const sizes *z, const REAL *field) {
+    size_t numbers = 2 * z->states * z->cells * z->vecs;
+    vec *fields = aligned_alloc(sizeof(vec), numbers * sizeof(vec));
+    if (!fields) return 0;
+    memset(fields, 0, numbers * sizeof(vec));
+    for (int64_t m = 0; m < z->states * z->cells; m++)
+        for (int part = 0; part < 2; part++)
+            for (int64_t n = 0; n < z->cells; n++)
+                ((REAL *)fields)[(m * 2 + part) * z->pitch + n] = field[(m * z->cells + n) * 2 + part];
+    return fields;
+}
+
+// Waves over the pupil's columns, (waves, vecs) each: real and imaginary parts, and the weighted re - im and re + im.
+typedef struct {
+    vec *re, *im, *one, *two;
+} row;
+
+// Computes B of a depth's pixels.
+static void fill_pixels(const sizes *z, const REAL *kernel, row r, vec *pixels) {
+    for (int64_t p = 0; p < z->window; p++) {
+        memset(r.re, 0, 4 * z->waves * z->vecs * sizeof(vec));
+        for (int64_t q = 0; q < z->order; q++)
+            for (int64_t n = 0; n < z->cells; n++) {
+                const REAL *x = kernel + ((p * z->order + q) * z->cells + n) * 2;
+                int64_t at = q * z->pitch + n;
+                ((REAL *)r.re)[at] = x[0], ((REAL *)r.im)[at] = x[1];
+                ((REAL *)r.one)[at] = x[0] + x[1], ((REAL *)r.two)[at] = x[1] - x[0];
+            }
+        products(r.re, r.im, r.one, r.two, z->order, z->rows, z->vecs, pixels + p * z->plane);
+    }
+}
+
+// Computes the waves of a row of pixels.
+static void fill_row(const sizes *z, const vec *fields, const REAL *kernel, int64_t p, row r) {
+    for (int64_t k = 0; k < z->states; k++)
+        for (int64_t q = 0; q < z->order; q++) {
+            const REAL *x = kernel + (p * z->order + q) * z->cells * 2;
+            const vec *u = fields + k * z->cells * 2 * z->vecs;
+            int64_t at = (k * z->order + q) * z->vecs, v = 0;
+            for (; v + 2 <= z->vecs; v += 2) add_wave(x, u + v, z->cells, z->vecs, 2, r.re + at + v, r.im + at + v);
+            for (; v < z->vecs; v++) add_wave(x, u + v, z->cells, z->vecs, 1, r.re + at + v, r.im + at + v);
+            for (v = at; v < at + z->vecs; v++)
+                r.one[v] = z->weights[k] * (r.re[v] - r.im[v]), r.two[v] = z->weights[k] * (r.re[v] + r.im[v]);
+        }
+}
+
 // kernels (depths, window, order, cells) and field (states, cells, cells) are complex, weights real, energies
 // (depths, window, window) real. Returns 0, or 1 if there is no memory.
 int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels, REAL *energies, int64_t states,
                     int64_t depths, int64_t window, int64_t order, int64_t cells, int64_t threads) {
-    int64_t vecs = (cells + STEP - 1) / STEP * (STEP / LANES), pitch = vecs * LANES, waves = states * order;
-    int64_t rows = (cells + BLOCK - 1) / BLOCK * BLOCK, plane = rows * vecs;
-    size_t numbers = 2 * states * cells * vecs;
-    vec *fields = aligned_alloc(sizeof(vec), numbers * sizeof(vec));
+    const sizes all = sizes_of(weights, states, depths, window, order, cells), *z = &all;
+    vec *fields = alternate(z, field);
     if (!fields) return 1;
-    memset(fields, 0, numbers * sizeof(vec));
-    for (int64_t k = 0; k < states; k++)  // the real and the imaginary part of each row alternate
-        for (int64_t m = 0; m < cells; m++)
-            for (int part = 0; part < 2; part++)
-                for (int64_t n = 0; n < cells; n++)
-                    ((REAL *)fields)[((k * cells + m) * 2 + part) * pitch + n] = field[((k * cells + m) * cells + n) * 2 + part];
     int failed = 0;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
     for (int64_t d = 0; d < depths; d++) {
-        vec *memory = aligned_alloc(sizeof(vec), (4 * waves * vecs + (window + 1) * plane) * sizeof(vec));
+        int64_t part = z->waves * z->vecs;
+        vec *memory = aligned_alloc(sizeof(vec), (4 * part + (window + 1) * z->plane) * sizeof(vec));
         if (!memory) {
 #pragma omp atomic write
             failed = 1;
             continue;
         }
-        vec *re = memory, *im = re + waves * vecs, *one = im + waves * vecs, *two = one + waves * vecs;
-        vec *intensity = two + waves * vecs, *pixels = intensity + plane;
+        row r = {memory, memory + part, memory + 2 * part, memory + 3 * part};
+        vec *intensity = memory + 4 * part, *pixels = intensity + z->plane;
         const REAL *kernel = kernels + d * window * order * cells * 2;
+        fill_pixels(z, kernel, r, pixels);
         for (int64_t p = 0; p < window; p++) {
-            memset(memory, 0, 4 * waves * vecs * sizeof(vec));
-            for (int64_t q = 0; q < order; q++)
-                for (int64_t n = 0; n < cells; n++) {
-                    REAL a = kernel[((p * order + q) * cells + n) * 2], b = kernel[((p * order + q) * cells + n) * 2 + 1];
-                    ((REAL *)re)[q * pitch + n] = a, ((REAL *)im)[q * pitch + n] = b;
-                    ((REAL *)one)[q * pitch + n] = a + b, ((REAL *)two)[q * pitch + n] = b - a;
-                }
-            products(re, im, one, two, order, rows, vecs, pixels + p * plane);
-        }
-        for (int64_t p = 0; p < window; p++) {
-            for (int64_t k = 0; k < states; k++)
-                for (int64_t q = 0; q < order; q++) {
-                    const REAL *x = kernel + (p * order + q) * cells * 2;
-                    const vec *u = fields + k * cells * 2 * vecs;
-                    int64_t at = (k * order + q) * vecs, v = 0;
-                    for (; v + 2 <= vecs; v += 2) add_wave(x, u + v, cells, vecs, 2, re + at + v, im + at + v);
-                    for (; v < vecs; v++) add_wave(x, u + v, cells, vecs, 1, re + at + v, im + at + v);
-                    for (v = at; v < at + vecs; v++)
-                        one[v] = weights[k] * (re[v] - im[v]), two[v] = weights[k] * (re[v] + im[v]);
-                }
-            products(re, im, one, two, waves, rows, vecs, intensity);
+            fill_row(z, fields, kernel, p, r);
+            products(r.re, r.im, r.one, r.two, z->waves, z->rows, z->vecs, intensity);
             REAL *light = energies + (d * window + p) * window;
             int64_t s = 0;
-            for (; s + 4 <= window; s += 4) add_light(intensity, pixels + s * plane, plane, 4, light + s);
-            for (; s < window; s++) add_light(intensity, pixels + s * plane, plane, 1, light + s);
+            for (; s + 4 <= window; s += 4) add_light(intensity, pixels + s * z->plane, z->plane, 4, light + s);
+            for (; s < window; s++) add_light(intensity, pixels + s * z->plane, z->plane, 1, light + s);
         }
         free(memory);
     }
     free(fields);
+    return failed;
+}
+
+// Buffers of a thread for the gradient of a depth.
+typedef struct {
+    row r;
+    vec *pixels, *intensity;  // B of all pixels; gradients of J of four rows
+    vec *form;                // rows and columns of one of them by turns
+    REAL *turned;             // a wave, conjugated and times i
+    vec *re, *im, *less;      // gradients of all waves, (states, window * order, vecs): real, imaginary, negative real
+    vec *left, *right;        // kernels, (window * order, vecs): real and imaginary
+    vec *sums;                // (states, 2, plane): the gradient of the field, real and imaginary
+} desk;
+
+// Adds the gradient of the waves of a row, that of J being T: re' = T one + T^t two and im' = T two - T^t one.
+static void add_row_gradient(const sizes *z, const vec *intensity, int64_t p, const desk *d) {
+    REAL *form = (REAL *)d->form;
+    for (int64_t m = 0; m < z->cells; m++) {
+        memcpy(d->form + 2 * m * z->vecs, intensity + m * z->vecs, z->vecs * sizeof(vec));
+        for (int64_t n = 0; n < z->cells; n++) form[(2 * m + 1) * z->pitch + n] = ((const REAL *)intensity)[n * z->pitch + m];
+    }
+    for (int64_t k = 0; k < z->states; k++)
+        for (int64_t q = 0; q < z->order; q++) {
+            int64_t from = (k * z->order + q) * z->vecs, at = ((k * z->window + p) * z->order + q) * z->vecs, v = 0;
+            for (int64_t n = 0; n < z->cells; n++) {
+                d->turned[2 * n] = ((const REAL *)(d->r.two + from))[n];
+                d->turned[2 * n + 1] = -((const REAL *)(d->r.one + from))[n];
+            }
+            for (; v + 2 <= z->vecs; v += 2)
+                add_wave(d->turned, d->form + v, z->cells, z->vecs, 2, d->re + at + v, d->im + at + v);
+            for (; v < z->vecs; v++) add_wave(d->turned, d->form + v, z->cells, z->vecs, 1, d->re + at + v, d->im + at + v);
+            for (v = at; v < at + z->vecs; v++) d->less[v] = -d->re[v];
+        }
+}
+
+// Adds the gradient of a depth to the sums.
+static void add_depth_gradient(const sizes *z, const vec *fields, const REAL *kernel, const REAL *gradient, const desk *d) {
+    fill_pixels(z, kernel, d->r, d->pixels);
+    for (int64_t p = 0, count; p < z->window; p += count) {
+        count = p + 4 <= z->window ? 4 : 1;
+        if (count == 4) add_pixels(d->pixels, gradient + p * z->window, z->window, z->plane, 4, d->intensity);
+        else add_pixels(d->pixels, gradient + p * z->window, z->window, z->plane, 1, d->intensity);
+        for (int64_t i = 0; i < count; i++) {
+            fill_row(z, fields, kernel, p + i, d->r);
+            add_row_gradient(z, d->intensity + i * z->plane, p + i, d);
+        }
+    }
+    int64_t points = z->window * z->order;
+    for (int64_t w = 0; w < points; w++)
+        for (int64_t n = 0; n < z->cells; n++) {
+            ((REAL *)(d->left + w * z->vecs))[n] = kernel[(w * z->cells + n) * 2];
+            ((REAL *)(d->right + w * z->vecs))[n] = kernel[(w * z->cells + n) * 2 + 1];
+        }
+    for (int64_t k = 0; k < z->states; k++) {
+        const vec *re = d->re + k * points * z->vecs, *im = d->im + k * points * z->vecs, *less = d->less + k * points * z->vecs;
+        for (int part = 0; part < 2; part++) {
+            vec *sums = d->sums + (2 * k + part) * z->plane;
+            products(d->left, d->right, part ? im : re, part ? less : im, points, z->rows, z->vecs, d->intensity);
+            for (int64_t n = 0; n < z->plane; n++) sums[n] += d->intensity[n];
+        }
+    }
+}
+
+// The gradient of the field, complex like it, from that of the energies. Depths are summed in slabs, one for each thread.
+// Returns 0, or 1 if there is no memory.
+int mutual_field_gradient(const REAL *field, const REAL *weights, const REAL *kernels, const REAL *gradient, REAL *out,
+                          int64_t states, int64_t depths, int64_t window, int64_t order, int64_t cells, int64_t threads) {
+    const sizes all = sizes_of(weights, states, depths, window, order, cells), *z = &all;
+    const int64_t slabs = least(threads, depths), part = z->waves * z->vecs, points = window * order * z->vecs;
+    const int64_t each[] = {4 * part, window * z->plane, 4 * z->plane, 2 * cells * z->vecs, 2 * z->vecs,
+                            3 * states * points, 2 * points, 2 * states * z->plane};
+    int64_t size = 0;
+    for (int n = 0; n < 8; n++) size += each[n];
+    vec *fields = alternate(z, field), *memory = aligned_alloc(sizeof(vec), (slabs * size + 1) * sizeof(vec));
+    if (fields && memory) {
+        memset(memory, 0, slabs * size * sizeof(vec));
+#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
+        for (int64_t slab = 0; slab < slabs; slab++) {
+            vec *at[8] = {memory + slab * size};
+            for (int n = 1; n < 8; n++) at[n] = at[n - 1] + each[n - 1];
+            desk d = {{at[0], at[0] + part, at[0] + 2 * part, at[0] + 3 * part}, at[1], at[2], at[3], (REAL *)at[4], at[5],
+                      at[5] + states * points, at[5] + 2 * states * points, at[6], at[6] + points, at[7]};
+            for (int64_t n = depths * slab / slabs; n < depths * (slab + 1) / slabs; n++)
+                add_depth_gradient(z, fields, kernels + n * window * order * cells * 2, gradient + n * window * window, &d);
+        }
+        for (int64_t m = 0; m < states * cells * cells * 2; m++) {
+            int64_t n = m / 2, plane = (n / cells / cells * 2 + m % 2) * z->plane;
+            int64_t place = (size - each[7] + plane) * LANES + n / cells % cells * z->pitch + n % cells;
+            out[m] = 0;
+            for (int64_t slab = 0; slab < slabs; slab++) out[m] += ((const REAL *)(memory + slab * size))[place];
+        }
+    }
+    int failed = !fields || !memory;
+    free(fields), free(memory);
     return failed;
 }

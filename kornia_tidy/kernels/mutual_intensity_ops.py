@@ -76,6 +76,35 @@ def _energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     return energies
 
 
+def mutual_field_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor) -> Tensor:
+    """Return the gradient of the field from that of the energies; it has no gradient of its own.
+
+    Args:
+        field: as for :func:`mutual_intensity_energies`.
+        weights: as there.
+        kernels: as there.
+        gradient: (D, P, P) of the energies.
+
+    Returns:
+        (K, N, N) complex, summed in the same order every time.
+
+    Raises:
+        MemoryError: if there is no memory for the waves of a depth.
+        NotBuiltError: if the source cannot be compiled.
+    """
+    _new_energies(field, weights, kernels)
+    tensors = [x.resolve_conj().contiguous() for x in (field, weights, kernels, gradient)]
+    depths, window, order, cells = kernels.shape
+    out = torch.empty_like(tensors[0])
+    failed = load(SOURCE, weights.dtype).mutual_field_gradient(
+        *(ctypes.c_void_p(x.data_ptr()) for x in (*tensors, out)),
+        *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
+    )
+    if failed:
+        raise MemoryError(f"no memory for the gradient of PSFs of {window}x{window} pixels")
+    return out
+
+
 def _keep(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
     ctx.save_for_backward(*inputs)
 

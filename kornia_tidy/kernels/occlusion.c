@@ -19,6 +19,7 @@
 #include "direct.c"
 
 enum { BAND = 8, DOUBLES = VECTOR_BYTES / sizeof(double), PARTS = LANES / DOUBLES };
+enum { STRIPS = REGISTERS / 16, EDGE_ROWS = REGISTERS / 4 };  // whose sums stay in registers
 
 typedef double dvec __attribute__((vector_size(VECTOR_BYTES)));
 typedef double dloose __attribute__((vector_size(VECTOR_BYTES), aligned(8), may_alias));
@@ -262,26 +263,36 @@ static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec tot
     convolve_rays(rays, psf, side, 2, total);
 }
 
+// Convolves two strips one after the other.
+INLINE void convolve_each(ray *rays, int64_t rows, const REAL *psf, int64_t side, vec total[2][BAND]) {
+    convolve_one(rays, psf, side, total);
+    for (int64_t r = 0; r < rows; r++) rays[r].light += LANES;
+    convolve_one(rays, psf, side, total + 1);
+}
+
 // Adds the blur of weights 1: the sum over the starts and ends of runs of sign times the table's partial sum.
 static void add_edges(const scene_parameters *s, const double *table, const region *a, vec total[BAND]) {
     int64_t pitch = table_pitch(s);
-    dvec constant[BAND / DOUBLES] = {0}, sums[BAND][PARTS];
+    dvec constant[BAND / DOUBLES] = {0};
     for (const edge *e = a->rows; e < a->rows + a->row_count; e++)
         for (int v = 0; v < BAND; v += DOUBLES)
             constant[v / DOUBLES] += e->sign * *(const dloose *)(table + table_rows(s) * pitch + e->at + v);
-    for (int v = 0; v < BAND; v++)
-        for (int p = 0; p < PARTS; p++) sums[v][p] = constant[v / DOUBLES][v % DOUBLES] - (dvec){0};
-    for (const edge *e = a->columns; e < a->columns + a->column_count; e++)
+    for (int top = 0; top < BAND; top += EDGE_ROWS) {
+        dvec sums[EDGE_ROWS][PARTS];
+        for (int v = 0; v < EDGE_ROWS; v++)
+            for (int p = 0; p < PARTS; p++) sums[v][p] = constant[(top + v) / DOUBLES][(top + v) % DOUBLES] - (dvec){0};
+        for (const edge *e = a->columns; e < a->columns + a->column_count; e++)
 #pragma GCC unroll 8
-        for (int v = 0; v < BAND; v++)
+            for (int v = 0; v < EDGE_ROWS; v++)
 #pragma GCC unroll 2
-            for (int p = 0; p < PARTS; p++)
-                sums[v][p] += e->sign * *(const dloose *)(table + e->at - v * pitch + p * DOUBLES);
-    for (int v = 0; v < BAND; v++)
-        for (int p = 0; p < PARTS; p++) {
-            part half = __builtin_convertvector(sums[v][p], part);
-            memcpy((char *)&total[v] + p * sizeof half, &half, sizeof half);
-        }
+                for (int p = 0; p < PARTS; p++)
+                    sums[v][p] += e->sign * *(const dloose *)(table + e->at - (top + v) * pitch + p * DOUBLES);
+        for (int v = 0; v < EDGE_ROWS; v++)
+            for (int p = 0; p < PARTS; p++) {
+                part half = __builtin_convertvector(sums[v][p], part);
+                memcpy((char *)&total[top + v] + p * sizeof half, &half, sizeof half);
+            }
+    }
 }
 
 // ---- Masked rows.
@@ -343,7 +354,9 @@ static void lay_alone(const scene_parameters *s, workspace *d, const double *tab
                 const REAL *row = s->plane + image * s->plane_image + c * s->plane_channel + (y + r) * s->plane_row + x;
                 d->rays[r] = (ray){row, 0, s->side};
             }
-            convolve_two(d->rays, s->psfs + (layer * s->channels + c) * area, s->side, light);
+            const REAL *psf = s->psfs + (layer * s->channels + c) * area;
+            if (STRIPS == 2) convolve_two(d->rays, psf, s->side, light);
+            else convolve_each(d->rays, rows, psf, s->side, light);
         }
         REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
         REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
@@ -489,12 +502,13 @@ static void lay_band(const scene_parameters *s, workspace *d, const double *tabl
     }
 }
 
-// Counts the operations of every `every`-th band. Returns 0, or 1 if there is no memory.
+// Counts the operations of every `every`-th band, as of vectors of 64 bytes. Returns 0, or 1 if there is no memory.
 int count(const scene_parameters *s, int64_t every, int64_t *counts) {
     int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
     workspace d;
     int ok = allocate_workspace(s, &d);
     for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
+    for (int n = 0; n < COUNTS; n++) counts[n] = counts[n] * VECTOR_BYTES / 64;
     free_workspace(&d);
     return !ok;
 }

@@ -17,9 +17,10 @@ from torch.nn.functional import pad
 
 from kornia_tidy.kernels import triton_ops
 from kornia_tidy.kernels.build import KERNELS, load
+from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "occlusion.c"
-BLOCK_ROWS, STRIP_BYTES = 8, 64  # a block of pixels, see occlusion.c
+BLOCK_ROWS = 8  # of a block of pixels, see occlusion.c
 EPSILON = 1e-6  # added to the divisor, see occlusion.c
 SMALLEST_SIDE = BLOCK_ROWS - 1  # px, of PSFs; smaller ones are padded to it
 
@@ -97,7 +98,7 @@ def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
         >>> smallest_output(torch.float32), smallest_output(torch.float64)
         ((8, 32), (8, 16))
     """
-    return BLOCK_ROWS, 2 * STRIP_BYTES // dtype.itemsize
+    return BLOCK_ROWS, size_step(dtype)
 
 
 class _Scene(ctypes.Structure):

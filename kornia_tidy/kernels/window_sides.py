@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-VECTOR_BYTES = 64  # of a vector, see vectors.h
+WIDEST_VECTOR_BYTES = 64  # narrower ones, see vectors.h, divide it: windows are the same on every processor
 
 
 def size_step(dtype: torch.dtype) -> int:
@@ -14,7 +14,7 @@ def size_step(dtype: torch.dtype) -> int:
         >>> size_step(torch.float32), size_step(torch.float64)
         (32, 16)
     """
-    return 2 * VECTOR_BYTES // dtype.itemsize
+    return 2 * WIDEST_VECTOR_BYTES // dtype.itemsize
 
 
 def is_window_size(size: int, dtype: torch.dtype) -> bool:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import REALS, compiled
-from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
+from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_field_gradient, mutual_intensity_energies
 from kornia_tidy.psf.gradients_only import is_gradients_only
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
@@ -30,9 +30,7 @@ LARGEST_WINDOW = (
     65  # px, in C: 0.6 (23 px) to 0.85 (61 px) of the time of matrix products, beyond 100 px more than they
 )
 
-torch.library.define(
-    "kornia_tidy::mutual_energies", "(Tensor field, Tensor weights, Tensor kernels, bool learning) -> Tensor"
-)
+torch.library.define("kornia_tidy::mutual_energies", "(Tensor field, Tensor weights, Tensor kernels) -> Tensor")
 torch.library.define(
     "kornia_tidy::mutual_energies_gradients",
     "(Tensor field, Tensor weights, Tensor kernels, Tensor gradient, bool[] wanted) -> Tensor[]",
@@ -59,12 +57,11 @@ def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     weights = weights.to(field.real.dtype)
     if is_transformed():
         return _energies(*_matrices(field, weights, kernels))
-    learning = torch.is_grad_enabled() and any(x.requires_grad for x in (field, weights, kernels))
-    return torch.ops.kornia_tidy.mutual_energies(field, weights, kernels, learning)
+    return torch.ops.kornia_tidy.mutual_energies(field, weights, kernels)
 
 
 def goes_in_c(window: int, dtype: torch.dtype) -> bool:
-    """Whether energies without gradients are had faster in C: where there is a compiler, unless the window is large.
+    """Whether energies are had faster in C: where there is a compiler, unless the window is large.
 
     Args:
         window: side of the PSFs in pixels.
@@ -73,11 +70,11 @@ def goes_in_c(window: int, dtype: torch.dtype) -> bool:
     return window <= LARGEST_WINDOW and dtype in REALS and compiled(SOURCE, dtype) is not None
 
 
-def _choose_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
-    """Compute the energies by the C kernel if no gradient is wanted, and otherwise by matrix products in torch."""
+def _choose_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    """Compute the energies by the C kernel where it is faster, and otherwise by matrix products in torch."""
     if is_gradients_only():
-        return torch.zeros_like(_new_energies(field, weights, kernels, learning))
-    if not learning and field.device.type == "cpu" and goes_in_c(kernels.shape[1], field.real.dtype):
+        return torch.zeros_like(_new_energies(field, weights, kernels))
+    if field.device.type == "cpu" and goes_in_c(kernels.shape[1], weights.dtype):
         return mutual_intensity_energies(field, weights, kernels)
     return _energies(*_matrices(field, weights, kernels))
 
@@ -165,14 +162,20 @@ def _blocks(plain: Tensor, left: Tensor) -> Iterator[slice]:
 # A compiler sees them as one node each: which of the ways is taken, and block by block, is decided when they run.
 
 
-def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor, learning: bool) -> Tensor:
+def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     return weights.new_empty(kernels.shape[0], kernels.shape[1], kernels.shape[1])
 
 
 def _make_gradients(
     field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor, wanted: Sequence[bool]
 ) -> list[Tensor]:
-    """Return the gradients that are wanted, without the energies."""
+    """Return the gradients that are wanted, without the energies: that of the field alone by the C kernel."""
+    if (
+        list(wanted) == [True, False, False]
+        and field.device.type == "cpu"
+        and goes_in_c(kernels.shape[1], weights.dtype)
+    ):
+        return [mutual_field_gradient(field, weights, kernels, gradient)]
     inputs = [x.detach().requires_grad_(want) for x, want in zip((field, weights, kernels), wanted, strict=True)]
     with recording_in_operator():
         matrices = _matrices(*inputs)
@@ -196,7 +199,7 @@ def _new_gradients(
 
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:3])
+    ctx.save_for_backward(*inputs)
 
 
 def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
@@ -208,7 +211,7 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         energies = _energies(*_matrices(*own))
         asked = [x for x, want in zip(own, wanted, strict=True) if want]
         found = iter(torch.autograd.grad(energies, asked, gradient, create_graph=True))
-    return *(next(found) if want else None for want in wanted), None
+    return tuple(next(found) if want else None for want in wanted)
 
 
 torch.library.impl("kornia_tidy::mutual_energies", "default", _choose_energies)

@@ -118,7 +118,8 @@ def forget_in_process() -> None:
 def profile_path(threads: int) -> Path:
     """Return the file of a number of threads, named after all that times depend on.
 
-    That is the processor, the threads, torch, the C sources and what compiled them, and the terms of the profile.
+    That is the processor, the threads, torch, the C sources, what compiled them with its vectors, and the terms of the
+    profile.
 
     Raises:
         OSError: if there is no folder that can be used.

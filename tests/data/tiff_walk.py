@@ -282,7 +282,7 @@ def read(case: Case, path: Path, generator: np.random.Generator) -> tuple[bool, 
     for depth in (False, True):
         may_refuse = case.refusals(depth) + ["no valid depth"] * (depth and not known.any())
         try:
-            with warnings.catch_warnings(action="ignore" if turned else None):  # of the orientation, once for each folder
+            with warnings.catch_warnings(action="ignore" if turned else None):  # once for each folder
                 found = read_depth(path) if depth else read_image(path)
             if depth:
                 found, valid = (part[0].numpy() for part in found)
