@@ -414,7 +414,8 @@ static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
         for (int64_t x = 0, column = s->origin; x < t.width;) {
             const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
             const REAL *from = (const REAL *)(d->sums + column / LANES * rows + s->origin + y) + lane;
-            memcpy(out + y * s->width + x, from, count * sizeof(REAL));
+            if (count == LANES) memcpy(out + y * s->width + x, from, sizeof(vec));
+            else memcpy(out + y * s->width + x, from, count * sizeof(REAL));
             x += count, column += count;
         }
 }
