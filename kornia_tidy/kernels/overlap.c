@@ -356,12 +356,22 @@ static void read_labels(const work *w, tile t, desk *d) {
     cut(w, weight, s->weight_row, t.height, t.width, s->origin, d->weight);
 }
 
+// The numbers where a condition holds, and zeros elsewhere.
+INLINE vec where(__typeof__((vec){0} == (vec){0}) holds, vec x) {
+    union {
+        vec x;
+        __typeof__((vec){0} == (vec){0}) bits;
+    } masked = {.x = x};
+    masked.bits &= holds;
+    return masked.x;
+}
+
 // The share of a layer in samples with some labels and, where the scene has them, weights of the next layer.
 INLINE vec share(const tiles *s, vec label, const vec *weight, int64_t layer) {
-    vec own = -__builtin_convertvector(label == (REAL)layer, vec);
-    if (!s->weight) return own;
-    vec next = -__builtin_convertvector(label == (REAL)(layer - 1), vec);
-    return s->weight_gradient ? next - own : own * (1 - *weight) + next * *weight;
+    const vec one = 1 - (vec){0};
+    if (!s->weight) return where(label == (REAL)layer, one);
+    if (s->weight_gradient) return where(label == (REAL)(layer - 1), one) - where(label == (REAL)layer, one);
+    return where(label == (REAL)layer, 1 - *weight) + where(label == (REAL)(layer - 1), *weight);
 }
 
 // Adds the light of a column of waves and its layer's share to the sums of a tile.
@@ -404,7 +414,8 @@ static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
         for (int64_t x = 0, column = s->origin; x < t.width;) {
             const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
             const REAL *from = (const REAL *)(d->sums + column / LANES * rows + s->origin + y) + lane;
-            memcpy(out + y * s->width + x, from, count * sizeof(REAL));
+            if (count == LANES) memcpy(out + y * s->width + x, from, sizeof(vec));
+            else memcpy(out + y * s->width + x, from, count * sizeof(REAL));
             x += count, column += count;
         }
 }
@@ -514,12 +525,13 @@ static int note_layers(const work *w) {
     for (int64_t n = 0; n < s->images * w->tiles; n++) {
         const tile t = tile_at(w, n / w->tiles, n % w->tiles);
         uint8_t *needed = needed_by(w, t, 0);
+        int64_t group = 0;
         for (int64_t y = t.top; y < t.top + t.height; y++) {
             const int64_t *index = s->index + t.image * s->index_image + y * s->index_row + t.left;
             const REAL *weight = s->weight ? s->weight + t.image * s->weight_image + y * s->weight_row + t.left : 0;
-            for (int64_t x = 0; x < t.width; x++) {
-                const int64_t group = (x + s->origin) / LANES % w->groups;
+            for (int64_t x = 0, column = s->origin; x < t.width; x++, column++) {
                 const int next = weight && (s->weight_gradient || !(weight[x] <= 0));
+                if (column % LANES == 0 || x == 0) group = column / LANES % w->groups;
                 if ((uint64_t)index[x] >= (uint64_t)(s->layers - next)) {
                     bad = 1;
                     continue;
