@@ -100,7 +100,8 @@ def run(args: argparse.Namespace) -> None:
             progress(0.95, "server")
             server = page_module.make_server(page, Path(folder), args.allow_host)
         with listening(args.port) as opened:
-            tell("open", "http://{}:{}/".format(*opened.getsockname()))
+            port = opened.getsockname()[1]
+            tell("open", f"http://127.0.0.1:{port}/")
             tell("end", "Ctrl+C")
             server.run(sockets=[opened])
 

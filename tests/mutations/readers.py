@@ -40,7 +40,8 @@ from kornia_tidy.mask_export import read_heights, read_response, read_slm_frames
 from kornia_tidy.mask_export.mask_files import read_dwell_shares
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.raw.capture import RawCapture
-from kornia_tidy.raw.tags import black_tile, camera_tags, filter_array_fault, kodak_matrix, missing_bytes, white_levels
+from kornia_tidy.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
+from kornia_tidy.raw.tags import camera_tags, kodak_matrix, tiff_directories
 from kornia_tidy.reconstruction.midas_small import load_midas_small
 from kornia_tidy.render.cost_profile import EPYC, CostProfile
 from kornia_tidy.tradeoff import TradeRun
@@ -310,7 +311,12 @@ def _raw_files(folder: Path) -> list[Case]:
 
     def read_tags(path: Path) -> None:
         data = path.read_bytes()
-        for read in (camera_tags, black_tile, white_levels, filter_array_fault, kodak_matrix, missing_bytes):
-            read(data)
+        camera_tags(data)
+        kodak_matrix(data)
+        directories = list(tiff_directories(data))
+        missing_bytes(data, directories)
+        sensor = dng_sensor(data, directories)
+        if sensor is not None:
+            ignored_opcodes(data, sensor)
 
     return [Case("tags", "tiff", path, read_tags), Case("raw", "tiff", path, RawCapture.open)]
