@@ -76,6 +76,7 @@ class TestMutations(BaseTester):
 class TestReaders(BaseTester):
     """In forks that read many files each; a command takes a fork for each file."""
 
+    @pytest.mark.filterwarnings("ignore:.* is stored ")  # turned, as some of the TIFF files are
     def test_smoke_whole_files_are_accepted(self, readers):
         for kind, cases in readers.items():
             for case in cases:

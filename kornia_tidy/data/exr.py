@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import math
 import struct
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.data.quiet import caught
+from kornia_tidy.runtime.search_path import import_installed
 
 MAGIC = b"v/1\x01"
 
@@ -107,7 +107,7 @@ def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
 
 def _library() -> Any:
     try:
-        return importlib.import_module("OpenEXR")  # an extra, without type hints
+        return import_installed("OpenEXR")  # an extra, without type hints
     except ImportError:
         raise ImportError("an OpenEXR file needs OpenEXR: pip install 'kornia-tidy[exr]'") from None
 

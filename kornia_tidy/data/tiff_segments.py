@@ -9,8 +9,10 @@ Source: TIFF 6.0, sections 3, 8 to 11, 13 to 15 and 22; Adobe Photoshop TIFF Tec
 from __future__ import annotations
 
 import io
+import logging
 import struct
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels, jpeg_frame
 from kornia_tidy.data.tiff_directories import COLUMNS, COMPRESSION, PHOTOMETRIC, ROWS, SAMPLES, Directory
+from kornia_tidy.runtime.search_path import import_installed
 
 BITS, FILL_ORDER, STRIP_OFFSETS, ROWS_PER_STRIP, STRIP_BYTES, PLANES, T4_OPTIONS = 258, 266, 273, 278, 279, 284, 292
 PREDICTOR, TILE_COLUMNS, TILE_ROWS, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT = 317, 322, 323, 324, 325, 339
@@ -170,10 +173,8 @@ def _compression(directory: Directory, bits: int, kind: int) -> int:
     if compression not in UNFOLDS:
         raise ValueError(f"its compression is {compression} ({COMPRESSIONS.get(compression, 'unknown')}), not read")
     if compression != 1:
-        import tifffile  # noqa: PLC0415 - needed for compressed TIFF only
-
         try:
-            tifffile.TIFF.DECOMPRESSORS[compression]
+            _tifffile().TIFF.DECOMPRESSORS[compression]
         except KeyError:
             said = f"its compression is {compression}: that needs newer packages (pip install -U tifffile imagecodecs)"
             raise ValueError(said) from None
@@ -277,9 +278,16 @@ def _jpeg_rows(coded: bytes, high: int, layout: Layout, title: str) -> int:
     return frame.rows
 
 
+@cache
+def _tifffile() -> Any:
+    """Import tifffile on first use. What it logs goes to handlers that a program has set, and else nowhere."""
+    logging.getLogger("tifffile").addHandler(logging.NullHandler())
+    return import_installed("tifffile")
+
+
 def _tifffile_decoder(directory: Directory, layout: Layout, rows: int, first: bytes) -> Callable[..., Any]:
     """Return tifffile's decoder of strips or tiles with some rows."""
-    import tifffile  # noqa: PLC0415 - needed for TIFF only
+    tifffile = _tifffile()
 
     samples = layout.samples if layout.planes == 1 else 1
     # JPEG's colours are converted if they are called YCbCr, or called RGB with a JFIF header, which says otherwise.

@@ -6,6 +6,7 @@ import re
 import shutil
 import struct
 import subprocess
+import sys
 import warnings
 from collections import Counter
 
@@ -316,6 +317,13 @@ class TestRefused(BaseTester):
         for read in (read_image, read_depth):
             with pytest.raises(ValueError, match=re.escape("a.tif: it holds 3 pictures (pages): save the one that is")):
                 read(tmp_path / "a.tif")
+
+    @pytest.mark.takes_seconds
+    def test_feature_no_word_of_a_library_in_a_process_without_logging(self, tmp_path):
+        (tmp_path / "a.tif").write_bytes(by_pillow(RGB[..., 0] > 99, compression="group3"))
+        script = f"from kornia_tidy.data import read_image; read_image({str(tmp_path / 'a.tif')!r})"
+        run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        assert (run.stdout, run.stderr) == ("", "")
 
     def test_feature_no_warning_and_no_word_of_a_library(self, capfd):
         with warnings.catch_warnings():
