@@ -88,8 +88,9 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
     """Return a C source as a library in which ``REAL`` is the given type, or None where it cannot be had.
 
     The library is kept under ``$XDG_CACHE_HOME/kornia_tidy`` (``~/.cache/kornia_tidy``, or a private temporary folder
-    where that cannot be written to), named after all that it depends on: source, width of the vectors in bytes, compiler
-    with its version, flags and processor. ``$CC`` chooses the compiler, with its own options if need be (``CC="ccache gcc -pthread"``).
+    where that cannot be written to), named after all that it depends on: source, width of its vectors in bytes,
+    compiler with its version, flags and processor. ``$CC`` chooses the compiler, with its own options if need be
+    (``CC="ccache gcc -pthread"``).
 
     Args:
         source: a file of C.

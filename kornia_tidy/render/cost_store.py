@@ -124,7 +124,8 @@ def forget_in_process() -> None:
 def profile_path(threads: int) -> Path:
     """Return the file of a number of threads, named after all that times depend on.
 
-    That is the processor, the threads, torch, the C compiler with its vectors and the C sources, and the terms of the profile.
+    That is the processor, the threads, torch, the C compiler, the width of its vectors, the C sources, and the terms of
+    the profile.
 
     Raises:
         OSError: if there is no folder that can be used.
