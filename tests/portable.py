@@ -1,7 +1,8 @@
 """Portability tests: the test suite under the conditions of other machines, one factor at a time, with a table.
 
 ``python -m tests.portable`` takes up to 20 minutes on two cores; ``--quick`` takes a share of it, ``--only aten`` the
-factors whose names begin so, and ``--list`` shows them all.
+factors whose names begin so, and ``--list`` shows them all. ``--only widths``, which the quick run leaves out, compares
+the widths of vectors that the processor can run, with one another and with no compiler: results and speed.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.benchmarks import vector_widths
 from tests.kernels.widths import AVX2, AVX512, V2
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,6 +71,8 @@ NUMBERS = (
     "tests/training/test_parts.py",
     "tests/inference/test_pretrained.py",
 )
+
+WIDTHS = "widths"  # of vectors, compared with one another: not a factor that tests run under
 
 # Prints, in the environment of a factor, the vector width, compiler and threads in use.
 PROBE = """
@@ -196,20 +200,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="show the factors and run none")
     args = parser.parse_args(arguments)
     chosen = [f for f in FACTORS if f.name.startswith(args.only or "") and (f.quick or not args.quick)]
-    if not chosen:
+    widths = not args.quick and WIDTHS.startswith(args.only or "")
+    if not chosen and not widths:
         parser.error(f"no factor's name begins with {args.only!r}: there are {', '.join(f.name for f in FACTORS)}")
     if args.list:
         for factor in chosen:
             words = " ".join(f"{key}={value!r}" for key, value in factor.environment.items())
             print(f"{factor.name:18} {words:34} {' '.join(factor.quick if args.quick else factor.tests)}")
+        if widths:
+            print(f"{WIDTHS:18} {' '.join(vector_widths.ROWS)}")
         return 0
     machine = this_machine()
     outcomes = []
     for factor in chosen:
         print(f"=== {factor.name}", flush=True)
         outcomes.append(run(factor, machine, factor.quick if args.quick else factor.tests))
-    print(table(outcomes, machine))
-    return int(any(outcome.failed for outcome in outcomes))
+    if outcomes:
+        print(table(outcomes, machine))
+    objections = vector_widths.check() if widths else []
+    print("\n".join(objections))
+    return int(any(outcome.failed for outcome in outcomes) or bool(objections))
 
 
 def this_machine() -> Machine:

@@ -502,13 +502,15 @@ static void lay_band(const scene_parameters *s, workspace *d, const double *tabl
     }
 }
 
-// Counts the operations of every `every`-th band, as of vectors of 64 bytes. Returns 0, or 1 if there is no memory.
+// Counts the operations of every `every`-th band as of vectors of 64 bytes, which costs are known for. Only what a pair
+// takes, the outline of a layer and its masks, is as much for narrow vectors. Returns 0, or 1 if there is no memory.
 int count(const scene_parameters *s, int64_t every, int64_t *counts) {
     int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
     workspace d;
     int ok = allocate_workspace(s, &d);
     for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
-    for (int n = 0; n < COUNTS; n++) counts[n] = counts[n] * VECTOR_BYTES / 64;
+    for (int n = 0; n < COUNTS; n++)
+        if (n != PAIRS) counts[n] = counts[n] * VECTOR_BYTES / 64;
     free_workspace(&d);
     return !ok;
 }

@@ -170,11 +170,8 @@ def _make_gradients(
     field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor, wanted: Sequence[bool]
 ) -> list[Tensor]:
     """Return the gradients that are wanted, without the energies: that of the field alone by the C kernel."""
-    if (
-        list(wanted) == [True, False, False]
-        and field.device.type == "cpu"
-        and goes_in_c(kernels.shape[1], weights.dtype)
-    ):
+    in_c = field.device.type == "cpu" and goes_in_c(kernels.shape[1], weights.dtype)
+    if in_c and list(wanted) == [True, False, False]:
         return [mutual_field_gradient(field, weights, kernels, gradient)]
     inputs = [x.detach().requires_grad_(want) for x, want in zip((field, weights, kernels), wanted, strict=True)]
     with recording_in_operator():

@@ -23,7 +23,7 @@ from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.borders import BORDERS, pad_border
 from kornia_tidy.render.scene import scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
-from tests.psf.energies import round_off, written_out
+from tests.psf.energies import gradient_round_off, round_off, written_out
 from tests.rounding import gamma
 
 DTYPES = (torch.float32, torch.float64)
@@ -58,8 +58,9 @@ class Call:
 
     @cached_property
     def got(self) -> Tensor:
-        """What the operator returns."""
-        return self.operator(*self.arguments)
+        """What the operator returns: of complex gradients the first one, as real numbers."""
+        made = self.operator(*self.arguments)
+        return torch.view_as_real(made[0]) if isinstance(made, list) else made
 
     def error(self) -> float:
         """Return the largest difference as a multiple of the allowed one."""
@@ -209,6 +210,36 @@ def occlude(draw: random.Random) -> Call:
 
 def energies(draw: random.Random) -> Call:
     """``mutual_energies`` of mutual_intensity.c."""
+    case, about, products = _partially_coherent(draw)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        return written_out(*_in_double(case)), 2 * round_off(*case)
+
+    return Call(about, "mutual_intensity_energies", case, products, truth)
+
+
+def field_gradient(draw: random.Random) -> Call:
+    """``mutual_field_gradient`` of mutual_intensity.c."""
+    case, about, products = _partially_coherent(draw)
+    light = torch.randn(len(case[2]), *(case[2].shape[1],) * 2, dtype=case[1].dtype)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        exact = _in_double(case)
+        exact[0].requires_grad_()
+        (expected,) = torch.autograd.grad((written_out(*exact) * light.double()).sum(), exact[0])
+        allowed = gradient_round_off(tuple(x.detach() for x in exact), light.double(), light.dtype)[0]
+        return torch.view_as_real(expected), 2 * allowed[..., None]
+
+    arguments = *case, light, [True, False, False]
+    return Call(about, "mutual_energies_gradients", arguments, 2 * products, truth)
+
+
+def _in_double(case: tuple[Tensor, Tensor, Tensor]) -> list[Tensor]:
+    return [x.to(torch.complex128) if x.is_complex() else x.double() for x in case]
+
+
+def _partially_coherent(draw: random.Random) -> tuple[tuple[Tensor, Tensor, Tensor], str, int]:
+    """A field of several states, their weights and kernels; the shapes in words, and the number of products."""
     dtype = draw.choice(DTYPES)
     states, cells, order, depths = draw.randint(1, 6), draw.randint(1, 36), draw.randint(1, 4), draw.randint(1, 4)
     window = draw.choice((1, 2, 3, 4, 5, 9, 22, 33)) if draw.random() < 0.95 else LARGEST_WINDOW
@@ -219,13 +250,7 @@ def energies(draw: random.Random) -> Call:
         kernels = kernels.transpose(1, 2).contiguous().transpose(1, 2)
     weights = torch.rand(states, dtype=dtype)
     about = f"{dtype} states {states} cells {cells} order {order} depths {depths} window {window}"
-
-    def truth() -> tuple[Tensor, Tensor]:
-        expected = written_out(field.to(torch.complex128), weights.double(), kernels.to(torch.complex128))
-        return expected, 2 * round_off(field, weights, kernels)
-
-    products = depths * window**2 * cells * (cells + states * order**2)
-    return Call(about, "mutual_intensity_energies", (field, weights, kernels), products, truth)
+    return (field, weights, kernels), about, depths * window**2 * cells * (cells + states * order**2)
 
 
 KERNELS: dict[str, Callable[[random.Random], Call]] = {
@@ -235,7 +260,8 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "direct.c: gather": gather,
     "direct.c: correlate": correlate,
     "occlusion.c": occlude,
-    "mutual_intensity.c": energies,
+    "mutual_intensity.c: energies": energies,
+    "mutual_intensity.c: gradient": field_gradient,
 }
 
 

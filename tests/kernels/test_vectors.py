@@ -1,4 +1,4 @@
-"""Vectors as wide as a register: which width a target has, and that all widths give the same numbers."""
+"""Vectors as wide as a register of the processor: the width of a target, and the same numbers at all widths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Widths of vectors that the C sources are compiled with: their targets, and which run on this processor."""
+"""Widths of vectors that C sources are compiled with: the targets that have them, and those of this processor."""
 
 from __future__ import annotations
 

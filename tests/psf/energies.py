@@ -40,7 +40,7 @@ def round_off(field, weights, kernels):
     return torch.einsum("k,dkpqrs->drp", w, 2 * seen * lost + gamma(roundings, dtype) * seen.square())
 
 
-def gradient_round_off(case, light):
+def gradient_round_off(case, light, dtype=torch.float64):
     """Bound the error of the gradients of ``(energies * light).sum()`` to field, weights and kernels.
 
     A gradient is a sum of products of the same numbers, and its magnitudes' sum the gradient of positive ones. They are
@@ -51,7 +51,7 @@ def gradient_round_off(case, light):
     roundings += kernels.shape[0] * kernels.shape[1] ** 2
     positive = [(magnitude(x + 0j) + (0j if x.is_complex() else 0)).requires_grad_() for x in case]
     total = torch.autograd.grad((written_out(*positive) * light.abs()).sum(), positive)
-    return [2 * gamma(roundings, torch.float64) * magnitude(x + 0j) for x in total]
+    return [2 * gamma(roundings, dtype) * magnitude(x + 0j) for x in total]
 
 
 class EnergiesTester(BaseTester):

@@ -27,7 +27,7 @@ class TestMutualEnergies(EnergiesTester):
 
 @pytest.mark.skipif(compiled(SOURCE, torch.float32) is None, reason="no C compiler on this machine")
 class TestInC(BaseTester):
-    """What C makes of it without gradients, against the matrix products that gradients go through."""
+    """What C makes of it, against the matrix products that energies go through without a compiler."""
 
     @pytest.mark.parametrize(("states", "cells", "order"), [(1, 5, 1), (5, 23, 3), (3, 16, 2), (2, 33, 4)])
     @pytest.mark.parametrize("window", [1, 7, 22, LARGEST_WINDOW])
@@ -38,8 +38,8 @@ class TestInC(BaseTester):
         kernels = torch.randn(3, window, order, cells, dtype=complex_type)
         weights = torch.rand(states, dtype=dtype)
         allowed = 2 * round_off(field, weights, kernels)
-        expected = mutual_energies(field, weights.requires_grad_(), kernels).detach()
-        got = mutual_energies(field, weights.detach(), kernels)
+        expected = mutual_intensity._energies(*mutual_intensity._matrices(field, weights, kernels))
+        got = mutual_energies(field, weights, kernels)
         assert bool(((got.double() - expected.double()).abs() <= allowed).all())
         assert bool((allowed < (0.1 if dtype == torch.float32 else 1e-9) * expected.max()).all())
 
@@ -58,16 +58,20 @@ class TestInC(BaseTester):
             torch.set_num_threads(threads)
         self.assert_close(got, expected, rtol=1e-5, atol=1e-4)
 
-    def test_feature_only_without_gradients_and_for_small_windows(self, monkeypatch):
+    def test_feature_for_small_windows_and_the_gradient_of_the_field_alone(self, monkeypatch):
         taken = []
-        monkeypatch.setattr(mutual_intensity, "mutual_intensity_energies", lambda *x: taken.append(x[2].shape[1]))
+        for name in ("mutual_intensity_energies", "mutual_field_gradient"):
+            function = getattr(mutual_intensity, name)
+            monkeypatch.setattr(
+                mutual_intensity, name, lambda *x, n=name, f=function: taken.append((n, x[2].shape[1])) or f(*x)
+            )
         for window in (9, LARGEST_WINDOW + 2):
             field, kernels = (torch.randn(*shape, dtype=torch.complex64) for shape in ((2, 8, 8), (2, window, 2, 8)))
-            mutual_energies(field, torch.ones(2), kernels)
-            mutual_energies(field.requires_grad_(), torch.ones(2), kernels)
-            with torch.no_grad():
-                mutual_energies(field, torch.ones(2), kernels)
-        assert taken == [9, 9]
+            weights = torch.ones(2)
+            mutual_energies(field.requires_grad_(), weights, kernels).sum().backward()
+            mutual_energies(field, weights.requires_grad_(), kernels).sum().backward()
+        energies, gradient = ("mutual_intensity_energies", 9), ("mutual_field_gradient", 9)
+        assert taken == [energies, gradient, energies]
 
 
 class TestOperator(BaseTester):
@@ -75,9 +79,9 @@ class TestOperator(BaseTester):
     def test_dynamo_passes_the_checks_of_operators(self, learning):
         """Schema, fake tensors of any shape, gradients as registered, and the compiler's dispatch."""
         case = [x.requires_grad_(learning) for x in random_case()]
-        torch.library.opcheck(torch.ops.kornia_tidy.mutual_energies.default, (*case, learning))
+        torch.library.opcheck(torch.ops.kornia_tidy.mutual_energies.default, (*case,))
 
-    @pytest.mark.parametrize("wanted", [[True, True, True], [False, True, False]])
+    @pytest.mark.parametrize("wanted", [[True, True, True], [False, True, False], [True, False, False]])
     def test_dynamo_the_gradients_pass_the_checks_of_operators(self, wanted):
         case = random_case()
         light = torch.randn(4, 5, 5, dtype=torch.float64)
