@@ -43,6 +43,8 @@ class TestInfo(BaseTester):
     def test_feature_kernels_and_their_cache(self, capsys):
         topics = self.told(capsys)
         assert all(" KiB" in text for text in topics["kernel"])
+        width = compiled.target_vector_bytes(compiled.find_compiler())
+        assert all(f", vectors of {width} bytes" in text for text in topics["kernel"])
         assert topics["kernel"][0].startswith("direct.c, float32: direct-")
 
     def test_feature_without_a_compiler_it_says_why(self, capsys, monkeypatch):

@@ -1,8 +1,8 @@
 """The direct backend: convolution with SIMD vectors, sample by sample, on processors.
 
-A block of 4 x 32 pixels (in float32) is convolved with the PSFs of its own layers and with no other: P x P products a
-pixel for each. For PSFs of up to some 40 pixels that is faster than transforms, whose tiles are larger and hold more
-layers. The work is done in C (``direct.c``), compiled on the machine that it runs on, see
+A block of 4 rows of two vectors (in float32 4 x 32 pixels, where vectors have 64 bytes) is convolved with the PSFs of
+its own layers and with no other: P x P products a pixel for each. For PSFs of up to some 40 pixels that is faster than
+transforms, whose tiles are larger and hold more layers. The work is done in C (``direct.c``), compiled on the machine that it runs on, see
 :mod:`kornia_tidy.kernels.build`. The gradient with respect to the image is made by overlapping windows
 (``overlap.c``): a pixel's light goes to pixels of many layers.
 """
