@@ -15,7 +15,7 @@ help:
 	@echo "make demo     captures with and without masks, and what is made of them: outputs/reconstruction.png, demo.png"
 	@echo "              make demo IMAGE=photo.png DEPTH=depth.png ARGS='--depth-scale 0.001' draws your own scene"
 	@echo "make test     the tests, a process for each core; ARGS='-k camera' runs some of them, ARGS='-n0' in one process"
-	@echo "make test-portable  the tests as on other machines: vector widths, compilers, none, threads; up to 20 minutes;"
+	@echo "make test-portable  the tests as on other machines: vector widths, compilers, none, threads; up to 30 minutes;"
 	@echo "              ARGS='--list' shows them, ARGS='--only aten' runs some, ARGS=--quick a share of each"
 	@echo "make sanitize the C sources under address and undefined-behaviour sanitizers: minutes, ARGS='--shapes 100' less"
 	@echo "make mutations  damaged files through the command: 200 of them, or ARGS='--count 5000 --seed 1 --kind png'"

@@ -1,6 +1,6 @@
 """Portability tests: the test suite under the conditions of other machines, one factor at a time, with a table.
 
-``python -m tests.portable`` takes up to 20 minutes on two cores; ``--quick`` takes a share of it, ``--only aten`` the
+``python -m tests.portable`` takes up to 30 minutes on two cores; ``--quick`` takes a share of it, ``--only aten`` the
 factors whose names begin so, and ``--list`` shows them all. ``--only widths``, which the quick run leaves out, compares
 the widths of vectors that the processor can run, with one another and with no compiler: results and speed.
 """

@@ -1,7 +1,8 @@
 """Occlusion by direct convolution with SIMD vectors, sample by sample.
 
-A block of 8 x 16 pixels (in float32) meets the layers in its window, each only in the rows and columns where it is. All
-that is added up is positive, so float32 is enough: the relative error of every sum is small, however small the
+A block of 8 vectors (in float32 8 x 16 pixels, where they have 64 bytes) meets the layers in its window, each only in
+the rows and columns where it is. All that is added up is positive, so float32 is enough: the relative error of every
+sum is small, however small the
 normaliser that it becomes. Whole weights along runs of pixels are not even convolved: their blur is known from where
 runs begin and end. The work is done in C (``occlusion.c``), see :mod:`kornia_tidy.kernels.build`. Gradients are made by
 tiles.
