@@ -245,7 +245,7 @@ INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, 
 }
 
 // Convolves rows of light with a PSF. `side` is at least BAND - 1.
-INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int strips, vec total[2][BAND]) {
+INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int strips, vec (*total)[BAND]) {
     vec sums[2][BAND];
     memset(sums, 0, sizeof sums);
 #pragma GCC unroll 7
@@ -255,16 +255,16 @@ INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int st
         for (int v = 0; v < BAND; v++) total[strip][v] = sums[strip][v];
 }
 
-static void convolve_one(const ray *rays, const REAL *psf, int64_t side, vec total[2][BAND]) {
+static void convolve_one(const ray *rays, const REAL *psf, int64_t side, vec (*total)[BAND]) {
     convolve_rays(rays, psf, side, 1, total);
 }
 
-static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec total[2][BAND]) {
+static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec (*total)[BAND]) {
     convolve_rays(rays, psf, side, 2, total);
 }
 
 // Convolves two strips one after the other.
-INLINE void convolve_each(ray *rays, int64_t rows, const REAL *psf, int64_t side, vec total[2][BAND]) {
+INLINE void convolve_each(ray *rays, int64_t rows, const REAL *psf, int64_t side, vec (*total)[BAND]) {
     convolve_one(rays, psf, side, total);
     for (int64_t r = 0; r < rows; r++) rays[r].light += LANES;
     convolve_one(rays, psf, side, total + 1);
