@@ -36,7 +36,7 @@ class TestDesign(BaseTester):
         lines = capsys.readouterr().out.splitlines()
         assert {path.name for path in folder.iterdir()} == FILES
         words = json.loads((folder / "report.json").read_text())["words"]
-        assert [line.split()[0] for line in lines[:5]] == ["scene", "light", "work", "verdict", "camera"]
+        assert [line.split()[0] for line in lines[:6]] == ["scene", "light", "work", "verdict", "exposure", "camera"]
         assert lines[3].endswith(words)
         assert "about" in lines[2]
         assert read_image(folder / "design.png").shape[2] > 1500
