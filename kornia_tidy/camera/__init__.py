@@ -2,7 +2,7 @@
 
 Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burst.py``), scenes that move during the
 exposure (``motion.py``) and the transform of a data set (``dataset_transform.py``). ``samples.py`` reads what a camera
-is given, ``banding.py`` takes large images in bands, ``psf_model_owner.py`` and ``camera_state.py`` are its bases.
+is given, ``strips.py`` takes large images some rows at a time, ``camera_state.py`` is its state.
 """
 
 from kornia_tidy.camera.burst import burst

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from kornia_tidy.camera.samples import compute_dtype, read_sample, survey_defocus
-from kornia_tidy.psf.wide_psfs import WideBank
+from kornia_tidy.psf.pieces import pieces_of
 from kornia_tidy.render.dispatch import Explanation, explain
 from kornia_tidy.render.scene import layered_scene
 
@@ -33,41 +33,31 @@ def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: fl
     return Planner(optics, sample.image.shape[1]).scene(defocus, light).plan(tolerance)
 
 
-def explain_groups(bank: WideBank, light: Tensor) -> Explanation:
-    """Return how wide blur is gathered: by groups of layers on their grids, whatever their times.
-
-    Args:
-        bank: of the scene.
-        light: (B, C, H, W).
-    """
-    groups = ", ".join(f"{len(group.bank.defocus)} on grids of {group.grid} px" for group in bank.groups)
-    (batch, channels, height, width) = light.shape
-    words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
-    return Explanation(words, "grids", {}, {})
-
-
 def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
-    """Return which backend renders a scene. Of an exposure in states, the first. See :meth:`TiDyOptics.explain`."""
+    """Return which backend renders a scene, of several pieces the first. See :meth:`TiDyOptics.explain`."""
     sample = read_sample(image, depth, optics)
     if len(sample.image) == 0:
         raise ValueError("an explanation needs at least one image, got a batch of none")
     light = optics.decode(sample.image.to(sample.dtype))
     defocus = optics.defocus(sample.depth.to(sample.dtype))
-    reach = survey_defocus([defocus], optics).reach
-    if optics.compositing == "gather" and optics.psf_model.wide_blur is not None:
-        return explain_groups(optics.psf_model.wide_bank(light.shape[1], sample.dtype, defocus), light)
-    (_, bank), *_ = optics.psf_model.scene_banks(light.shape[1], sample.dtype, reach, optics.compositing == "occlusion")
-    fidelity = optics.psf_model.fidelity
+    reach, (batch, channels, height, width) = survey_defocus([defocus], optics).reach, light.shape
+    given = optics.compositing, optics.memory_budget, defocus
+    pieces = list(pieces_of(optics.psf_model, channels, sample.dtype, reach, *given))
+    if pieces[0].window is not None:
+        groups = ", ".join(f"{len(piece.bank().defocus)} on grids of {piece.grid} px" for piece in pieces)
+        words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
+        return Explanation(words, "grids", {}, {})
+    bank, rendering = pieces[0].bank(), optics.rendering(light.device)
     return explain(
         layered_scene(
-            light.repeat(1, bank.psfs.shape[1] // light.shape[1], 1, 1),
+            light.repeat(1, bank.psfs.shape[1] // channels, 1, 1),
             defocus,
             bank.defocus,
             bank.psfs,
             bank.veil,
-            compositing=optics.compositing,
-            layers="nearest" if fidelity.layers == "nearest" else "linear",
-            border=optics.border,
-            correlate=fidelity.correlate,
+            compositing=rendering.compositing,
+            layers=rendering.layers,
+            border=rendering.border,
+            correlate=rendering.correlate,
         )
     )

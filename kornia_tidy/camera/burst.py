@@ -88,15 +88,12 @@ def burst(
         torch.Size([2, 3, 80, 80])
     """
     sample = read_sample(image, depth, optics)
-    now = optics.snapshot(sample.dtype)  # all shots see the masks of one moment
-    light = now.decode(sample.image)
-    shots = []
+    now, shots = optics.snapshot(sample.dtype), []  # all shots see the masks of one moment
     for k, share in enumerate(burst_shares(_dwell_shares(now, sample.dtype), dead_time, exposure)):
-        one = linear_through_moment(now, k)
-        one.check_inputs = now.check_inputs and k == 0  # warnings come once
-        shot = one(light, sample.depth) * share.to(light)
+        shot = now.through_moment(k).irradiance(sample)
+        shot = shot * share.to(shot)
         shots.append(shot if now.sensor is None else _sensor_for(now.sensor, share)(shot, generator=generator))
-    stack = torch.stack(shots, 1)
+    stack = torch.stack(shots, 1).to(sample.image.dtype)
     return stack if sample.batched else stack[0]
 
 
@@ -106,13 +103,6 @@ def _dwell_shares(optics: TiDyOptics, dtype: torch.dtype) -> Tensor:
     if not bool(shown.sum() > 0):
         raise ValueError("a burst needs masks that are shown for a time, but switching takes the whole exposure")
     return shown / shown.sum()
-
-
-def linear_through_moment(optics: TiDyOptics, moment: int) -> TiDyOptics:
-    """Return the camera with one moment of its exposure shown all the time, in linear light and without noise."""
-    one = optics.through_moment(moment)
-    one.sensor, one.color_space = None, "linear"
-    return one
 
 
 def _sensor_for(sensor: nn.Module, share: Tensor) -> nn.Module:

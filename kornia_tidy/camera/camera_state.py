@@ -1,16 +1,21 @@
-"""The state of a camera: weights, settings and PSF window in one ``state_dict``."""
+"""What a camera has of its PSF model, and its state: weights, settings and PSF window in one ``state_dict``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any
+from typing import Any, Literal, NoReturn, Self, overload
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-from kornia_tidy.camera.psf_model_owner import PSFModelOwner
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.masks.base import PhaseMasks
+from kornia_tidy.modulator.modulator import Timeline
+from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.camera_settings import (
     EXTRA_STATE,
     check_settings,
@@ -20,17 +25,35 @@ from kornia_tidy.psf.camera_settings import (
     write_settings,
 )
 from kornia_tidy.psf.lens_limits import PARTS
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.psf_window import FittedWindow
+from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
+from kornia_tidy.runtime.tracing import is_followed, refuse_torchscript
 
+_SUBMODULES = ("masks", "camera", "modulator")
 COLOR_SPACES = ("srgb", "linear", "paper")
 OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")  # of a camera, beside those of its PSF model
 
 
-class CameraState(PSFModelOwner):
-    """A camera with a ``state_dict`` of weights, settings and PSF window.
+def _part(name: str, meaning: str, *, settable: bool = False) -> Any:
+    """Return a property that is the PSF model's; to set it puts another model in the place of the present one."""
+
+    def swap(self: Any, value: Any) -> None:
+        self._swap(**{name: value})
+
+    return property(lambda self: getattr(self.psf_model, name), swap if settable else None, doc=meaning)
+
+
+class CameraState(nn.Module):
+    """A camera with a PSF model, and a ``state_dict`` of weights, settings and PSF window.
+
+    Masks, camera and modulator of the model are its submodules, so that states hold ``masks.phase``, and optimisers and
+    ``to(device)`` reach the parts. To set one of them, or ``fidelity``, ``spectrum`` or ``aperture``, puts another PSF
+    model in the place of the present one.
 
     The settings of its parts and its PSF window are one entry, ``_extra_state``, a tensor of bytes. Loading a state
 
@@ -45,9 +68,192 @@ class CameraState(PSFModelOwner):
     module obeys the same rules. To take settings over there, load the camera's part of the state into the camera first.
     """
 
+    psf_model: PSFModel
+    fixed_defocus: tuple[float, float] | None = None  # of every scene, see with_fixed_layers
+    masks: PhaseMasks
+    camera: ThinLensCamera | DefocusRange
+    modulator: nn.Module
+
+    fidelity: Fidelity = _part("fidelity", "How exactly to compute.", settable=True)
+    spectrum: Spectrum = _part("spectrum", "Wavelengths, and how each channel weights them.", settable=True)
+    aperture: Tensor | None = _part(
+        "aperture", "Amplitude over the mask's pixels, None for the binary disc.", settable=True
+    )
+    pupil: Pupil = _part("pupil", "The aperture over the masks' pixels.")
+    defocus_nodes: tuple[float, ...] = _part(
+        "defocus_nodes", "Defocus of the PSF bank's layers in radians: evenly spaced over the camera's range."
+    )
+    window: int = _part(
+        "window", "Side of the PSFs in pixels: given by the fidelity, or measured by :meth:`fit_window`."
+    )
+
     def __init__(self, psf_model: PSFModel) -> None:
-        super().__init__(psf_model)
+        super().__init__()
+        self.psf_model = psf_model
+        for name in _SUBMODULES:
+            super().__setattr__(name, getattr(psf_model, name))
         self.register_load_state_dict_post_hook(_measure_window)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; masks, camera and modulator are of the PSF model too."""
+        if name not in _SUBMODULES:
+            super().__setattr__(name, value)
+            return
+        with self.psf_model.lock:
+            self._swap(**{name: value})
+            super().__setattr__(name, value)
+
+    def _swap(self, **parts: Any) -> None:
+        with self.psf_model.lock:
+            self.psf_model = self.psf_model.replace(**parts)
+
+    @abstractmethod
+    def _replace(self, **attributes: Any) -> Self:
+        """Return this module with other attributes; all others are shared."""
+
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Refuse ``torch.jit.script`` of this camera and of modules that contain it."""
+        refuse_torchscript()
+
+    @property
+    def light_held(self) -> tuple[float, float]:
+        """Least and largest share of the light in the window, as it was when the window was chosen."""
+        return self.psf_model.fitted.held
+
+    def fit_window(self) -> int:
+        """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
+
+        It is done on construction, when a part is swapped, and after loading weights that do not tell their window;
+        masks in training keep their window until this is called again. A window or a preset that fixes the side is only
+        measured.
+
+        Returns:
+            The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
+        """
+        with self.psf_model.lock:
+            self.psf_model = self.psf_model.with_window(None)
+            return self.psf_model.fitted.side
+
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: Literal[False] = False,
+    ) -> PSFBank: ...
+
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: Literal[True],
+    ) -> StateBank: ...
+
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: bool = False,
+    ) -> PSFBank | StateBank:
+        """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
+
+        They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
+        Without gradients, PSFs are remembered while masks and camera stay as they are.
+
+        Args:
+            channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
+            dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
+            defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
+            states: return the PSFs of each state that the modulator shows, with their weights, not the average.
+        """
+        model = self.psf_model
+        if not is_followed():
+            with model.lock:  # the window and the masks of one moment
+                model = self.psf_model.snapshot(model.bank_dtype(dtype))
+        if states:
+            return model.psf_bank(channels, dtype, defocus, states=True)
+        return model.psf_bank(channels, dtype, defocus)
+
+    def state_weights(self, dtype: torch.dtype) -> Tensor:
+        """Return the share of the exposure of each state that the modulator shows, (S,)."""
+        return self.psf_model.state_weights(dtype)
+
+    def timeline(self, dtype: torch.dtype) -> Timeline:
+        """Return what the modulator shows of the masks during one exposure, and when."""
+        return self.psf_model.timeline(dtype)
+
+    def with_fidelity(self, fidelity: str | Fidelity) -> Self:
+        """Return this camera at another fidelity. The parts are shared, so masks learn through both.
+
+        Args:
+            fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`, such as that of a plan.
+        """
+        return self._replace(psf_model=self.psf_model.with_fidelity(fidelity))
+
+    def with_fixed_layers(self, depth: Tensor | None = None) -> Self:
+        """Return this camera with the same defocus layers for every scene. The parts are shared, so masks learn.
+
+        A capture usually looks at the scene: it checks its values, and convolves the layers between its nearest and its
+        farthest point. An accelerator has to be waited for to know them. With fixed layers a capture on an accelerator
+        looks at no value: the host never waits, and a training step can be captured in a CUDA graph, once one was made
+        before. On the CPU values are checked as ever.
+
+        Args:
+            depth: depths whose range all scenes keep to, in what the camera takes, such as metres. Default: all of the
+                camera's range. What lies beyond is rendered as its nearest layer.
+
+        Raises:
+            ValueError: if a depth is NaN or not positive.
+
+        Example:
+            >>> from kornia_tidy import TiDyOptics
+            >>> optics = TiDyOptics().with_fixed_layers(torch.tensor([0.5, 2.0]))
+            >>> [round(psi, 2) for psi in optics.fixed_defocus]
+            [-14.06, 3.8]
+        """
+        if depth is None:
+            return self._replace(fixed_defocus=self.psf_model.camera.defocus_range)
+        reach = torch.stack(torch.aminmax(self.psf_model.camera.defocus(depth.detach())))
+        return self._replace(fixed_defocus=tuple(reach.tolist()))
+
+    def through_state(self, state: int) -> Self:
+        """Return this camera with one state of its modulator shown all the time. The parts and the window are shared.
+
+        Args:
+            state: index among the states that the modulator shows.
+
+        Raises:
+            ValueError: if there is no such state.
+        """
+        return self._replace(psf_model=self.psf_model.through_state(state))
+
+    def through_moment(self, moment: int) -> Self:
+        """Return this camera with what its modulator shows at one moment shown all the time. The parts are shared.
+
+        Args:
+            moment: index among the moments of :meth:`timeline`.
+
+        Raises:
+            ValueError: if there is no such moment.
+        """
+        return self._replace(psf_model=self.psf_model.through_moment(moment))
+
+    def with_bank(self, bank: PSFBank) -> Self:
+        """Return this camera with PSFs that were measured in the place of its masks'. The other parts are shared.
+
+        Args:
+            bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them.
+        """
+        return self._replace(psf_model=self.psf_model.with_bank(bank))
+
+    # ------------------------------------------------------------------ state
 
     def settings(self) -> dict[str, Any]:
         """Return what shapes a capture besides the weights, by the names of the parts."""

@@ -8,8 +8,7 @@ import torch
 from kornia.geometry import remap
 from torch import Tensor
 
-from kornia_tidy.camera.burst import linear_through_moment
-from kornia_tidy.camera.samples import check_light, compute_dtype
+from kornia_tidy.camera.samples import check_light, compute_dtype, read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.modulator.modulator import Timeline
@@ -87,10 +86,10 @@ def moving_capture(
                 )
         total, clamped = torch.zeros(()), 0
         for moment, share in enumerate(durations):
-            one = linear_through_moment(optics, moment)
-            light = one(optics.decode(images[:, moment].to(dtype)), depths[:, moment]) * share
+            sample = read_sample(images[:, moment], depths[:, moment], optics)
+            light = optics.through_moment(moment).irradiance(sample) * share
             total = light if moment == 0 else total + light
-            clamped += one.clamped_pixels
+            clamped += optics.clamped_pixels
         optics.notes.of_thread.clamped = clamped
         if optics.sensor is not None:
             total = optics.sensor(total, params=params, generator=generator)

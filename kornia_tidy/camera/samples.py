@@ -18,6 +18,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.render.borders import cropped
 from kornia_tidy.runtime.precision import widest
 from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.threads import CaptureNotes
@@ -178,21 +179,6 @@ def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
             f"{list(sample)}"
         )
     return sample["image"], sample[keys[0]]
-
-
-def cropped(tensor: Tensor, margin: int) -> Tensor:
-    """Return a map without so many pixels on each side.
-
-    Example:
-        >>> cropped(torch.zeros(3, 8, 9), 2).shape
-        torch.Size([3, 4, 5])
-    """
-    return tensor[..., margin : tensor.shape[-2] - margin, margin : tensor.shape[-1] - margin]
-
-
-def zero_of(*tensors: Tensor) -> Tensor:
-    """Return zero, computed from the tensors: added to an empty capture, it gives each of them a gradient of zero."""
-    return cast("Tensor", sum(tensor.sum() for tensor in tensors)) * 0
 
 
 class DefocusSpan(NamedTuple):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
@@ -10,25 +11,32 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.camera.advice import explain_capture, plan_capture
-from kornia_tidy.camera.banding import capture_in_bands, rows_at_once
-from kornia_tidy.camera.bank_pieces import BankPieces, render_pieces
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
-from kornia_tidy.camera.capture_psfs import Banks, capture_psfs, wide_irradiance
 from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
-from kornia_tidy.camera.exposure import render_banks
-from kornia_tidy.camera.samples import compute_dtype, cropped, read_sample, survey_scene, tell_of_defocus
+from kornia_tidy.camera.samples import (
+    Sample,
+    check_light,
+    compute_dtype,
+    read_sample,
+    survey_defocus,
+    survey_scene,
+    tell_of_defocus,
+)
+from kornia_tidy.camera.strips import placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_part, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
+from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
 from kornia_tidy.psf.psf_model import PSFModel
-from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
+from kornia_tidy.render.exposure import Rendering, render_pieces
 from kornia_tidy.runtime.reading import is_unread, values_unread
 from kornia_tidy.runtime.threads import CaptureNotes
-from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
+from kornia_tidy.runtime.tracing import is_followed, is_transformed, is_value_unknown
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.systems.presets import published_system
 
@@ -200,19 +208,76 @@ class TiDyOptics(CameraState):
             generator: source of the noise (not while compiling).
         """
         sample = read_sample(image, depth, self, generator, deferred=True)
-        device = sample.image.device
+        device, dtype = sample.image.device, sample.image.dtype
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             now = self.snapshot(sample.dtype)
-            if sample.bytes_at_once > now.memory_budget // 2 and (rows := rows_at_once(now, sample)):
-                return sample.coded(capture_in_bands(now, sample, rows, params, generator))
-            light = now.decode(sample.image.to(sample.dtype))
-            defocus = now.defocus(sample.depth.to(sample.dtype))
-            reach = survey_scene(sample, defocus, now)
-            banks = capture_psfs(now, light.shape[1], sample.dtype, reach, defocus)
-            irradiance = now.render(light, defocus, banks, now.border)
-            seen = irradiance if now.sensor is None else now.sensor(irradiance, params=params, generator=generator)
-            coded = now.encode(seen)
-        return sample.coded(coded.to(sample.image.dtype))
+            coded: Any = None
+            for rows, irradiance in now.strips(sample):
+                seen = now.encode(now.expose(irradiance, params, generator, rows)).to(dtype)
+                coded = seen if rows is None else placed(coded, seen, rows, now.height(sample))
+            return sample.coded(coded)
+
+    def strips(self, sample: Sample) -> Iterator[tuple[slice | None, Tensor]]:
+        """Yield rows of a capture and their irradiance on the sensor over the whole exposure.
+
+        All rows come at once, as None, unless they would take more than the memory budget.
+
+        Args:
+            sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
+        """
+        channels, dtype, device = sample.image.shape[1], sample.dtype, sample.image.device
+        given, rendering, rows = (self.compositing, self.memory_budget), self.rendering(device), None
+        if sample.bytes_at_once > self.memory_budget // 2:
+            rows = self._rows_at_once(sample)
+        if rows is None:
+            light, defocus = self.decode(sample.image.to(dtype)), self.defocus(sample.depth.to(dtype))
+            reach = survey_scene(sample, defocus, self)
+            pieces = pieces_of(self.psf_model, channels, dtype, reach, *given, defocus, device)
+            yield None, render_pieces(light, defocus, pieces, rendering)
+            return
+        check_border(self.border, *sample.image.shape[-2:], self.window)
+        if device.type != "cpu":
+            check_light(sample.image, self)
+        reach = survey_defocus((self.defocus(part.to(dtype)) for part in sample.depth.split(rows, dim=-2)), self).reach
+        rendering = replace(rendering, border="valid")
+        for strip, image, depth in strips_of(sample, rows, self.height(sample), self.window // 2, self.border):
+            light, defocus = self.decode(image.to(dtype)), self.defocus(depth.to(dtype))
+            pieces = pieces_of(self.psf_model, channels, dtype, reach, *given, defocus, device)
+            yield strip, render_pieces(light, defocus, pieces, rendering)
+
+    def irradiance(self, sample: Sample) -> Tensor:
+        """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure. See :meth:`strips`."""
+        whole, device = None, sample.image.device
+        with torch.autocast(device.type, enabled=False), values_unread(device):
+            for rows, part in self.strips(sample):
+                whole = part if rows is None else placed(whole, part, rows, self.height(sample))
+        return cast("Tensor", whole)
+
+    def height(self, sample: Sample) -> int:
+        """Return how many rows a capture has."""
+        return sample.image.shape[-2] - (self.window - 1 if self.border == "valid" else 0)
+
+    def rendering(self, device: torch.device) -> Rendering:
+        """Return how pieces of PSFs are rendered on a device."""
+        fidelity, waits = self.psf_model.fidelity, self.fixed_defocus is None or device.type == "cpu"
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        return Rendering(self.compositing, self.border, layers, fidelity.correlate, "auto" if waits else "batched")
+
+    def _rows_at_once(self, sample: Sample) -> int | None:
+        """Return how many rows fit the memory allowed; None where all do, or the whole image is needed at once."""
+        image, depth = sample.image, sample.depth
+        learning = torch.is_grad_enabled() and (
+            image.requires_grad or depth.requires_grad or any(p.requires_grad for p in self.parameters())
+        )
+        spread = self.fidelity.stray_light == "veil"
+        # Beyond a zero border there is nothing that hides, which black pixels would.
+        unseen = self.compositing == "occlusion" and self.border == "zero"
+        if learning or is_followed() or spread or unseen or not len(image):
+            return None
+        allowed = self.memory_budget
+        if comes_in_pieces(self.psf_model, image.shape[1], sample.dtype, self.compositing, allowed):
+            allowed //= 2  # the other half is for PSFs
+        return None if sample.bytes_at_once <= allowed else rows_at_once(sample, allowed)
 
     def capture(
         self,
@@ -266,27 +331,26 @@ class TiDyOptics(CameraState):
         checked = self.check_inputs and not is_value_unknown() and not is_unread()
         return self.psf_model.camera.defocus(depth, check_inputs=checked)
 
-    def render(self, light: Tensor, defocus: Tensor, banks: Banks, border: str) -> Tensor:
-        """Return the irradiance of a scene on the sensor, over the whole exposure.
+    def expose(
+        self,
+        irradiance: Tensor,
+        params: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+        rows: slice | None = None,
+    ) -> Tensor:
+        """Return what the sensor reports of an irradiance, in linear light. See :meth:`forward` for the noise.
 
         Args:
-            light: (B, C, H, W) linear light.
-            defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-            banks: PSFs, each with its share of the exposure.
-            border: what lies beyond the image.
+            irradiance: (B, C, h, w).
+            params: noise of the whole capture.
+            generator: source of the noise.
+            rows: of the capture that the irradiance is. Default: all.
         """
-        if isinstance(banks, BankPieces):
-            return render_pieces(light, defocus, banks, self, border)
-        if not isinstance(banks, list):
-            return wide_irradiance(light, defocus, banks, border)
-        method = "batched" if self.fixed_defocus is not None and light.device.type != "cpu" else "auto"
-        return render_banks(light, defocus, banks, self.psf_model.fidelity, self.compositing, border, method)
-
-    def expose(
-        self, irradiance: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Return what the sensor reports of an irradiance, in linear light. See :meth:`forward` for the noise."""
-        return irradiance if self.sensor is None else self.sensor(irradiance, params=params, generator=generator)
+        if self.sensor is None:
+            return irradiance
+        if params is not None and rows is not None:
+            params = {name: field[..., rows, :] for name, field in params.items()}
+        return self.sensor(irradiance, params=params, generator=generator)
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.

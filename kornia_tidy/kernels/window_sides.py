@@ -24,7 +24,7 @@ def is_window_size(size: int, dtype: torch.dtype) -> bool:
         >>> [n for n in range(1, 200) if is_window_size(n, torch.float32)]
         [32, 64, 96, 128, 160, 192]
     """
-    return size >= 1 and size % size_step(dtype) == 0 and _is_fast(size)
+    return size >= 1 and size % size_step(dtype) == 0 and next_fast_size(size) == size
 
 
 def needed_side(size: int, pixels: int, psf_side: int, step: int) -> int:
@@ -45,12 +45,21 @@ def needed_side(size: int, pixels: int, psf_side: int, step: int) -> int:
     """
     tiles = -(-pixels // (size - psf_side + 1))
     least = -(-pixels // tiles) + psf_side - 1
-    return next(side for side in range(-(-least // step) * step, size + 1, step) if _is_fast(side))
+    return next(side for side in range(-(-least // step) * step, size + 1, step) if next_fast_size(side) == side)
 
 
-def _is_fast(size: int) -> bool:
-    """Return whether a transform's length has no prime factors but 2, 3 and 5."""
-    for factor in (2, 3, 5):
-        while size % factor == 0:
-            size //= factor
-    return size == 1
+def next_fast_size(size: int) -> int:
+    """Return the smallest number of samples, at least ``size``, that has no prime factor above 5.
+
+    Example:
+        >>> next_fast_size(1046)
+        1080
+    """
+    while True:
+        rest = size
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return size
+        size += 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,39 +20,6 @@ from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur, window_of
 Exact = Callable[[Tensor, Tensor, tuple[float, ...], int], PSFBank]
 """Exact PSFs of states and their weights, at nodes, in a window."""
 MOST_LEARNT = 257  # sensor pixels; waves cost the square of a window's side
-
-
-@dataclass(frozen=True, eq=False)
-class GroupBank:
-    """PSFs of a group of layers on its grid.
-
-    Args:
-        grid: sensor pixels along a side of a pixel of the grid.
-        span: defocus in radians between which pixels belong to the group.
-        bank: PSFs, each pixel of the grid with the light that falls on it.
-    """
-
-    grid: int
-    span: tuple[float, float]
-    bank: PSFBank
-
-
-@dataclass(frozen=True, eq=False)
-class WideBank:
-    """PSFs of the layers that a scene holds, in groups of ascending defocus.
-
-    Args:
-        groups: those that hold pixels of the scene.
-        window: side in sensor pixels that holds the PSFs of the lens at every depth.
-    """
-
-    groups: tuple[GroupBank, ...]
-    window: int
-
-    @property
-    def psfs(self) -> Tensor:
-        """PSFs of the first group, (D, C, P, P)."""
-        return self.groups[0].bank.psfs
 
 
 def wide_psfs(
@@ -91,8 +57,8 @@ def wide_psfs(
             psfs = psfs + rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
         parts.append(psfs)
     if small:
-        largest = max(blur_radius(psi, step) for psi in small)
-        side = min(window, window_of(largest, step, pupil.extent, grid))
+        # Of all small discs of the lens, so that a PSF does not depend on what is asked for besides.
+        side = min(window, window_of(blur.ray_radius, step, pupil.extent, grid))
         psfs = exact(small, side).psfs
         parts.insert(1, pad(psfs, ((window - side) // 2,) * 4))
     psfs = torch.cat(parts)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.kernels.window_sides import next_fast_size
 
 BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
 _PAD_MODES = {"reflect": "reflect", "replicate": "replicate", "zero": "constant", "circular": "circular"}
@@ -63,27 +64,20 @@ def pad_border(image: Tensor, radius: int | tuple[int, int], border: str, spare:
     return torch.nn.functional.pad(image, sides, mode=_PAD_MODES[border])
 
 
+def cropped(tensor: Tensor, margin: int) -> Tensor:
+    """Return a map without so many pixels on each side.
+
+    Example:
+        >>> cropped(torch.zeros(3, 8, 9), 2).shape
+        torch.Size([3, 4, 5])
+    """
+    return tensor[..., margin : tensor.shape[-2] - margin, margin : tensor.shape[-1] - margin]
+
+
 def padded_size(height: int, width: int, psf_size: int, border: str) -> tuple[int, int]:
     """Return the height and width that :func:`pad_border` gives an image."""
     extra = 0 if border == "valid" else 2 * (psf_size // 2)
     return height + extra, width + extra
-
-
-def next_fast_size(size: int) -> int:
-    """Return the smallest number of samples, at least ``size``, that has no prime factor above 5.
-
-    Example:
-        >>> next_fast_size(1046)
-        1080
-    """
-    while True:
-        rest = size
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return size
-        size += 1
 
 
 def to_spectrum(planes: Tensor, size: tuple[int, int]) -> Tensor:

@@ -9,77 +9,48 @@ camera with pixels k times as wide, and interpolated linearly. Averaging twice a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Protocol
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
-from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.psf.pieces import Piece
+from kornia_tidy.render.borders import cropped, next_fast_size
 from kornia_tidy.render.compositing import Bank, gather
 
 _SHARPENED = 1 / 6  # half of the variance that averaging and interpolating add on each axis
 _LAYER_BYTES = 64 << 20  # of the layers held at a time
 
 
-class LayerGroup(Protocol):
-    """Layers on one grid, see :class:`kornia_tidy.psf.wide_psfs.GroupBank`."""
-
-    @property
-    def grid(self) -> int:
-        """Sensor pixels along a side of a pixel of the grid."""
-        ...
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """Lowest and highest defocus of the group's pixels in radians."""
-        ...
-
-    @property
-    def bank(self) -> Bank:
-        """PSFs on the grid."""
-        ...
-
-
-def gather_groups(
-    image: Tensor, defocus: Tensor, groups: Iterable[LayerGroup], window: int, border: str = "reflect"
-) -> Tensor:
-    """Gather light through groups of layers, each on its own grid.
+def gather_group(image: Tensor, defocus: Tensor, group: Piece, border: str = "reflect") -> Tensor:
+    """Gather light through a group of layers on one grid, at the pixels that are the group's.
 
     Args:
         image: (B, C, H, W) linear light.
-        defocus: (B, 1, H, W) or (1, 1, H, W) radians. Beyond the groups it is clamped to the ends.
-        groups: in ascending order of defocus; every pixel lies in one of them.
-        window: side of the PSFs in sensor pixels, for the border ``"valid"``.
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians. Beyond the group's layers it is clamped to the ends.
+        group: PSFs, the span of defocus whose pixels it takes, and its grid; with ``window`` set, by half of which the
+            border ``"valid"`` crops.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`. Images smaller than a PSF's radius
             are reflected several times.
 
     Returns:
-        (B, C, h, w) light. Gradients reach image, defocus and PSFs.
+        (B, C, h, w) light, zero at pixels of other groups. Gradients reach image, defocus and PSFs.
 
     Example:
-        >>> from types import SimpleNamespace
-        >>> bank = SimpleNamespace(psfs=torch.full((2, 1, 5, 5), 1 / 25), defocus=torch.tensor([8.0, 9.0]), veil=None)
-        >>> group = SimpleNamespace(grid=2, span=(8.0, 9.0), bank=bank)
-        >>> gather_groups(torch.ones(1, 1, 16, 16), torch.full((1, 1, 16, 16), 8.2), [group], 11).mean().round()
+        >>> from kornia_tidy.psf import PSFBank
+        >>> bank = PSFBank(torch.full((2, 1, 5, 5), 1 / 25), torch.tensor([8.0, 9.0]), torch.ones(2, 1))
+        >>> group = Piece(lambda: bank, grid=2, window=11)
+        >>> gather_group(torch.ones(1, 1, 16, 16), torch.full((1, 1, 16, 16), 8.2), group).mean().round()
         tensor(1.)
     """
-    margin = window // 2 if border == "valid" else 0
-    height, width = image.shape[-2] - 2 * margin, image.shape[-1] - 2 * margin
-    seen = defocus[..., margin : margin + height, margin : margin + width]
-    parts = list(groups)
-    ends = seen.new_tensor([group.span[1] for group in parts[:-1]])
-    owner = torch.bucketize(seen.detach().contiguous(), ends, right=True)
-    fine = [group for group in parts if group.grid == 1]
-    if fine:
-        coded = _on_sensor(image, seen, fine[0].bank, margin, border).clone()
-    else:
-        coded = image.new_zeros(*image.shape[:2], height, width)
-    for number, group in enumerate(parts):
-        if group.grid > 1:
-            for b, pixels, light in _on_grid(image, seen, owner == number, group, margin, border):
-                coded.flatten(2)[b].index_copy_(1, pixels, light)
+    margin = (group.window or 0) // 2 if border == "valid" else 0
+    seen, own = cropped(defocus, margin), cropped(group.holds(defocus), margin)
+    if group.grid == 1:
+        return torch.where(own, _on_sensor(image, seen, group.bank(), margin, border), 0)
+    coded = image.new_zeros(*image.shape[:2], *seen.shape[-2:])
+    for b, pixels, light in _on_grid(image, seen, own, group, margin, border):
+        coded.flatten(2)[b].index_copy_(1, pixels, light.to(image.dtype))
     return coded
 
 
@@ -94,13 +65,14 @@ def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str
 
 
 def _on_grid(
-    image: Tensor, seen: Tensor, own: Tensor, group: LayerGroup, margin: int, border: str
+    image: Tensor, seen: Tensor, own: Tensor, group: Piece, margin: int, border: str
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Yield images of the batch, pixels (n,) of the group and their light (C, n), some layers at a time."""
-    grid, radius = group.grid, group.bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening
+    bank, grid = group.bank(), group.grid
+    radius = bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening
     rows, columns = ((margin - radius * grid, margin + (-(-side // grid) + radius) * grid) for side in seen.shape[-2:])
     plane = avg_pool2d(_extended(image, rows, columns, border), grid)
-    psfs, nodes = _sharpened(group.bank.psfs.to(plane.dtype)), group.bank.defocus.to(seen)
+    psfs, nodes = _sharpened(bank.psfs.to(plane.dtype)), bank.defocus.to(seen)
     size, lost = [next_fast_size(side) for side in plane.shape[-2:]], psfs.shape[-1] - 1
     spectrum = torch.fft.rfft2(plane, s=size)
     at_once = max(2, _LAYER_BYTES // max(1, plane.numel() * plane.element_size()))

@@ -178,8 +178,8 @@ class TestMovingCapture(BaseTester):
     def test_feature_psfs_are_computed_once_for_scenes_that_follow(self, monkeypatch):
         optics, (image, depth) = camera(), scene(torch.float32)
         built = []
-        build = PSFModel._build
-        monkeypatch.setattr(PSFModel, "_build", lambda self, *a, **k: built.append(1) or build(self, *a, **k))
+        build = PSFModel._exact_psfs
+        monkeypatch.setattr(PSFModel, "_exact_psfs", lambda self, *a, **k: built.append(1) or build(self, *a, **k))
         with torch.no_grad():
             for _ in range(3):
                 moving_capture(optics, *at_rest(optics, image, depth))

@@ -18,7 +18,7 @@ from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNois
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.psf import scene_psfs as module
+from kornia_tidy.psf import psf_model as module
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.runtime.threads import CaptureNotes, SharedLock
 from tests.base import BaseTester
@@ -247,11 +247,11 @@ class TestThreads(BaseTester):
                 return burst(optics, image, depth)
             return moving_capture(optics, torch.stack([image] * 2, 1), torch.stack([depth] * 2, 1))
 
-        optics, real = camera(), TiDyOptics.render
+        optics, real = camera(), TiDyOptics.irradiance
         with torch.no_grad():
             expected = take()
             monkeypatch.setattr(
-                TiDyOptics, "render", lambda self, *given: (real(self, *given), optics.masks.phase.add_(1))[0]
+                TiDyOptics, "irradiance", lambda self, *given: (real(self, *given), optics.masks.phase.add_(1))[0]
             )
             assert torch.equal(take(), expected)
             assert not torch.equal(take(), expected)

@@ -10,7 +10,8 @@ from torch.nn.functional import conv2d, interpolate, pad
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.planning.planner import Planner
-from kornia_tidy.render.compositing import render
+from kornia_tidy.psf.pieces import pieces_of
+from kornia_tidy.render.exposure import render_pieces
 from tests.scenes import load_scene
 
 
@@ -30,13 +31,9 @@ class Rig:
             self._cameras[key] = deepcopy(self.optics).with_fidelity(fidelity)
         dtype = torch.float64 if fidelity.double else torch.float32
         light, defocus = light.to(dtype), defocus.to(dtype)
-        occluding = self.optics.compositing == "occlusion"
-        banks = self._cameras[key].psf_model.scene_banks(light.shape[1], dtype, defocus, occluding)
-        layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        planes = light.repeat(1, banks[0][1].psfs.shape[1] // light.shape[1], 1, 1)  # one for each reflectance, if any
-        options = {"layers": layers, "border": self.optics.border}
-        coded = sum(share * render(planes, defocus, bank, self.optics.compositing, **options) for share, bank in banks)
-        return coded.unflatten(1, (light.shape[1], -1)).sum(2).double()
+        camera = self._cameras[key]
+        pieces = pieces_of(camera.psf_model, light.shape[1], dtype, defocus, camera.compositing)
+        return render_pieces(light, defocus, pieces, camera.rendering(light.device)).double()
 
     def error(self, light: Tensor, defocus: Tensor, fidelity: Fidelity, reference: Fidelity) -> float:
         """Return the root mean square difference of two captures, full scale 1 also where light goes beyond it.

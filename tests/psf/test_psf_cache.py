@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.psf import scene_psfs as module
+from kornia_tidy.psf import psf_model as module
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=5.0)

@@ -1,16 +1,18 @@
 """Gather on coarse grids, against gather on the sensor's pixels."""
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import pytest
 import torch
 
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.geometric_psf import geometric_psfs
+from kornia_tidy.psf.pieces import Piece
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import pupil_over
 from kornia_tidy.psf.wide_blur import GRID_ERROR, SCENE_DEVIATION, window_of
-from kornia_tidy.render.coarse_gather import gather_groups
+from kornia_tidy.render.coarse_gather import gather_group
 from kornia_tidy.render.compositing import gather
 from tests.base import BaseTester
 
@@ -18,13 +20,19 @@ STEP = 1.625e-6
 PUPIL = pupil_over((1, 23, 23), None, 1.0)
 
 
-def group_of(radii: tuple[float, ...], grid: int, dtype: torch.dtype = torch.float32) -> SimpleNamespace:
-    """Discs of these radii in pixels, on a grid."""
-    nodes = [radius * math.pi * STEP / REFERENCE_WAVELENGTH for radius in radii]
-    window = window_of(max(radii), STEP, PUPIL.extent, grid)
-    psfs = geometric_psfs(PUPIL.amplitude, PUPIL.cell_pitch, nodes, STEP * grid, window).to(dtype)[:, None]
-    bank = SimpleNamespace(psfs=psfs, defocus=torch.tensor(nodes, dtype=dtype), veil=None)
-    return SimpleNamespace(grid=grid, span=(nodes[0], nodes[-1]), bank=bank)
+def defocus_of(radius: float) -> float:
+    """Defocus in radians whose disc has a radius in pixels."""
+    return radius * math.pi * STEP / REFERENCE_WAVELENGTH
+
+
+def group_of(radii: tuple[float, ...], grid: int, dtype: torch.dtype = torch.float32, span=None, window=0) -> Piece:
+    """Discs of these radii in pixels, on a grid, for the pixels of a span of radii."""
+    nodes = [defocus_of(radius) for radius in radii]
+    side = window_of(max(radii), STEP, PUPIL.extent, grid)
+    psfs = geometric_psfs(PUPIL.amplitude, PUPIL.cell_pitch, nodes, STEP * grid, side).to(dtype)[:, None]
+    bank = PSFBank(psfs, torch.tensor(nodes, dtype=dtype), psfs.sum((2, 3)))
+    ends = None if span is None else (defocus_of(span[0]), defocus_of(span[1]))
+    return Piece(lambda: bank, 1.0, ends, grid, window)
 
 
 def light(size: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -36,57 +44,59 @@ def light(size: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
     return (0.5 + SCENE_DEVIATION * plane / plane.std()).to(dtype)
 
 
-class TestGatherGroups(BaseTester):
+class TestGatherGroup(BaseTester):
     def test_smoke_white_stays_white(self):
         seen = torch.linspace(220.0, 340.0, 60).expand(2, 1, 40, 60)
-        white = gather_groups(torch.ones(2, 1, 40, 60), seen, [group_of((24.0, 30.0, 36.0), 2)], 85)
+        white = gather_group(torch.ones(2, 1, 40, 60), seen, group_of((24.0, 30.0, 36.0), 2))
         self.assert_close(white, torch.ones_like(white), rtol=0, atol=2e-6)
 
     def test_feature_error_of_the_grid_is_within_the_promise(self):
         for radius, grid in ((24.0, 2), (48.0, 4)):
             one, fine, coarse = light(160), group_of((radius,), 1), group_of((radius,), grid)
-            psi = torch.full((1, 1, 160, 160), fine.span[0])
-            found = gather_groups(one, psi, [coarse], 131, "circular")
-            exact = gather(one, psi, fine.bank.defocus, fine.bank.psfs, border="circular")
+            psi = torch.full((1, 1, 160, 160), defocus_of(radius))
+            found = gather_group(one, psi, coarse, "circular")
+            exact = gather(one, psi, fine.bank().defocus, fine.bank().psfs, border="circular")
             assert float((found - exact).square().mean().sqrt()) < 1.3 * GRID_ERROR
 
     def test_feature_each_pixel_takes_the_group_of_its_defocus(self):
-        fine, coarse = group_of((8.0, 24.0), 1), group_of((24.0, 32.0), 2)
+        fine = group_of((8.0, 24.0), 1, span=(-math.inf, 24.0))
+        coarse = group_of((24.0, 32.0), 2, span=(24.0, math.inf))
         one = light(96)
-        psi = torch.linspace(fine.span[0], coarse.span[1], 96).expand(1, 1, 96, 96)
-        found = gather_groups(one, psi, [fine, coarse], 75, "circular")
-        exact = [group_of((r0, r1), 1).bank for r0, r1 in ((8.0, 24.0), (24.0, 32.0))]
+        psi = torch.linspace(defocus_of(8.0), defocus_of(32.0), 96).expand(1, 1, 96, 96)
+        found = sum(gather_group(one, psi, group, "circular") for group in (fine, coarse))
+        exact = [group_of((r0, r1), 1).bank() for r0, r1 in ((8.0, 24.0), (24.0, 32.0))]
         both = [gather(one, psi, bank.defocus, bank.psfs, border="circular") for bank in exact]
-        expected = torch.where(psi < coarse.span[0], both[0], both[1])
+        expected = torch.where(psi < defocus_of(24.0), both[0], both[1])
         assert float((found - expected).square().mean().sqrt()) < 1.3 * GRID_ERROR
 
     def test_cardinality_of_borders_and_odd_sizes(self):
-        coarse = group_of((24.0, 30.0), 4)
+        coarse = group_of((24.0, 30.0), 4, window=71)
         for border in ("reflect", "replicate", "zero", "circular"):
             seen = torch.full((1, 1, 33, 50), 250.0)
-            assert gather_groups(torch.rand(2, 1, 33, 50), seen, [coarse], 71, border).shape == (2, 1, 33, 50)
+            assert gather_group(torch.rand(2, 1, 33, 50), seen, coarse, border).shape == (2, 1, 33, 50)
         seen = torch.full((1, 1, 90, 101), 250.0)
-        assert gather_groups(torch.rand(2, 1, 90, 101), seen, [coarse], 71, "valid").shape == (2, 1, 20, 31)
+        assert gather_group(torch.rand(2, 1, 90, 101), seen, coarse, "valid").shape == (2, 1, 20, 31)
 
     def test_feature_few_layers_at_a_time_change_nothing(self, monkeypatch):
         group, one = group_of((24.0, 26.0, 28.0, 31.0, 34.0), 2), light(64)
-        psi = torch.linspace(group.span[0], group.span[1], 64).expand(1, 1, 64, 64)
-        whole = gather_groups(one, psi, [group], 79)
+        psi = torch.linspace(defocus_of(24.0), defocus_of(34.0), 64).expand(1, 1, 64, 64)
+        whole = gather_group(one, psi, group)
         monkeypatch.setattr("kornia_tidy.render.coarse_gather._LAYER_BYTES", 1)
-        self.assert_close(gather_groups(one, psi, [group], 79), whole, rtol=0, atol=1e-6)
+        self.assert_close(gather_group(one, psi, group), whole, rtol=0, atol=1e-6)
 
     @pytest.mark.takes_seconds
     def test_gradcheck_of_image_defocus_and_psfs(self):
-        fine, coarse = group_of((1.0, 3.0), 1, torch.float64), group_of((3.0, 5.0), 2, torch.float64)
-        psi = torch.tensor([1.3, 2.1, 3.4, 4.2, 4.6], dtype=torch.float64) * math.pi * STEP / REFERENCE_WAVELENGTH
+        fine = group_of((1.0, 3.0), 1, torch.float64, (0.0, 3.0))
+        coarse = group_of((3.0, 5.0), 2, torch.float64, (3.0, 9.0))
+        psi = torch.tensor([defocus_of(radius) for radius in (1.3, 2.1, 3.4, 4.2, 4.6)], dtype=torch.float64)
         seen = psi.expand(1, 1, 4, 5).clone()
 
         def render(image, defocus, psfs):
-            bank = SimpleNamespace(psfs=psfs, defocus=coarse.bank.defocus, veil=None)
-            group = SimpleNamespace(grid=2, span=coarse.span, bank=bank)
-            return gather_groups(image, defocus, [fine, group], 21)
+            bank = replace(coarse.bank(), psfs=psfs)
+            group = replace(coarse, bank=lambda: bank)
+            return gather_group(image, defocus, fine) + gather_group(image, defocus, group)
 
-        inputs = (torch.rand(1, 1, 4, 5, dtype=torch.float64), seen, coarse.bank.psfs.clone())
+        inputs = (torch.rand(1, 1, 4, 5, dtype=torch.float64), seen, coarse.bank().psfs.clone())
         for x in inputs:
             x.requires_grad_()
         torch.autograd.gradcheck(render, inputs)

@@ -1,0 +1,59 @@
+"""Large pictures: a capture that would not fit the memory allowed is taken some rows at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from torch import Tensor
+
+from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample
+from kornia_tidy.render.bands import padded_band
+from kornia_tidy.sensor.noise import STRIP
+
+
+def rows_at_once(sample: Sample, allowed: int) -> int | None:
+    """Return how many rows of a capture fit into so many bytes; None for all.
+
+    It is a multiple of those that noise is drawn for at once.
+
+    Args:
+        sample: image and depth.
+        allowed: bytes beside image and capture.
+    """
+    batch, _, height, width = sample.image.shape
+    row = 3 * BYTES_A_VALUE * sample.dtype.itemsize // 4 * batch * width
+    rows = max(STRIP, (allowed - BYTES_OF_TILES) // row // STRIP * STRIP)
+    return None if rows >= height else rows
+
+
+def strips_of(
+    sample: Sample, rows: int, height: int, radius: int, border: str
+) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """Yield rows of a capture, with the image and the depth that they are seen from.
+
+    Args:
+        sample: image and depth.
+        rows: of a strip.
+        height: of the capture.
+        radius: of the PSFs: how far the image of a strip reaches beyond it, to be rendered with the border ``"valid"``.
+        border: of the capture.
+    """
+    sides = "replicate" if border == "zero" else border  # black has no depth of its own
+    for top in range(0, height, rows):
+        strip = slice(top, min(top + rows, height))
+        yield strip, padded_band(sample.image, strip, radius, border), padded_band(sample.depth, strip, radius, sides)
+
+
+def placed(whole: Tensor | None, part: Tensor, rows: slice, height: int) -> Tensor:
+    """Return a picture with some of its rows filled in.
+
+    Args:
+        whole: the picture so far; None before its first rows, which come first.
+        part: (B, C, rows, W).
+        rows: where they belong.
+        height: of the picture.
+    """
+    if whole is None:
+        whole = part.new_empty(*part.shape[:-2], height, part.shape[-1])
+    whole[..., rows, :] = part
+    return whole

@@ -1,0 +1,227 @@
+r"""The stream of PSF pieces that a capture is a sum over.
+
+.. math:: I = \sum_p s_p \, \mathcal{R}(L, \psi; h_p)
+
+Ordinarily there is one piece. There are several where the states of an exposure are rendered one by one (occlusion),
+where the PSFs of all layers would not fit the memory allowed (runs of layers), and where blur is wide (groups of layers
+on coarse grids). A piece computes its PSFs when it is asked for them, so that a plan of pieces costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from math import inf
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.kernels.window_sides import next_fast_size
+from kornia_tidy.psf.defocus_interpolation import nodes_around
+from kornia_tidy.psf.exact import without_kernel_cache
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_model import EACH, PSFModel
+from kornia_tidy.psf.wide_blur import WideBlur
+from kornia_tidy.psf.wide_psfs import held_nodes
+from kornia_tidy.runtime.reading import is_unread
+from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
+
+LEAST_BYTES = 12 << 20  # allowed to a piece whatever the budget
+_COPIES = 4  # of PSFs, while a bank is computed, stacked and normalised
+_TILE = 4  # side of the tiles' transforms over that of the PSFs: with smaller tiles their overlap is most of them
+_POINTS = 100  # bytes for each pixel along a PSF's side and each mask pixel: the matrices of the propagation
+_MOST_COPIES = 64  # of PSFs: while they are computed, and in their spectra, for each state
+_BANKS = 3  # held at a time by scatter and occlusion through wide blur: of layers, and their spectra
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """The PSFs of a part of a capture.
+
+    Args:
+        bank: computes the PSFs, or finds them in a memory.
+        share: of the exposure; (S,) where the bank holds the PSFs of S states, those of a state after each other.
+        span: defocus in radians from the first to below the second whose pixels are the piece's; None for all.
+        grid: sensor pixels along a side of a pixel of the PSFs.
+        window: side in sensor pixels that holds the PSFs of all pieces, where they differ: a border ``"valid"`` crops
+            by it.
+        keep: False for PSFs that are made for each use, and once more in the backward pass.
+    """
+
+    bank: Callable[[], PSFBank]
+    share: Tensor | float = 1.0
+    span: tuple[float, float] | None = None
+    grid: int = 1
+    window: int | None = None
+    keep: bool = True
+
+    def holds(self, defocus: Tensor) -> Tensor:
+        """Return which pixels of a defocus map are the piece's."""
+        first, last = (-inf, inf) if self.span is None else self.span
+        own = defocus.detach().double()  # as layers are assigned
+        return (own >= first) & (own < last)
+
+
+def pieces_of(
+    model: PSFModel,
+    channels: int,
+    dtype: torch.dtype,
+    reach: Tensor,
+    compositing: str = "gather",
+    budget: int | None = None,
+    scene: Tensor | None = None,
+    device: torch.device | None = None,
+) -> Iterator[Piece]:
+    """Yield what a capture is a sum over: one piece in the ordinary case.
+
+    Args:
+        model: as it is at one moment.
+        channels: of the image: those of the spectrum, or 1.
+        dtype: float32 or float64.
+        reach: lowest and highest defocus of the scene in radians, (2,), or its map.
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
+        budget: bytes for PSFs and images together. Half of it is for PSFs, their computation and their spectra, but at
+            least :data:`LEAST_BYTES`. Default: all PSFs at once. PSFs that were measured or are interpolated over
+            defocus come as a whole in any case, and so do all on accelerators and in compiled code.
+        scene: the map, where it is at hand: of depths between that it does not hold, some are left out.
+        device: of measured PSFs. Default: that of ``reach``.
+
+    Raises:
+        ValueError: if blur is so wide that scatter or occlusion would need more than the budget.
+
+    Example:
+        >>> [piece] = pieces_of(PSFModel(fidelity="draft"), 3, torch.float32, torch.tensor([-4.0, 5.0]))
+        >>> piece.bank().psfs.shape[:2], piece.span
+        (torch.Size([7, 3]), None)
+    """
+    scene = reach if scene is None else scene
+    if (blur := None if is_value_unknown() else model.wide_blur) is not None:
+        if compositing == "gather" and scene.numel():
+            yield from _wide_pieces(model, blur, channels, dtype, scene)
+            return
+        _check_wide_bytes(blur, channels, dtype, compositing, budget)
+    most, remembered = None, True
+    if blur is None and budget is not None and not _surely_fits(model, channels, dtype, budget):
+        most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
+    make = partial(model.scene_bank, channels, dtype, device=device or reach.device)
+    if not remembered:
+        make = partial(_forgotten, model, channels, dtype)
+    if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
+        shares = model.state_weights(dtype)
+        if is_unread():  # all states in one bank, for one rendering
+            yield Piece(partial(make, reach, EACH), shares)
+            return
+        for state, share in enumerate(shares):
+            yield Piece(partial(make, reach, state), share, keep=most is None)
+    elif most is None:
+        yield Piece(partial(make, reach))
+    else:
+        for span in _runs(model.defocus_nodes, scene, most - 1):
+            ends = torch.tensor(span, dtype=torch.float64)
+            yield Piece(partial(make, ends), span=_open_ended(span, model.defocus_nodes), keep=False)
+
+
+def comes_in_pieces(model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int) -> bool:
+    """Return whether PSFs of all the camera's range exceed what a memory budget allows them. See :func:`pieces_of`."""
+    reach = torch.tensor(model.camera.defocus_range, dtype=torch.float64)
+    return _most_layers(model, channels, dtype, reach, compositing, budget)[0] is not None
+
+
+def layer_bytes(model: PSFModel, channels: int, dtype: torch.dtype) -> tuple[int, int]:
+    """Return the bytes that a layer takes: of its PSFs, and of their computation and their spectra.
+
+    Args:
+        model: of the PSFs.
+        channels: of the image.
+        dtype: float32 or float64.
+
+    Example:
+        >>> from kornia_tidy import Fidelity
+        >>> psfs, work = layer_bytes(PSFModel(fidelity=Fidelity(window=65)), 3, torch.float32)
+        >>> psfs >> 10, work >> 20
+        (198, 2)
+    """
+    side, cells = model.window, model.pupil.amplitude.shape[-1]
+    planes = channels * len(model.spectrum.basis or (1,))
+    tile = next_fast_size(_TILE * side)
+    psfs = _COPIES * planes * side**2 * dtype.itemsize
+    work = 2 * planes * tile**2 * dtype.itemsize + 2 * side * cells**2 * dtype.itemsize + _POINTS * side * cells
+    return psfs, work
+
+
+def runs_of(present: list[bool], most: int) -> list[tuple[int, int]]:
+    """Return begin and end of runs of consecutive present entries, of at most so many.
+
+    Example:
+        >>> runs_of([True, True, True, False, True], 2)
+        [(0, 2), (2, 3), (4, 5)]
+    """
+    edges = [i for i, (before, own) in enumerate(pairwise([False, *present, False])) if before != own]
+    runs = zip(edges[::2], edges[1::2], strict=True)
+    return [(start, min(start + most, stop)) for first, stop in runs for start in range(first, stop, most)]
+
+
+def _surely_fits(model: PSFModel, channels: int, dtype: torch.dtype, budget: int) -> bool:
+    """Return whether PSFs of all the camera's range fit half of a budget, whatever their window."""
+    (lo, hi), fidelity = model.camera.defocus_range, model.fidelity
+    samples = ((hi - lo) / fidelity.layer_spacing + 1) * (fidelity.window or fidelity.max_window) ** 2
+    return _MOST_COPIES * samples * channels * dtype.itemsize <= budget // 2
+
+
+def _most_layers(
+    model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, compositing: str, budget: int
+) -> tuple[int | None, bool]:
+    """Return the most layers of a piece, None where all fit at once, and whether PSFs are remembered."""
+    whole, fidelity = (None, True), model.fidelity
+    if is_followed() or is_unread() or not reach.numel() or model.measured is not None:
+        return whole
+    if fidelity.layers not in ("nearest", "linear") or (layers := len(nodes_around(model.defocus_nodes, reach))) < 3:
+        return whole
+    psfs, work = layer_bytes(model, channels, dtype)
+    allowed = max(budget // 2, LEAST_BYTES)
+    if compositing == "occlusion":
+        states = len(model.state_weights(dtype)) if fidelity.occlusion_states == "each" else 1
+        return whole if states == 1 or states * layers * psfs <= allowed else (layers, False)
+    if layers * (psfs + work) <= allowed:
+        return whole
+    return max(2, allowed // (psfs + work)), layers * psfs <= allowed
+
+
+def _forgotten(model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, state: int | None = None) -> PSFBank:
+    with without_kernel_cache():
+        return model.without_memory().scene_bank(channels, dtype, reach, state)
+
+
+def _wide_pieces(model: PSFModel, blur: WideBlur, channels: int, dtype: torch.dtype, scene: Tensor) -> Iterator[Piece]:
+    held = held_nodes(blur, scene)
+    ends = [-inf, *(group.nodes[-1] for group, _ in held[:-1]), inf]
+    for (group, nodes), span in zip(held, pairwise(ends), strict=True):
+        yield Piece(partial(model.group_bank, channels, dtype, group, nodes), 1.0, span, group.grid, blur.window)
+
+
+def _check_wide_bytes(blur: WideBlur, channels: int, dtype: torch.dtype, compositing: str, budget: int | None) -> None:
+    needed = _BANKS * len(blur.nodes) * channels * dtype.itemsize * blur.window**2
+    if budget is not None and needed > budget:
+        raise ValueError(
+            f"compositing {compositing!r} of this lens needs {len(blur.nodes)} layers of PSFs {blur.window} px wide, "
+            f"some {needed / 2**30:.1f} GiB, of which memory_budget allows {budget / 2**30:.1f} GiB: take "
+            f"compositing='gather', a smaller aperture, a narrower depth_range, or a larger memory_budget"
+        )
+
+
+def _runs(nodes: tuple[float, ...], scene: Tensor, most: int) -> Iterator[tuple[float, float]]:
+    """Yield the first and last node of each run of layers that hold pixels of a scene: (2,) or a map."""
+    inner = torch.tensor(nodes[1:-1], dtype=torch.float64, device=scene.device)
+    interval = torch.bucketize(scene.detach().double().contiguous(), inner, right=True)
+    present = torch.bincount(interval.flatten(), minlength=len(nodes) - 1) > 0
+    if scene.ndim == 1:
+        present[int(interval.min()) : int(interval.max()) + 1] = True
+    for first, last in runs_of(present.tolist(), most):
+        yield nodes[first], nodes[last]
+
+
+def _open_ended(span: tuple[float, float], nodes: tuple[float, ...]) -> tuple[float, float]:
+    """Return a span that takes in what lies beyond the outermost layers."""
+    return (-inf if span[0] == nodes[0] else span[0], inf if span[1] == nodes[-1] else span[1])
