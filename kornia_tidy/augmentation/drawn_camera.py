@@ -152,13 +152,14 @@ class RowSensors(nn.Module):
         irradiance: Tensor,
         params: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
+        origin: tuple[int, int] = (0, 0),
     ) -> Tensor:
         """Return what the sensors record. ``params`` and ``generator`` are not for rows with their own noise."""
         rows = []
         for row, light in enumerate(irradiance.split(1)):
             seen = light if self.exposures is None else light * self.exposures[row]
             sensor = self.sensors[row]
-            rows.append(seen if sensor is None else sensor(seen, generator=self.generators[row]))
+            rows.append(seen if sensor is None else sensor(seen, generator=self.generators[row], origin=origin))
         return torch.cat(rows)
 
 

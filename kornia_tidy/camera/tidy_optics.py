@@ -24,7 +24,7 @@ from kornia_tidy.camera.samples import (
     tell_of_defocus,
 )
 from kornia_tidy.camera.strips import placed, rows_at_once, strips_of
-from kornia_tidy.checks import check_choice, check_part, check_positive
+from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.spectrum import Spectrum
@@ -38,6 +38,7 @@ from kornia_tidy.runtime.reading import is_unread, values_unread
 from kornia_tidy.runtime.threads import CaptureNotes
 from kornia_tidy.runtime.tracing import is_followed, is_transformed, is_value_unknown
 from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import Sensor, check_sensor
 from kornia_tidy.systems.presets import published_system
 
 if TYPE_CHECKING:
@@ -150,8 +151,7 @@ class TiDyOptics(CameraState):
                 "compositing 'occlusion' needs colours without spectra of their own, got a spectrum with a basis: "
                 "leave reflectance=True out, or use 'gather' or 'scatter'"
             )
-        if sensor is not None:
-            check_part("sensor", sensor, nn.Module, "a sensor such as SensorNoise(0.01), or None for no noise")
+        check_sensor(sensor)
         self.sensor = SensorNoise(0.01) if sensor is _DEFAULT_SENSOR else sensor  # cameras share no part by default
         self.compositing = compositing
         self.color_space = color_space
@@ -348,9 +348,11 @@ class TiDyOptics(CameraState):
         """
         if self.sensor is None:
             return irradiance
-        if params is not None and rows is not None:
+        if rows is None:
+            return self.sensor(irradiance, params=params, generator=generator)
+        if params is not None:
             params = {name: field[..., rows, :] for name, field in params.items()}
-        return self.sensor(irradiance, params=params, generator=generator)
+        return self.sensor(irradiance, params=params, generator=generator, origin=(rows.start, 0))
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.
@@ -364,7 +366,7 @@ class TiDyOptics(CameraState):
         height, width = cropped(image, self.window // 2 if self.border == "valid" else 0).shape[-2:]
         shape = (*(image.shape[:2] if image.ndim == 4 else (1, image.shape[0])), height, width)
         dtype = compute_dtype(image.dtype, self.fidelity, image.device)
-        return cast("SensorNoise", self.sensor).draw(shape, device=image.device, dtype=dtype, generator=generator)
+        return cast("Sensor", self.sensor).draw(shape, device=image.device, dtype=dtype, generator=generator)
 
     # ------------------------------------------------------------------ how exactly to compute
 

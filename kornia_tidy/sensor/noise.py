@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_number, check_positive
+from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at
 from kornia_tidy.sensor.shot import shot_noise
 
 
@@ -51,10 +52,10 @@ class SensorNoise(nn.Module):
 
     The steps, with full scale = 1.0 = ``full_well`` electrons:
 
-    1. shot noise: N = Poisson(full_well · max(image, 0) + dark), one draw for signal and dark signal;
+    1. shot noise: N = Poisson(full_well · max(image · response, 0) + dark), one draw for signal and dark signal;
     2. full well: N is limited to ``full_well``;
     3. black level: (N - dark) / full_well;
-    4. read noise: a Gaussian of standard deviation ``sigma`` is added;
+    4. read noise: a Gaussian of standard deviation ``sigma``, and ``offset``, are added;
     5. converter: the value is rounded to ``bits``, see :func:`quantize`;
     6. the value is clipped to [0, 1].
 
@@ -68,6 +69,9 @@ class SensorNoise(nn.Module):
             Its mean is subtracted as black level, so a saturated pixel has the value 1 - dark / full_well.
         bits: bits of the converter, 1 to 16. None: no rounding.
         clip: limit to the full well and to [0, 1]. False keeps highlights above 1 (HDR) and negative noise.
+        response: of each pixel to light, 1 on average (PRNU): (H, W) or (C, H, W) of the whole sensor, with 1 in the
+            place of H or W where rows or columns are alike. None: all pixels respond alike.
+        offset: of each pixel in units of full scale (DSNU, columns), as ``response``. See :func:`draw_pattern`.
 
     Raises:
         ValueError: if a value is out of its range, or ``dark`` is given without ``full_well``.
@@ -89,6 +93,9 @@ class SensorNoise(nn.Module):
         tensor([0.0000, 0.5000, 1.0000])
     """
 
+    response: Tensor | None
+    offset: Tensor | None
+
     def __init__(
         self,
         sigma: float = 0.01,
@@ -97,6 +104,8 @@ class SensorNoise(nn.Module):
         dark: float = 0.0,
         bits: int | None = None,
         clip: bool = True,
+        response: Tensor | None = None,
+        offset: Tensor | None = None,
     ) -> None:
         super().__init__()
         _check_not_negative("sigma", sigma, "in units of full scale")
@@ -110,6 +119,9 @@ class SensorNoise(nn.Module):
         if bits is not None:
             _check_bits(bits)
         self.sigma, self.full_well, self.dark, self.bits, self.clip = sigma, full_well, dark, bits, clip
+        for name, plane in (("response", response), ("offset", offset)):
+            check_pattern(name, plane)
+            self.register_buffer(name, plane)
 
     @classmethod
     def physical(
@@ -135,7 +147,11 @@ class SensorNoise(nn.Module):
         return cls(read_noise_electrons / full_well, full_well=full_well, dark=dark_electrons, bits=bits)
 
     def forward(
-        self, image: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
+        self,
+        image: Tensor,
+        params: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+        origin: tuple[int, int] = (0, 0),
     ) -> Tensor:
         """Return the noisy image.
 
@@ -145,14 +161,16 @@ class SensorNoise(nn.Module):
                 ``torch.compile``.
             generator: source of random numbers, in eager mode only; it may be on another device than the image.
                 Default: the global generator of the image's device.
+            origin: row and column of the sensor at the image's first pixel, by which ``response`` and ``offset`` are
+                found. The noise does not depend on it.
 
         Returns:
             The same shape and dtype.
 
         Raises:
             TypeError: if the image is not a floating-point tensor.
-            ValueError: if the image is not (B, C, H, W), a field is missing or has another shape, or both ``params``
-                and ``generator`` are given.
+            ValueError: if the image is not (B, C, H, W), a field is missing or has another shape, both ``params``
+                and ``generator`` are given, or the image reaches beyond the pixels of ``response`` or ``offset``.
         """
         check_float_tensor("image", image, 4, "(B, C, H, W)")
         value = image.to(torch.promote_types(image.dtype, torch.float32))
@@ -162,6 +180,8 @@ class SensorNoise(nn.Module):
             raise ValueError("give params to replay or generator to draw, got both")
         else:
             fields = {name: self._field(params, name, value) for name in self._field_names()}
+        if self.response is not None:
+            value = value * pattern_at("response", self.response, value, origin)
         if self.full_well is not None:
             electrons = shot_noise(value.clamp(min=0) * self.full_well + self.dark, fields["shot"])
             if self.clip:
@@ -169,6 +189,8 @@ class SensorNoise(nn.Module):
             value = (electrons - self.dark) / self.full_well
         if self.sigma > 0:
             value = value + self.sigma * fields["read"]
+        if self.offset is not None:
+            value = value + pattern_at("offset", self.offset, value, origin)
         if self.bits is not None:
             value = quantize(value, self.bits)
         if self.clip:
@@ -176,7 +198,7 @@ class SensorNoise(nn.Module):
         return value.to(image.dtype)
 
     def std(self, image: Tensor) -> Tensor:
-        r"""Return the standard deviation of the noise in each pixel, before the clip.
+        r"""Return the standard deviation of the noise in each pixel, before the clip; a fixed pattern is none.
 
         .. math:: \sqrt{\sigma^2 + (x + d / w) / w + q^2 / 12}
 
@@ -266,10 +288,12 @@ class SensorNoise(nn.Module):
 
     def extra_repr(self) -> str:
         """Return a one-line description of the sensor."""
+        pattern = [name for name in ("response", "offset") if getattr(self, name) is not None]
         words = [f"read noise {self.sigma:g} of full scale" if self.sigma > 0 else "no read noise"]
         words += ["no shot noise" if self.full_well is None else f"full well {self.full_well:g} electrons"]
         words += [f"dark signal {self.dark:g} electrons"] if self.dark else []
         words += [] if self.bits is None else [f"{self.bits} bits"]
+        words += [f"pixels with {' and '.join(pattern)} of their own"] if pattern else []
         words += ["clipped to [0, 1]" if self.clip else "not clipped"]
         return ", ".join(words)
 
