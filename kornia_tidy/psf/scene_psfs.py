@@ -355,10 +355,14 @@ class ScenePSFs(WidePSFs):
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:
-        """Return the PSFs at both ends of the range and at focus, good enough to see where the light goes."""
+        """Return the PSFs at both ends of the range and at focus, good enough to see where the light goes.
+
+        As shares of the light in the field: of what crosses a cell at a hard edge, a mean field holds a part only.
+        """
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-        return self._build(*self.states(torch.float32), self._sampled.flat(), size, 0.1, nodes).psfs
+        psfs = self._build(*self.states(torch.float32), self._sampled.flat(), size, 0.1, nodes).psfs
+        return psfs if self.fidelity.propagation == "paper" else psfs / self.pupil.field_share
 
     def _check_layers(self) -> None:
         check_defocus_range(self.camera.defocus_range, self.pixel_step, self.fidelity, self.fixed_window)

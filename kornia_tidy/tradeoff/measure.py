@@ -246,7 +246,7 @@ def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDy
         color_space="paper" if fidelity.propagation == "paper" else "linear",  # neither decodes nor encodes
         border=optics.border,
         spectrum=optics.spectrum,
-        aperture=optics.pupil.amplitude,
+        aperture=optics.aperture,
     )
 
 

@@ -22,7 +22,7 @@ def group_of(radii: tuple[float, ...], grid: int, dtype: torch.dtype = torch.flo
     """Discs of these radii in pixels, on a grid."""
     nodes = [radius * math.pi * STEP / REFERENCE_WAVELENGTH for radius in radii]
     window = window_of(max(radii), STEP, PUPIL.extent, grid)
-    psfs = geometric_psfs(PUPIL.amplitude, PUPIL.cell_pitch, nodes, STEP * grid, window).to(dtype)[:, None]
+    psfs = geometric_psfs(PUPIL.transmission, PUPIL.cell_pitch, nodes, STEP * grid, window).to(dtype)[:, None]
     bank = SimpleNamespace(psfs=psfs, defocus=torch.tensor(nodes, dtype=dtype), veil=None)
     return SimpleNamespace(grid=grid, span=(nodes[0], nodes[-1]), bank=bank)
 
