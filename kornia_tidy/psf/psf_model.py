@@ -178,7 +178,9 @@ class PSFModel(ScenePSFs):
             >>> model.window, torch.equal(model.psf_bank().psfs, measured.psfs)
             (5, True)
         """
-        return self.replace(fidelity=self.fidelity.replace(occlusion_states="mean"))._replace(measured=bank)
+        cut = bool((bank.psfs == 0).any())
+        mean = self.replace(fidelity=self.fidelity.replace(occlusion_states="mean"))
+        return mean._replace(measured=bank, measured_cut=cut)
 
     def with_window(self, window: FittedWindow | None) -> Self:
         """Return this model with a window that is known; None measures it, and finds the pupil, when it is asked for.

@@ -51,6 +51,7 @@ class ScenePSFs(WidePSFs):
     aperture: Tensor | None
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
+    measured_cut: bool  # whether measured PSFs are zero somewhere
     shown: Timeline | None  # what a snapshot shows, which masks that change leave alone
     lock: SharedLock  # held while masks are read, and by whoever changes several of them at once
 
@@ -68,7 +69,7 @@ class ScenePSFs(WidePSFs):
         aperture: Tensor | None = None,
     ) -> None:
         unset = dict.fromkeys(("measured", "state", "moment", "shown"))
-        vars(self).update(unset, lock=SharedLock(), _memories={})
+        vars(self).update(unset, measured_cut=False, lock=SharedLock(), _memories={})
         parts = self.replace(
             fidelity=Fidelity.of(fidelity),
             masks=PixelwiseMask() if masks is None else masks,
@@ -150,13 +151,15 @@ class ScenePSFs(WidePSFs):
             channels: of the image: those of the spectrum, or 1.
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
-            each_state: return a bank for each state of the exposure, not their average, unless the fidelity takes the
-                mean PSFs in any case. In one bank, (D, S C, P, P), with shares (S,), where values are left unread.
+            each_state: for occlusion: return a bank for each state of the exposure, not their average, unless the
+                fidelity takes the mean PSFs in any case. In one bank, (D, S C, P, P), with shares (S,), where values
+                are left unread. PSFs that are cut to zero get tails, see :meth:`PSFBank.with_tails`.
             device: of measured PSFs. Default: that of ``defocus``.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
         if self.measured is not None:
-            return [(1.0, self._measured_bank(spectrum, dtype, device or defocus.device))]
+            bank = self._measured_bank(spectrum, dtype, device or defocus.device)
+            return [(1.0, bank.with_tails() if each_state and self.measured_cut else bank)]
         nodes, kind = self.defocus_nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         interpolated = kind not in ("nearest", "linear")
@@ -172,6 +175,8 @@ class ScenePSFs(WidePSFs):
                 bank = self._interpolated_bank(spectrum, dtype, targets, state).with_stray_light(*stray_light)
             else:
                 bank = self._computed_bank(spectrum, dtype, targets, state, stray_light)
+            if each_state and self.wide_blur is not None:  # geometric discs end
+                bank = bank.with_tails()
             banks.append((share, bank))
         return banks
 

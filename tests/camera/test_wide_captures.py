@@ -100,6 +100,14 @@ class TestWideCaptures(BaseTester):
         other = fast_camera(compositing=compositing)(image, depth)
         assert float((gathered - other).square().mean().sqrt()) < 1e-3
 
+    @torch.no_grad()
+    def test_feature_white_behind_something_near_stays_white(self):
+        """Geometric discs end, and so does what occlusion sees through them: it was 0.83 at the outline."""
+        optics, depth = fast_camera(compositing="occlusion"), torch.full((1, 1, 64, 64), 2.0)
+        depth[..., :32] = 1.55
+        white = optics(torch.ones(1, 3, 64, 64), depth)
+        assert 0.997 < float(white.min()) <= float(white.max()) < 1 + 1e-5
+
     def test_exception_of_occlusion_beyond_the_memory(self):
         optics = fast_camera(1.4, 0.5, compositing="occlusion")
         with pytest.raises(ValueError, match=r"needs 155 layers of PSFs 699 px wide, some .* GiB"):
