@@ -103,9 +103,9 @@ class TestWideCaptures(BaseTester):
     @torch.no_grad()
     def test_feature_white_behind_something_near_stays_white(self):
         """Geometric discs end, and so does what occlusion sees through them: it was 0.83 at the outline."""
-        optics, depth = fast_camera(compositing="occlusion"), torch.full((1, 1, 64, 64), 2.0)
-        depth[..., :32] = 1.55
-        white = optics(torch.ones(1, 3, 64, 64), depth)
+        optics, depth = fast_camera(1.8, compositing="occlusion"), torch.full((1, 1, 128, 128), 2.0)
+        depth[..., :64] = 1.55
+        white = optics(torch.ones(1, 3, 128, 128), depth)
         assert 0.997 < float(white.min()) <= float(white.max()) < 1 + 1e-5
 
     def test_exception_of_occlusion_beyond_the_memory(self):
