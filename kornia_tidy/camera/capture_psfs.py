@@ -47,7 +47,7 @@ def capture_psfs(camera: Any, channels: int, dtype: torch.dtype, reach: Tensor, 
             )
     else:
         (lo, hi), fidelity = model.camera.defocus_range, model.fidelity
-        samples = ((hi - lo) / fidelity.layer_spacing + 1) * (fidelity.window or fidelity.max_window) ** 2
+        samples = ((hi - lo) / fidelity.layer_spacing + 1) * model.largest_window**2
         if _MOST_COPIES * samples * channels * dtype.itemsize > camera.memory_budget // 2:  # else it surely fits
             pieces = pieces_for(camera, channels, dtype, reach)
             if pieces is not None:

@@ -26,7 +26,8 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolated_bank,
     nodes_around,
 )
-from kornia_tidy.psf.lens_limits import PARTS, check_defocus_range, check_layer_spacing
+from kornia_tidy.psf.geometric_psf import blur_radius
+from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, check_layer_spacing
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
@@ -34,7 +35,7 @@ from kornia_tidy.psf.psf_ops import computed_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
-from kornia_tidy.psf.wide_blur import BlurGroup
+from kornia_tidy.psf.wide_blur import BlurGroup, window_of
 from kornia_tidy.psf.wide_model import Derived, WidePSFs
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank
 from kornia_tidy.runtime.reading import is_unread
@@ -342,6 +343,12 @@ class ScenePSFs(WidePSFs):
         return self.fitted.side
 
     @property
+    def largest_window(self) -> int:
+        """Largest side that the PSFs may have, without measuring their window."""
+        known = self._derived.window
+        return max(self.fidelity.window or self.fidelity.max_window, 0 if known is None else known.side)
+
+    @property
     def fitted(self) -> FittedWindow:
         """The window and the share of the light in it, measured with the masks as they were at the first look."""
         with self.lock:
@@ -356,7 +363,24 @@ class ScenePSFs(WidePSFs):
         if (blur := self.wide_blur) is not None:
             return FittedWindow(blur.window, self._wide_light())
         self._check_layers()
-        return fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
+        found = fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
+        if not found.enough and (disc := self._disc_window()) is not None:
+            found = fitted_window(self._sampled_psfs, self.fidelity, disc)
+            return found._replace(enough=found.held[0] >= self.fidelity.enclosed_energy)
+        return found
+
+    def _disc_window(self) -> int | None:
+        """Return the side that holds the lens's widest defocus disc; None where ``max_window`` holds it.
+
+        Also where that is below :data:`LEAST_WINDOW`, or the disc is wider than :data:`WIDEST_DISC`.
+        """
+        step, shifts = self.pixel_step, [self.camera.chromatic_defocus(w) for w in self.spectrum.wavelengths]
+        size = float(step.detach()) if isinstance(step, Tensor) else step
+        lo, hi = self.camera.defocus_range
+        radius = blur_radius(max(-(lo + min(*shifts, 0.0)), hi + max(*shifts, 0.0)), size)
+        if not LEAST_WINDOW <= self.fidelity.max_window < 2 * radius <= WIDEST_DISC:
+            return None
+        return window_of(radius, size, self.pupil.extent)
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:

@@ -91,7 +91,8 @@ def wide_psfs(
             psfs = psfs + rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
         parts.append(psfs)
     if small:
-        largest = max(blur_radius(psi, step) for psi in small)
+        # The largest disc of the lens and not of these nodes: what else a scene holds must not matter.
+        largest = min(blur.ray_radius, max(blur_radius(psi, step) for psi in blur.nodes))
         side = min(window, window_of(largest, step, pupil.extent, grid))
         psfs = exact(small, side).psfs
         parts.insert(1, pad(psfs, ((window - side) // 2,) * 4))

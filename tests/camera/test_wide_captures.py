@@ -86,6 +86,21 @@ class TestWideCaptures(BaseTester):
             assert float(learnt.masks.phase.grad.abs().max()) > 0
 
     @torch.no_grad()
+    @pytest.mark.parametrize("f_number", [1.4, 2.8, 4.0])
+    def test_feature_a_capture_depends_on_nothing_but_what_its_psfs_reach(self, f_number):
+        """Neither on captures before it, nor on pixels farther away than any PSF; it was by up to 0.02."""
+        image, near = light(192), torch.full((1, 1, 192, 192), 2.0)
+        alone = fast_camera(f_number)(image, near)
+        optics = fast_camera(f_number)
+        optics(image, torch.linspace(1.6, 9.0, 192).expand(1, 1, 192, 192))
+        assert torch.equal(optics(image, near), alone)
+        near[..., :8, :8] = 2.4
+        reach = 8 + optics.window // 2
+        assert reach < 160
+        apart = (fast_camera(f_number)(image, near) - alone)[..., reach:, reach:]
+        assert float(apart.abs().max()) < 2e-6
+
+    @torch.no_grad()
     def test_feature_bands_are_the_whole(self):
         optics, image, depth = fast_camera(), light(192), stairs(192)
         whole = optics(image, depth)

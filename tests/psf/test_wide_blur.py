@@ -114,8 +114,7 @@ class TestWideBlur(BaseTester):
         assert PSFModel(flat).wide_blur is None
         assert PSFModel(flat, fast_lens(), fidelity="reference").wide_blur is None
         assert PSFModel(flat, fast_lens(), fidelity=Fidelity(wide_blur="waves", window=9)).wide_blur is None
-        with pytest.warns(UserWarning, match="the largest PSF window allowed"):
-            assert PSFModel(PixelwiseMask(1), fast_lens()).wide_blur is None
+        assert PSFModel(PixelwiseMask(1), fast_lens()).wide_blur is None
         assert is_flat(torch.full((2, 3, 3), 0.5))
 
     def test_feature_masks_that_are_learnt_leave_it(self):
@@ -123,8 +122,7 @@ class TestWideBlur(BaseTester):
         assert optics.psf_model.wide_blur is not None
         with torch.no_grad():
             optics.masks.phase.uniform_(-1, 1)
-        with pytest.warns(UserWarning, match="the largest PSF window allowed"):
-            optics.psf_bank(defocus=[0.0])
+        optics.psf_bank(defocus=[0.0])
         assert optics.psf_model.wide_blur is None
 
     def test_exception_of_an_unknown_choice(self):
