@@ -74,7 +74,8 @@ class Fidelity:
             :func:`kornia_tidy.psf.spectral_binning.bin_spectrum`. Default: all that the spectrum has.
         window: side of the PSFs in pixels, odd. Default: measured, by the next two.
         enclosed_energy: share of the light that the PSF window must hold, at focus and at both ends of the range.
-        max_window: largest side of the PSF window in pixels.
+        max_window: largest side of the PSF window in pixels. Where it holds less than ``enclosed_energy`` because the
+            defocus disc of the lens is wider, the window is that of the disc, up to 257 px, unless it is below 41 px.
         stray_light: treatment of the light outside the window. ``"renormalize"`` scales the window to sum one,
             ``"veil"`` spreads the light evenly over the image (with the border ``"zero"`` only the part that stays
             inside it), and ``"discard"`` drops it.

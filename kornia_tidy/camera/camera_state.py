@@ -128,7 +128,8 @@ class CameraState(nn.Module):
         measured.
 
         Returns:
-            The side in pixels: at most ``fidelity.max_window``, with a warning if that does not hold the share.
+            The side in pixels: at most ``fidelity.max_window``, or as wide as the lens's defocus disc; with a warning
+            if that does not hold the share.
         """
         with self.psf_model.lock:
             self.psf_model = self.psf_model.with_window(None)

@@ -9,20 +9,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.commands.report import tell
+from kornia_tidy.inference.trained import camera_state
 from kornia_tidy.mask_export.frame_files import SUFFIXES, check_replaceable, read_slm_frames, write_slm_frames
-from kornia_tidy.mask_export.mask_files import read_dwell_shares, read_heights, write_heights
+from kornia_tidy.mask_export.mask_files import SavedMasks, masks_in_state, read_heights, write_heights
 from kornia_tidy.mask_export.placement import FLIPS, ROTATIONS, PanelPlacement
 from kornia_tidy.mask_export.printing import write_stl
 from kornia_tidy.mask_export.response_file import read_response
 from kornia_tidy.mask_export.slm_frames import SLMFrames
-from kornia_tidy.mask_export.timing import frame_times
+from kornia_tidy.mask_export.timing import FrameTime, frame_times
 from kornia_tidy.masks.base import metres_to_radians
 from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.modulator.switching import Switching
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, constant_index
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 MATERIALS = {
     "constant": constant_index(1.5),
@@ -34,9 +37,10 @@ MATERIALS = {
 
 DESCRIPTION = """\
 Export and import phase masks. MASKS is a file of heights in metres (.npy, K x rows x
-columns) or a camera's state_dict (.safetensors, masks.phase in radians at 530 nm). A
-state_dict does not contain the constraint of masks: export masks with a constraint, and
-families without the parameter phase, from Python (kornia_tidy.mask_export).
+columns), a camera's state_dict (.safetensors) or a checkpoint of a training. A
+state_dict tells the masks' family, constraint and material, and the modulator, whose
+grey levels, dwell and switching times are the defaults of frames. One of masks alone
+(phase in radians at 530 nm) tells none of them.
 """
 
 EXPORT = """\
@@ -121,16 +125,18 @@ def add_parser(subparsers: Any) -> None:
 
 def show_masks(args: argparse.Namespace) -> None:
     """Print the masks of a file with their size and heights."""
-    heights = read_heights(args.masks, MATERIALS[args.material])
+    saved = _saved(args)
+    heights = saved.heights
     tell("masks", _in_words(heights))
+    tell("material", saved.material.name)
     for k, one in enumerate(heights):
         low, high = one.aminmax()
         tell(
             f"mask {k}",
             f"{float(low) * 1e9:.1f} to {float(high) * 1e9:.1f} nm, RMS {float(one.std(correction=0)) * 1e9:.1f} nm",
         )
-    if (shares := read_dwell_shares(args.masks)) is not None:
-        tell("dwell", " ".join(f"{share:.4f}" for share in shares))
+    if saved.dwell is not None:
+        tell("dwell", " ".join(f"{share:.4f}" for share in saved.dwell))
 
 
 def export_masks(args: argparse.Namespace) -> None:
@@ -138,15 +144,14 @@ def export_masks(args: argparse.Namespace) -> None:
     kind = Path(args.output).suffix.lower()
     check_choice("the suffix of what to write", kind, ("", ".npy", ".stl"))
     _check_absent(args.output, args.force, args.masks, folder=not kind)
-    material = MATERIALS[args.material]
-    heights = read_heights(args.masks, material)
-    tell("masks", _in_words(heights))
+    saved = _saved(args)
+    tell("masks", _in_words(saved.heights))
     if kind == ".npy":
-        write_heights(args.output, heights)
+        write_heights(args.output, saved.heights)
     elif kind == ".stl":
-        _export_stl(args, heights)
+        _export_stl(args, saved.heights)
     else:
-        _export_frames(args, heights)
+        _export_frames(args, saved)
     tell("wrote", args.output)
 
 
@@ -160,14 +165,55 @@ def import_masks(args: argparse.Namespace) -> None:
     tell("masks", _in_words(heights))
     tell("frames", _frames_in_words(frames))
     if args.output is not None:
-        write_heights(args.output, heights, MATERIALS[args.material])
+        write_heights(args.output, heights, None if args.material is None else MATERIALS[args.material])
         tell("wrote", args.output)
 
 
-def _export_frames(args: argparse.Namespace, heights: Tensor) -> None:
-    panel = GreyLevels(args.bits, args.phase_range)
+def _saved(args: argparse.Namespace) -> SavedMasks:
+    """Return the masks of the arguments, and what their file says of them."""
+    material = None if args.material is None else MATERIALS[args.material]
+    if Path(args.masks).suffix.lower() != ".safetensors":
+        return SavedMasks(read_heights(args.masks), MATERIALS["constant"] if material is None else material)
+    state = camera_state(args.masks)
+    try:
+        return masks_in_state(state, material)
+    except ValueError as error:
+        raise ValueError(f"cannot read {args.masks}: {error}") from None
+
+
+def _panel(args: argparse.Namespace, saved: SavedMasks) -> GreyLevels:
+    """Return the panel of the options; without them, that of the camera, with its phases at the working wavelength."""
+    bits = 8 if args.bits is None else args.bits
     if args.response is not None:
-        panel = GreyLevels(args.bits, response=read_response(args.response, args.bits))
+        return GreyLevels(bits, response=read_response(args.response, bits))
+    known = next((part for part in _parts(saved) if isinstance(part, GreyLevels)), None)
+    if known is None or args.bits is not None or args.phase_range is not None:
+        return GreyLevels(bits, 2 * math.pi if args.phase_range is None else args.phase_range)
+    if args.wavelength == REFERENCE_WAVELENGTH:
+        return known
+    scale = metres_to_radians(saved.material, args.wavelength) / metres_to_radians(saved.material)
+    if known.response is None:
+        return GreyLevels(known.bits, known.phase_range * scale)
+    return GreyLevels(known.bits, response=(known.levels * scale).tolist())
+
+
+def _times(args: argparse.Namespace, saved: SavedMasks) -> list[FrameTime]:
+    """Return when the frames are shown, by the options; without them, by the camera's modulator."""
+    known = next((part for part in _parts(saved) if isinstance(part, Switching)), Switching(0.0))
+    exposure = known.exposure if args.exposure is None else args.exposure
+    switching = known.switching_time if args.switching_time is None else args.switching_time
+    shares = args.dwell or saved.dwell or [1.0] * len(saved.heights)
+    if len(shares) != len(saved.heights):
+        raise ValueError(f"there are {len(shares)} dwell shares for {len(saved.heights)} masks")
+    return frame_times(shares, exposure, switching, args.cyclic or known.cyclic)
+
+
+def _parts(saved: SavedMasks) -> list[nn.Module]:
+    return [] if saved.modulator is None else list(saved.modulator.modules())
+
+
+def _export_frames(args: argparse.Namespace, saved: SavedMasks) -> None:
+    heights, panel = saved.heights, _panel(args, saved)
     placement = PanelPlacement(
         (args.panel[1], args.panel[0]),
         args.panel_pitch,
@@ -176,11 +222,8 @@ def _export_frames(args: argparse.Namespace, heights: Tensor) -> None:
         args.flip,
         args.rotate,
     )
-    shares = args.dwell or read_dwell_shares(args.masks) or [1.0] * len(heights)
-    if len(shares) != len(heights):
-        raise ValueError(f"there are {len(shares)} dwell shares for {len(heights)} masks")
-    times = frame_times(shares, args.exposure, args.switching_time, args.cyclic)
-    frames = SLMFrames.of(heights, panel, args.wavelength, MATERIALS[args.material])
+    times = _times(args, saved)
+    frames = SLMFrames.of(heights, panel, args.wavelength, saved.material)
     write_slm_frames(args.output, frames, placement, times, args.suffix, replace=args.force)
     size = (heights.shape[1], heights.shape[2])
     scale = placement.scale(size)
@@ -189,7 +232,7 @@ def _export_frames(args: argparse.Namespace, heights: Tensor) -> None:
     tell("pupil", f"radius {placement.radius(size) * 1e3:.4g} mm on the panel")
     tell("frames", _frames_in_words(frames))
     # By the panel's phases and the masks themselves, and not by what the sidecar says of both.
-    wanted = heights * metres_to_radians(MATERIALS[args.material], args.wavelength)
+    wanted = heights * metres_to_radians(saved.material, args.wavelength)
     error, share = read_slm_frames(args.output).phase_error(wanted, panel.levels)
     tell("check", f"read back, phase differs by up to {error:.3g} rad, {share / 2:.3f} grey levels, 0.5 allowed")
     if share > 1:
@@ -206,7 +249,7 @@ def _export_stl(args: argparse.Namespace, heights: Tensor) -> None:
 
 
 def _add_masks(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("masks", metavar="MASKS", help="heights (.npy) or a state_dict (.safetensors)")
+    parser.add_argument("masks", metavar="MASKS", help="heights (.npy), a state_dict or a checkpoint (.safetensors)")
     _add_material(parser)
 
 
@@ -214,23 +257,21 @@ def _add_material(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--material",
         choices=tuple(MATERIALS),
-        default="constant",
-        help="what turns height into phase (default: constant, index 1.5 at every wavelength)",
+        help="what turns height into phase (default: as saved, or constant, index 1.5 at every wavelength)",
     )
 
 
 def _add_panel(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("panel (frames)")
-    group.add_argument("--bits", type=int, default=8, metavar="B", help="of a grey level, 1 to 10 (default: 8)")
+    group.add_argument("--bits", type=int, metavar="B", help="of a grey level, 1 to 10 (default: as saved, or 8)")
     group.add_argument(
         "--wavelength", type=float, default=530e-9, metavar="M", help="the panel's working wavelength (default: 530e-9)"
     )
     group.add_argument(
         "--phase-range",
         type=float,
-        default=2 * math.pi,
         metavar="RAD",
-        help="phase at that wavelength that the levels span (default: 2 pi)",
+        help="phase at that wavelength that the levels span (default: as saved, or 2 pi)",
     )
     group.add_argument(
         "--response",
@@ -259,10 +300,10 @@ def _add_panel(parser: argparse.ArgumentParser) -> None:
 
 def _add_timing(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("timing (frames)")
-    group.add_argument("--exposure", type=float, default=0.1, metavar="S", help="seconds (default: 0.1)")
-    group.add_argument("--switching-time", type=float, default=0.0, metavar="S", help="of a swap (default: 0)")
+    group.add_argument("--exposure", type=float, metavar="S", help="seconds (default: as saved, or 0.1)")
+    group.add_argument("--switching-time", type=float, metavar="S", help="of a swap (default: as saved, or 0)")
     group.add_argument(
-        "--dwell", type=float, nargs="+", metavar="SHARE", help="of each mask (default: as learnt, or equal)"
+        "--dwell", type=float, nargs="+", metavar="SHARE", help="of each mask (default: as saved, or equal)"
     )
     group.add_argument("--cyclic", action="store_true", help="the swap back to the first falls into the exposure too")
 

@@ -20,7 +20,7 @@ from kornia_tidy.figures.psf import PSFSheet, draw_psfs, ring_centres
 from kornia_tidy.figures.style import require_matplotlib
 from kornia_tidy.figures.system_statistics import contrast_transfer
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.inference.trained import load_camera
 from kornia_tidy.mask_export.mask_files import SUFFIXES, read_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -29,8 +29,8 @@ from kornia_tidy.systems.presets import SYSTEMS
 DESCRIPTION = """\
 Draw the point spread functions (PSFs) of a camera: a montage over depth and colour,
 a slice through focus, and the modulation transfer function (MTF). CAMERA is
-the name of a published system, a checkpoint of a training (best.safetensors), or a
-file of masks: heights in metres (.npy) or a camera's state_dict (.safetensors).
+the name of a published system, a camera's state_dict (.safetensors), a checkpoint of
+a training (best.safetensors), or a file of heights in metres (.npy).
 
 Printed for each depth and colour:
   held    share of a point's light inside the window (ensquared energy)
@@ -69,7 +69,7 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run)
-    parser.add_argument("camera", metavar="CAMERA", help="a published system, a checkpoint, or a file of masks")
+    parser.add_argument("camera", metavar="CAMERA", help="a published system, or a file as above")
     parser.add_argument("-o", "--output", default="psf.png", metavar="OUT", help="picture (default: psf.png)")
     parser.add_argument(
         "--depths",
@@ -77,12 +77,10 @@ def add_parser(subparsers: Any) -> None:
         help=f"metres, inf allowed (default: {COLUMNS} over the camera's range, even in inverse depth)",
     )
     parser.add_argument("--window", type=int, metavar="PX", help="side of the PSFs, odd (default: as in a capture)")
-    parser.add_argument(
-        "--fidelity", choices=tuple(PRESETS), help="speed or accuracy (default: balanced, or as trained)"
-    )
+    parser.add_argument("--fidelity", choices=tuple(PRESETS), help="speed or accuracy (default: balanced, or as saved)")
     parser.add_argument("--mask-seed", type=seed, default=0, metavar="N", help="of a system's masks (default: 0)")
     add_lens_options(
-        parser.add_argument_group("lens", "In metres, for a file of masks; systems and checkpoints have their own.")
+        parser.add_argument_group("lens", "In metres, for a file of masks alone; saved cameras have their own.")
     )
 
 
@@ -151,35 +149,19 @@ def _optics(args: argparse.Namespace) -> TiDyOptics:
         raise ValueError(
             f"CAMERA must be one of {', '.join(map(repr, SYSTEMS))}, or a file (.npy, .safetensors), got {name!r}"
         )
-    elif (trained := _trained(name)) is None:
+    elif (saved := None if Path(name).suffix.lower() == ".npy" else load_camera(name)) is None:
         optics = TiDyOptics(PixelwiseMask(initial=read_heights(name)), lens, fidelity=fidelity)
     else:
         _refuse_lens(name, lens)
-        optics = trained if args.fidelity is None else trained.with_fidelity(fidelity)
+        optics = saved if args.fidelity is None else saved.with_fidelity(fidelity)
     settings: Fidelity = optics.fidelity
     window = optics.window if args.window is None else args.window
     return optics.with_fidelity(settings.replace(name=settings.name, window=window, stray_light="discard"))
 
 
-def _trained(path: str) -> TiDyOptics | None:
-    """Return the camera of a checkpoint; None for a file of masks."""
-    if Path(path).suffix.lower() != ".safetensors":
-        return None
-    try:
-        return load_trained(path).optics
-    except ValueError:
-        try:
-            read_heights(path)
-        except ValueError:
-            pass
-        else:
-            return None
-        raise
-
-
 def _refuse_lens(name: str, lens: ThinLensCamera) -> None:
     if lens.extra_repr() != ThinLensCamera().extra_repr():
-        raise ValueError(f"{name} has a lens of its own: --focal-length and the like are for files of masks")
+        raise ValueError(f"{name} has a lens of its own: --focal-length and the like are for files of masks alone")
 
 
 def _defocus(text: str | None, optics: TiDyOptics) -> Tensor:

@@ -94,7 +94,7 @@ def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
         fidelity=optics.fidelity.replace(window=optics.window),
         color_space=optics.color_space,
         spectrum=optics.spectrum,
-        aperture=optics.pupil.amplitude,
+        aperture=optics.aperture,
     )
     banks = []
     with torch.no_grad():

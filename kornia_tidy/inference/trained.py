@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera.saved_camera import below, camera_of_state, masks_of_state
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.heads import CLOSED_FORMS, check_imported, make_head
@@ -19,7 +20,7 @@ from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.psf.camera_settings import EXTRA_STATE, check_settings, settings_of
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.head import ReconstructionHead
@@ -245,32 +246,70 @@ def load_weights(
         part.load_state_dict(own)
 
 
+def camera_state(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Read the state of the camera in a file: what its ``state_dict()`` returned, alone or in a checkpoint.
+
+    Args:
+        path: safetensors file of a camera's state, or of ``kornia-tidy train``.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is damaged.
+    """
+    tensors, header = read_tensors(path, WHAT)
+    return tensors if header.get("format") is None else below(weights_of(read_state(path), path), "optics.")
+
+
+def load_camera(path: str | os.PathLike[str]) -> TiDyOptics | None:
+    """Load the camera that was saved in a file: every capture is the same to the last bit.
+
+    Args:
+        path: as in :func:`camera_state`.
+
+    Returns:
+        The camera; None where the file says nothing of one, such as that of masks alone.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if it is damaged, or see :func:`~kornia_tidy.camera.saved_camera.camera_of_state`.
+    """
+    state = camera_state(path)
+    if EXTRA_STATE in state:
+        try:
+            return camera_of_state(state)
+        except ValueError as error:
+            raise ValueError(f"cannot read {path}: {error}") from error
+    checkpoint = read_tensors(path, WHAT)[1].get("format") is not None
+    return load_trained(path).optics if checkpoint else None
+
+
 def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
     """Load the masks of a checkpoint or of a camera into a camera, which may differ in all else.
 
     Args:
         checkpoint: path of a file that ``kornia-tidy train`` wrote, or of a camera's state, such as
             ``camera.safetensors`` of ``kornia-tidy design``.
-        optics: camera with as many masks of the same family and size. Its PSF window stays as it is.
+        optics: camera with as many masks of the same size. Its PSF window stays as it is. Pixel-wise masks without
+            limits take the phase of masks of any family; others need their own family, limits and material.
 
     Raises:
         ValueError: if the masks do not fit. Nothing is then loaded.
     """
-    tensors, header = read_tensors(checkpoint, WHAT)
-    prefix = "masks." if header.get("format") is None else "optics.masks."
-    own = below(tensors if prefix == "masks." else weights_of(read_state(checkpoint), checkpoint), prefix)
-    check_weights(optics.masks, own, f"{checkpoint}, {prefix.removesuffix('.')}")
+    state = camera_state(checkpoint)
+    own = below(state, "masks.")
+    if EXTRA_STATE in state:
+        saved, here = masks_of_state(state), optics.masks
+        if isinstance(here, PixelwiseMask) and here.constraint == "none":
+            own = {"phase": saved.phase.detach()}
+        else:
+            check_settings({"masks": settings_of(saved)}, {"masks": settings_of(here)})
+    check_weights(optics.masks, own, f"{checkpoint}, masks")
     optics.masks.load_state_dict(own)
 
 
 def head_prefix(weights: Mapping[str, Tensor]) -> str:
     """Return the prefix of the network's weights in a checkpoint; of the averaged ones, if there are any."""
     return "average.network." if any(key.startswith("average.") for key in weights) else "head."
-
-
-def below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the weights whose names begin with a prefix, under their names without it."""
-    return {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
 
 
 def check_weights(module: nn.Module, weights: Mapping[str, Tensor], name: str) -> None:

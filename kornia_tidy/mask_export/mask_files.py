@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
+from kornia_tidy.camera.saved_camera import masks_of_state, modulator_of_state
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.mask_export.slm_frames import checked_heights
 from kornia_tidy.masks.base import metres_to_radians
+from kornia_tidy.modulator.modulator import DwellTimes, LearnableDwellTimes
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.tensor_files import read_tensors
@@ -24,71 +28,94 @@ SUFFIXES = (".npy", ".safetensors")
 _KEYS = ("masks.phase", "phase")  # in the state of a camera, and in that of masks alone
 
 
+class SavedMasks(NamedTuple):
+    """Masks of a file: their heights, and what the file says of their material and of the modulator that shows them."""
+
+    heights: Tensor
+    """(K, rows, columns) metres, float64, with the constraint applied."""
+    material: Material
+    modulator: nn.Module | None = None
+    """None where the file does not tell it, or its class is none of this package."""
+    dwell: list[float] | None = None
+    """Share of each mask, summing to one; None where all are equal."""
+
+
+def masks_in_state(state: Mapping[str, Tensor], material: Material | None = None) -> SavedMasks:
+    """Return the masks of a camera's state: of any family, with its constraint, range of phase and material.
+
+    Args:
+        state: of a camera; or ``masks.phase`` or ``phase`` in radians at 530 nm alone, taken as they are.
+        material: of masks whose state does not tell it. Default: index 1.5, the default of masks.
+
+    Raises:
+        ValueError: if there are no masks, their family is none of this package, or they are of another material.
+
+    Example:
+        >>> from kornia_tidy import DwellTimes, TiDyOptics
+        >>> from kornia_tidy.masks import CubicMask
+        >>> masks = CubicMask([20.0, 8.0], constraint="wrapped")
+        >>> found = masks_in_state(TiDyOptics(masks, modulator=DwellTimes((3, 1))).state_dict())
+        >>> bool((found.heights - masks.heights().detach()).abs().max() < 1e-13), found.dwell
+        (True, [0.75, 0.25])
+    """
+    if EXTRA_STATE in state:
+        masks, modulator = masks_of_state(state), modulator_of_state(state)
+        if material not in (None, masks.material):
+            raise ValueError(f"its masks are of {masks.material.name}: leave the material out, got {material.name}")
+        dwell = None if modulator is None else _dwell_shares(modulator)
+        heights = masks.phase.detach().double() / metres_to_radians(masks.material)
+        return SavedMasks(checked_heights(heights), masks.material, modulator, dwell)
+    names = [key for key in _KEYS if key in state]
+    if not names:
+        raise ValueError(f"it has no 'masks.phase', only {', '.join(sorted(state))[:200] or 'nothing'}")
+    material = constant_index(1.5) if material is None else material
+    learnt = [v for key, v in state.items() if key.startswith("modulator.") and key.endswith("logits")]
+    dwell = learnt[0].double().softmax(0).tolist() if learnt else None
+    heights = state[names[0]].double() / metres_to_radians(material)
+    return SavedMasks(checked_heights(heights[None] if heights.ndim == 2 else heights), material, None, dwell)
+
+
+def _dwell_shares(modulator: nn.Module) -> list[float] | None:
+    for part in modulator.modules():
+        if isinstance(part, LearnableDwellTimes):
+            return part.logits.detach().double().softmax(0).tolist()
+        if isinstance(part, DwellTimes) and part.shares is not None:
+            return list(part.shares)
+    return None
+
+
 def read_heights(path: str | os.PathLike[str], material: Material | None = None) -> Tensor:
     """Read the heights of masks from a file.
 
     Args:
         path: NPY file of heights in metres, (K, rows, columns) or (rows, columns); or safetensors file with the
-            ``state_dict`` of a camera or of masks, whose ``masks.phase`` or ``phase`` is in radians at 530 nm.
-        material: material for the conversion of radians to metres. Default: index 1.5, the default of masks.
+            ``state_dict`` of a camera with masks of any family, or with ``phase`` in radians at 530 nm alone.
+        material: for the conversion of radians to metres, where the state does not tell it. Default: index 1.5.
 
     Returns:
-        (K, rows, columns) metres, float64.
+        (K, rows, columns) metres, float64, with the constraint of the masks applied.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if the suffix is another, the file is damaged or has no pixel-wise masks, or a height is not finite.
+        ValueError: if the suffix is another, the file is damaged or has no masks, a height is not finite, or the masks
+            are of another material.
 
     Convention:
-        - A state does not include the constraint of its masks. Masks with a constraint, and families without a
-          ``phase``, are exported from Python: :meth:`~kornia_tidy.mask_export.SLMFrames.of` takes the masks themselves.
+        - The state of masks alone includes neither constraint nor material: save the camera's.
     """
     path = Path(path)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)
-    if path.suffix.lower() == ".npy":
-        data = read_bytes(path)
-        try:
-            array = decode_npy(data)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from None
-        if array.dtype.kind != "f" or array.ndim not in (2, 3):
-            raise ValueError(f"cannot read {path}: heights are floats in 2 or 3 axes, not {array.dtype} {array.shape}")
-        heights = torch.from_numpy(array.astype(np.float64))
-    else:
-        state = read_tensors(path)[0]
-        names = [key for key in _KEYS if key in state]
-        if not names:
-            raise ValueError(
-                f"cannot read {path}: it has no 'masks.phase', only "
-                f"{', '.join(sorted(state.keys() - {EXTRA_STATE}))[:200] or 'nothing'}"
-            )
-        material = constant_index(1.5) if material is None else material
-        heights = state[names[0]].double() / metres_to_radians(material)
     try:
+        if path.suffix.lower() != ".npy":
+            return masks_in_state(read_tensors(path)[0], material).heights
+        array = decode_npy(read_bytes(path))
+        if array.dtype.kind != "f" or array.ndim not in (2, 3):
+            raise ValueError(f"heights are floats in 2 or 3 axes, not {array.dtype} {array.shape}")
+        heights = torch.from_numpy(array.astype(np.float64))
         return checked_heights(heights[None] if heights.ndim == 2 else heights)
     except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
-
-
-def read_dwell_shares(path: str | os.PathLike[str]) -> list[float] | None:
-    """Read the learnt dwell shares from the state of a camera.
-
-    Args:
-        path: safetensors file of a camera's state, or any other file of masks.
-
-    Returns:
-        One share for each mask, summing to one. None if the state has no learnt dwell times, or the file no state.
-
-    Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: if the file is damaged.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".safetensors":
-        return None
-    state = read_tensors(path)[0]
-    learnt = [v for key, v in state.items() if key.startswith("modulator.") and key.endswith("logits")]
-    return learnt[0].double().softmax(0).tolist() if learnt else None
+        told = str(error)
+        raise ValueError(told if told.startswith("cannot read") else f"cannot read {path}: {told}") from None
 
 
 def write_heights(path: str | os.PathLike[str], heights: Tensor, material: Material | None = None) -> None:

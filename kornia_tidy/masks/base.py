@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import cast
+from collections.abc import Mapping
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -96,6 +97,21 @@ class PhaseMasks(nn.Module):
     def free_phase(self) -> Tensor:
         """Return the phase before the constraint: here the parameter or buffer registered as ``phase``."""
         return cast("Tensor", super().__getattr__("phase"))  # AttributeError if a family registered none
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments of the class that follow from the shapes of a state's parameters, such as ``num_masks``.
+
+        Pixels, material and limits are no parameters; see :func:`~kornia_tidy.camera.saved_camera.masks_of_state`.
+
+        Args:
+            parameters: of a ``state_dict`` of these masks.
+
+        Example:
+            >>> PhaseMasks.arguments_of({"phase": torch.zeros(5, 23, 23)})
+            {'num_masks': 5}
+        """
+        return {"num_masks": len(next(iter(parameters.values())))}
 
     def heights(self) -> Tensor:
         """Return the height maps in metres, (K, N, N), in float32 or better because they are of order 1e-7."""

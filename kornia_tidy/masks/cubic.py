@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -54,6 +55,11 @@ class CubicMask(PhaseMasks):
         y, x = mask_axes(size)
         self.register_buffer("shape", (x**3 + y**3).to(values), persistent=False)
         self.strength = nn.Parameter(values)
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments that follow from the parameters of a state. See :meth:`PhaseMasks.arguments_of`."""
+        return {"strength": parameters["strength"]}
 
     def free_phase(self) -> Tensor:
         """Return the cubic phase, (K, N, N) radians."""

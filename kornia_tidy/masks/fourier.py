@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -71,6 +73,11 @@ class FourierMask(PhaseMasks):
         count = 2 * max_frequency + 1
         values = initial_values(initial, num_masks, (count, count), NOISE_RMS / count, generator)
         self.coefficients = nn.Parameter(values)
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments that follow from the parameters of a state. See :meth:`PhaseMasks.arguments_of`."""
+        return {**super().arguments_of(parameters), "max_frequency": parameters["coefficients"].shape[1] // 2}
 
     def free_phase(self) -> Tensor:
         """Return the sum of the waves before the constraint, (K, N, N) radians."""

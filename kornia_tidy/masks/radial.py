@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -76,6 +78,11 @@ class RadialMask(PhaseMasks):
         self.register_buffer("inner_index", inner.long(), persistent=False)
         self.register_buffer("outer_weight", (position - inner).to(torch.get_default_dtype()), persistent=False)
         self.profile = nn.Parameter(initial_values(initial, num_masks, (num_radii,), NOISE_RMS, generator))
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments that follow from the parameters of a state. See :meth:`PhaseMasks.arguments_of`."""
+        return {**super().arguments_of(parameters), "num_radii": parameters["profile"].shape[1]}
 
     def free_phase(self) -> Tensor:
         """Return the profile interpolated at the radius of each pixel, (K, N, N) radians."""

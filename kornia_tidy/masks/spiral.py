@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -84,6 +87,11 @@ class SpiralMask(PhaseMasks):
         offsets = "flat" if initial == "rotating" else initial
         self.charges = nn.Parameter(torch.arange(1.0, num_zones + 1).repeat(num_masks, 1))
         self.offsets = nn.Parameter(initial_values(offsets, num_masks, (num_zones,), NOISE_RMS, generator))
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments that follow from the parameters of a state. See :meth:`PhaseMasks.arguments_of`."""
+        return {**super().arguments_of(parameters), "num_zones": parameters["charges"].shape[1]}
 
     def free_phase(self) -> Tensor:
         """Return the vortex phase of the rings, (K, N, N) radians."""

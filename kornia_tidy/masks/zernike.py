@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -72,6 +73,11 @@ class ZernikeMask(PhaseMasks):
         self.quarter = (len(y) - len(y) // 2, len(x) - len(x) // 2)
         rms = NOISE_RMS / math.sqrt(num_modes)
         self.coefficients = nn.Parameter(initial_values(initial, num_masks, (num_modes,), rms, generator))
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments that follow from the parameters of a state. See :meth:`PhaseMasks.arguments_of`."""
+        return {**super().arguments_of(parameters), "num_modes": parameters["coefficients"].shape[1]}
 
     def free_phase(self) -> Tensor:
         """Return the sum of the polynomials before the constraint, (K, N, N) radians."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Self, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -227,6 +227,11 @@ class LearnableDwellTimes(Modulator):
         if not shares or not all(0 < s < math.inf for s in shares):
             raise ValueError(f"dwell shares to learn must be positive and finite, got {tuple(shares)}")
         self.logits = nn.Parameter(torch.tensor([math.log(s) for s in shares]))
+
+    @classmethod
+    def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments of the class that follow from the parameters of a state."""
+        return {"shares": parameters["logits"].double().softmax(0).tolist()}
 
     def timeline(self, phase: Tensor) -> Timeline:
         """Return the masks one after another, each for its learnt dwell time."""

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from kornia_tidy.checks import check_positive, unmasked
 
+WIDEST_CROSSTALK = 1000  # pixels, standard deviation; wider than any panel
 _SLACK = 1e-3  # rad beyond 0 to 4 pi, by rounding in a file
 
 
@@ -240,7 +241,7 @@ def crosstalk_kernel(sigma: float) -> Tensor:
         (2 r + 1,) float64, summing to one, with r six standard deviations, rounded up.
 
     Raises:
-        ValueError: if sigma is not positive and finite.
+        ValueError: if sigma is not positive, or above 1000.
 
     Example:
         >>> crosstalk_kernel(0.25)
@@ -248,6 +249,8 @@ def crosstalk_kernel(sigma: float) -> Tensor:
                dtype=torch.float64)
     """
     check_positive("sigma", sigma, "pixels")
+    if sigma > WIDEST_CROSSTALK:
+        raise ValueError(f"sigma must be at most {WIDEST_CROSSTALK} pixels, got {sigma}")
     reach = math.ceil(6 * sigma)
     x = torch.arange(-reach - 1, reach + 2, dtype=torch.float64)
     integral = x * torch.special.ndtr(x / sigma) + sigma / math.sqrt(2 * math.pi) * torch.exp(-((x / sigma) ** 2) / 2)
@@ -268,7 +271,7 @@ class PixelCrosstalk(nn.Module):
         - input and output: (K, N, N) radians; beyond the border the outermost pixels are repeated.
 
     Raises:
-        ValueError: if sigma is not positive and finite.
+        ValueError: if sigma is not positive, or above 1000.
 
     Source: Persson, Engström and Goksör, Optics Express 20(20) 22334 (2012).
 

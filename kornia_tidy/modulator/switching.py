@@ -16,6 +16,7 @@ from kornia_tidy.optics.quadrature import gauss_legendre
 
 BETWEEN = ("random", "linear", "exponential")
 SLOWEST = 10.0  # s; even motors that exchange phase plates are faster
+MOST_SAMPLES = 1024  # of a transition; a saved camera could ask for more than memory holds
 SETTLED = 0.99  # fraction of an exponential response that is complete at the end of the switching time
 
 
@@ -49,7 +50,8 @@ class Switching(Modulator):
 
     Raises:
         ValueError: if a time is negative or not finite, ``between`` is unknown, or a response has fewer than two
-            samples or one that is not finite; on use, if the transitions take longer than the exposure.
+            samples or one that is not finite, or ``samples`` is above 1024; on use, if the transitions take longer than
+            the exposure.
 
     Convention:
         - There are K - 1 transitions, as in the paper: the first mask is set before the shutter opens. A camera whose
@@ -94,6 +96,8 @@ class Switching(Modulator):
             )
         check_positive("exposure", exposure, "seconds")
         check_positive("samples", samples)
+        if samples > MOST_SAMPLES:
+            raise ValueError(f"samples must be at most {MOST_SAMPLES} points in time for a transition, got {samples}")
         if isinstance(between, str):
             check_choice("between", between, BETWEEN)
         else:

@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_positive, check_values, unmasked
 
@@ -20,6 +20,39 @@ Edges = Literal["binary", "area"]
 
 TOLERANCE = 1e-9  # pupil radii; keeps cells open if their centre is on the rim, such as (0.6, 0.8), despite rounding
 ROUND_OFF = 1e-12  # covered fractions closer to 0 or 1 than this are set to 0 or 1
+
+
+class OpenArea(Tensor):
+    """The open fraction of each cell of an aperture with a hard edge, as ``edges="area"`` gives it.
+
+    The edge shades no light: it crosses a cell. The field of the cell is that of its open part, so that the fraction
+    is its mean amplitude; the light through the cell is the fraction too, and not its square, as through a graded
+    filter (apodisation). What is computed with it, such as ``0.9 * aperture``, is a plain tensor of amplitudes.
+
+    Example:
+        >>> half = torch.tensor([[0.5]]).as_subclass(OpenArea)
+        >>> float(light_through(half)), float(light_through(half * 1.0))
+        (0.5, 0.25)
+    """
+
+    __torch_function__ = nn.Parameter.__torch_function__  # results are plain tensors
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> OpenArea:
+        """Return a copy that is still one."""
+        memo[id(self)] = copied = self.detach().clone().as_subclass(OpenArea)
+        return copied
+
+
+def light_through(aperture: Tensor) -> Tensor:
+    """Return the light through each cell of an aperture: the open area of an :class:`OpenArea`, else amplitude squared.
+
+    Args:
+        aperture: amplitudes in [0, 1], or an :class:`OpenArea`.
+
+    Returns:
+        Fraction of the light that falls on the cell, a plain tensor in float64.
+    """
+    return aperture.as_subclass(Tensor).double() if isinstance(aperture, OpenArea) else aperture.double().square()
 
 
 def circular_aperture(size: int, pitch: float = 0.1, radius: float = 1.0, *, edges: Edges = "binary") -> Tensor:
@@ -33,7 +66,7 @@ def circular_aperture(size: int, pitch: float = 0.1, radius: float = 1.0, *, edg
             shut); "area" gives each cell the exact fraction of its area that the disc covers (for a smooth iris).
 
     Returns:
-        Amplitude in [0, 1], float64.
+        Amplitude in [0, 1], float64; with "area" an :class:`OpenArea`.
 
     Shape:
         (size, size)
@@ -51,7 +84,7 @@ def circular_aperture(size: int, pitch: float = 0.1, radius: float = 1.0, *, edg
     """
     _check_grid(size, pitch, edges)
     check_positive("radius", radius, "pupil radii")
-    return _require_light(_disc(size, pitch, radius, edges))
+    return _made(_disc(size, pitch, radius, edges), edges)
 
 
 def annular_aperture(size: int, pitch: float, inner: float, radius: float = 1.0, *, edges: Edges = "binary") -> Tensor:
@@ -65,7 +98,7 @@ def annular_aperture(size: int, pitch: float, inner: float, radius: float = 1.0,
         edges: "binary" or "area", see :func:`circular_aperture`.
 
     Returns:
-        Amplitude in [0, 1], float64: the disc minus the obstruction.
+        Amplitude in [0, 1], float64: the disc minus the obstruction. With "area" an :class:`OpenArea`.
 
     Shape:
         (size, size)
@@ -81,7 +114,7 @@ def annular_aperture(size: int, pitch: float, inner: float, radius: float = 1.0,
     check_positive("radius", radius, "pupil radii")
     if not 0 < inner < radius:
         raise ValueError(f"inner must be between 0 and the outer radius {radius}, got {inner}")
-    return _require_light((_disc(size, pitch, radius, edges) - _disc(size, pitch, inner, edges)).clamp(min=0))
+    return _made((_disc(size, pitch, radius, edges) - _disc(size, pitch, inner, edges)).clamp(min=0), edges)
 
 
 def polygon_aperture(
@@ -98,7 +131,7 @@ def polygon_aperture(
         edges: "binary" or "area", see :func:`circular_aperture`.
 
     Returns:
-        Amplitude in [0, 1], float64.
+        Amplitude in [0, 1], float64; with "area" an :class:`OpenArea`.
 
     Shape:
         (size, size)
@@ -123,13 +156,13 @@ def polygon_aperture(
     if not math.isfinite(rotation):
         raise ValueError(f"rotation must be finite radians, got {rotation}")
     if edges == "binary":
-        return _require_light(_polygon_contains_centres(size, pitch, sides, rotation, radius))
+        return _made(_polygon_contains_centres(size, pitch, sides, rotation, radius), edges)
     angles = [rotation + 2 * math.pi * k / sides for k in range(sides)]
     corners = [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
     cover = _polygon_cover(_grid_lines(size, pitch), corners) / pitch**2
     cover[cover < ROUND_OFF] = 0
     cover[cover > 1 - ROUND_OFF] = 1
-    return _require_light(cover)
+    return _made(cover, edges)
 
 
 def check_aperture(aperture: Any, size: int) -> Tensor:
@@ -140,7 +173,7 @@ def check_aperture(aperture: Any, size: int) -> Tensor:
         size: cells along a side of the pupil grid.
 
     Returns:
-        A copy in float64 on the same device.
+        A copy in float64 on the same device; of an :class:`OpenArea` another one.
 
     Shape:
         (size, size)
@@ -163,7 +196,7 @@ def check_aperture(aperture: Any, size: int) -> Tensor:
     valid = (amplitude >= 0) & (amplitude <= 1)  # False for NaN too
     if not bool(valid.all()):
         raise ValueError(f"aperture must have amplitudes in [0, 1], got {amplitude[~valid][0].item()}")
-    return _require_light(amplitude)
+    return _made(amplitude, "area" if isinstance(aperture, OpenArea) else "binary")
 
 
 def _check_grid(size: int, pitch: float, edges: str) -> None:
@@ -173,12 +206,12 @@ def _check_grid(size: int, pitch: float, edges: str) -> None:
     check_choice("edges", edges, ("binary", "area"))
 
 
-def _require_light(amplitude: Tensor) -> Tensor:
-    """Return the amplitude, or raise if every cell is closed: such a pupil has no point spread function."""
+def _made(amplitude: Tensor, edges: str) -> Tensor:
+    """Return the aperture, or raise if every cell is closed: such a pupil has no point spread function."""
     check_values("aperture", amplitude)
     if not bool((amplitude > 0).any()):
         raise ValueError("aperture must let some light through, got 0 open cells")
-    return amplitude
+    return amplitude.as_subclass(OpenArea) if edges == "area" else amplitude
 
 
 def _cell_centres(size: int, pitch: float) -> Tensor:

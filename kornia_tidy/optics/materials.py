@@ -130,6 +130,9 @@ def _root_power_series(um: float, terms: Terms) -> float:
     return math.sqrt(_power_series(um, terms))
 
 
+DISPERSIONS = {formula.__name__: formula for formula in (_sellmeier, _power_series, _root_power_series)}
+"""Dispersion formulas by their names, as a camera's state gives them."""
+
 FUSED_SILICA = Material(
     "fused silica",
     "I. H. Malitson, J. Opt. Soc. Am. 55, 1205 (1965), at 20 °C",

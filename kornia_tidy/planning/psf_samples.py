@@ -123,6 +123,7 @@ class PSFSamples:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that the widest allowed window misses the encircled energy
                 window = self._optics.with_fidelity(REFERENCE.replace(max_window=limit)).window
+            window = min(window, limit)  # that of a wide defocus disc may be larger than the border allows
             self._references[limit] = replace(REFERENCE, window=window)
         return self._references[limit]
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.files import parse_json
+from kornia_tidy.optics.aperture import OpenArea
 
 EXTRA_STATE = "_extra_state"  # how PyTorch calls the entry of a state that is neither parameter nor buffer
 _PAGE = 4096  # bytes; settings of about the same length fill the same tensor, as distributed checkpoints want it
@@ -144,7 +145,8 @@ def _described(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _packed(tensor: Tensor) -> dict[str, Any]:
     data = tensor.detach().cpu().double().contiguous().numpy().tobytes()  # apertures are mostly zeros and ones
-    return {"is": "tensor", "shape": list(tensor.shape), "values": base64.b64encode(zlib.compress(data)).decode()}
+    packed = {"is": "tensor", "shape": list(tensor.shape), "values": base64.b64encode(zlib.compress(data)).decode()}
+    return {**packed, "open_area": True} if isinstance(tensor, OpenArea) else packed
 
 
 def _unpacked(packed: Mapping[str, Any]) -> Tensor:
@@ -152,7 +154,10 @@ def _unpacked(packed: Mapping[str, Any]) -> Tensor:
     if size > 8 * _MOST_VALUES:
         raise ValueError(f"a tensor of {shape} is too large for settings")
     data = zlib.decompressobj().decompress(base64.b64decode(packed["values"]), max(size, 1))
-    return torch.frombuffer(bytearray(data), dtype=torch.float64).reshape(shape).clone() if size else torch.empty(shape)
+    tensor = (
+        torch.frombuffer(bytearray(data), dtype=torch.float64).reshape(shape).clone() if size else torch.empty(shape)
+    )
+    return tensor.as_subclass(OpenArea) if packed.get("open_area") else tensor
 
 
 def _difference(saved: Any, here: Any, place: str) -> tuple[str, Any, Any] | None:
@@ -220,7 +225,10 @@ def _made(current: Any, saved: Any, place: str) -> Any:
         values = {f.name: getattr(current, f.name) for f in fields(current) if f.init}
         return replace(current, **{n: _made(v, saved[n], f"{place}.{n}") for n, v in values.items()})  # type: ignore[type-var]
     if isinstance(saved, dict) and saved.get("is") == "tensor" and (current is None or isinstance(current, Tensor)):
-        return _unpacked(saved) if current is None else _unpacked(saved).to(current)
+        if current is None or saved.get("open_area"):
+            return _unpacked(saved)
+        # States of earlier versions do not tell open areas from amplitudes.
+        return current if {**here, **saved} == here else _unpacked(saved).to(current)
     if isinstance(current, Tensor) and saved is None:
         return None
     number, text = isinstance(saved, (int, float)), isinstance(saved, str)

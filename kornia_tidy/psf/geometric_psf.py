@@ -32,11 +32,11 @@ def blur_radius(defocus: float, step: float) -> float:
     return abs(defocus) * REFERENCE_WAVELENGTH / (math.pi * step)
 
 
-def geometric_psfs(amplitude: Tensor, pitch: float, defocus: Sequence[float], step: float, window: int) -> Tensor:
+def geometric_psfs(transmission: Tensor, pitch: float, defocus: Sequence[float], step: float, window: int) -> Tensor:
     """Return geometric-optics PSFs: the image of the aperture on the sensor's pixels, the same at all wavelengths.
 
     Args:
-        amplitude: of the aperture's cells, (N, N) in [0, 1].
+        transmission: share of the light that passes each cell of the aperture, (N, N) in [0, 1]: that of a ``Pupil``.
         pitch: side of a cell in pupil radii.
         defocus: radians at the pupil edge at 530 nm, not 0.
         step: a sensor pixel seen from the pupil in metres.
@@ -54,10 +54,10 @@ def geometric_psfs(amplitude: Tensor, pitch: float, defocus: Sequence[float], st
         >>> round(float(psf.sum()), 6), int((psf > 0).any(0).sum())
         (1.0, 113)
     """
-    cells = amplitude.shape[-1]
-    edges = (torch.arange(cells + 1, dtype=torch.float64, device=amplitude.device) - cells / 2) * pitch
-    pixels = torch.arange(window, dtype=torch.float64, device=amplitude.device)[:, None] - window // 2
-    light = amplitude.double().square()
+    cells = transmission.shape[-1]
+    edges = (torch.arange(cells + 1, dtype=torch.float64, device=transmission.device) - cells / 2) * pitch
+    pixels = torch.arange(window, dtype=torch.float64, device=transmission.device)[:, None] - window // 2
+    light = transmission.double()
     light = light / light.sum()
     psfs = []
     for psi in defocus:

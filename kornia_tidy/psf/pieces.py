@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from math import inf
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -108,6 +109,8 @@ def pieces_of(
     make = partial(model.scene_bank, channels, dtype, device=device or reach.device)
     if not remembered:
         make = partial(_forgotten, model, channels, dtype)
+    if compositing == "occlusion" and (blur is not None or model.measured_cut):  # discs of rays end
+        make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
         shares = model.state_weights(dtype)
         if is_unread():  # all states in one bank, for one rendering
@@ -165,8 +168,8 @@ def runs_of(present: list[bool], most: int) -> list[tuple[int, int]]:
 
 def _surely_fits(model: PSFModel, channels: int, dtype: torch.dtype, budget: int) -> bool:
     """Return whether PSFs of all the camera's range fit half of a budget, whatever their window."""
-    (lo, hi), fidelity = model.camera.defocus_range, model.fidelity
-    samples = ((hi - lo) / fidelity.layer_spacing + 1) * (fidelity.window or fidelity.max_window) ** 2
+    lo, hi = model.camera.defocus_range
+    samples = ((hi - lo) / model.fidelity.layer_spacing + 1) * model.largest_window**2
     return _MOST_COPIES * samples * channels * dtype.itemsize <= budget // 2
 
 
@@ -192,6 +195,10 @@ def _most_layers(
 def _forgotten(model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, state: int | None = None) -> PSFBank:
     with without_kernel_cache():
         return model.without_memory().scene_bank(channels, dtype, reach, state)
+
+
+def _with_tails(make: Callable[..., PSFBank], *given: Any) -> PSFBank:
+    return make(*given).with_tails()
 
 
 def _wide_pieces(model: PSFModel, blur: WideBlur, channels: int, dtype: torch.dtype, scene: Tensor) -> Iterator[Piece]:

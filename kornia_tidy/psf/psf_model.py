@@ -29,7 +29,8 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolated_bank,
     nodes_around,
 )
-from kornia_tidy.psf.lens_limits import PARTS, check_defocus_range, check_layer_spacing
+from kornia_tidy.psf.geometric_psf import blur_radius
+from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, check_layer_spacing
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
@@ -94,6 +95,7 @@ class PSFModel:
     measured: PSFBank | None  # PSFs in the place of the masks' own
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
+    measured_cut: bool  # whether measured PSFs are zero somewhere
     shown: Timeline | None  # what a snapshot shows, which masks that change leave alone
     lock: SharedLock  # held while masks are read, and by whoever changes several of them at once
 
@@ -113,7 +115,7 @@ class PSFModel:
         aperture: Tensor | None = None,
     ) -> None:
         unset = dict.fromkeys(("measured", "state", "moment", "shown"))
-        vars(self).update(unset, lock=SharedLock(), _memories={})
+        vars(self).update(unset, measured_cut=False, lock=SharedLock(), _memories={})
         parts = self.replace(
             fidelity=Fidelity.of(fidelity),
             masks=PixelwiseMask() if masks is None else masks,
@@ -480,7 +482,9 @@ class PSFModel:
             >>> model.window, torch.equal(model.psf_bank().psfs, measured.psfs)
             (5, True)
         """
-        return self.replace(fidelity=self.fidelity.replace(occlusion_states="mean"))._replace(measured=bank)
+        cut = bool((bank.psfs == 0).any())
+        mean = self.replace(fidelity=self.fidelity.replace(occlusion_states="mean"))
+        return mean._replace(measured=bank, measured_cut=cut)
 
     def with_window(self, window: FittedWindow | None) -> Self:
         """Return this model with a window that is known; None measures it, and finds the pupil, when it is asked for.
@@ -528,6 +532,12 @@ class PSFModel:
         return self.fitted.side
 
     @property
+    def largest_window(self) -> int:
+        """Largest side that the PSFs may have, without measuring their window."""
+        known = self._derived.window
+        return max(self.fidelity.window or self.fidelity.max_window, 0 if known is None else known.side)
+
+    @property
     def fitted(self) -> FittedWindow:
         """The window and the share of the light in it, measured with the masks as they were at the first look."""
         with self.lock:
@@ -542,15 +552,36 @@ class PSFModel:
         if (blur := self.wide_blur) is not None:
             return FittedWindow(blur.window, self._wide_light())
         self._check_layers()
-        return fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
+        found = fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
+        if not found.enough and (disc := self._disc_window()) is not None:
+            found = fitted_window(self._sampled_psfs, self.fidelity, disc)
+            return found._replace(enough=found.held[0] >= self.fidelity.enclosed_energy)
+        return found
+
+    def _disc_window(self) -> int | None:
+        """Return the side that holds the lens's widest defocus disc; None where ``max_window`` holds it.
+
+        Also where that is below :data:`LEAST_WINDOW`, or the disc is wider than :data:`WIDEST_DISC`.
+        """
+        step, shifts = self.pixel_step, [self.camera.chromatic_defocus(w) for w in self.spectrum.wavelengths]
+        size = float(step.detach()) if isinstance(step, Tensor) else step
+        lo, hi = self.camera.defocus_range
+        radius = blur_radius(max(-(lo + min(*shifts, 0.0)), hi + max(*shifts, 0.0)), size)
+        if not LEAST_WINDOW <= self.fidelity.max_window < 2 * radius <= WIDEST_DISC:
+            return None
+        return window_of(radius, size, self.pupil.extent)
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:
-        """Return the PSFs at both ends of the range and at focus, good enough to see where the light goes."""
+        """Return the PSFs at both ends of the range and at focus, good enough to see where the light goes.
+
+        As shares of the light in the field: of what crosses a cell at a hard edge, a mean field holds a part only.
+        """
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
         states = self.states(torch.float32)
-        return self._exact_psfs(self._sampled.flat(), 1, *states, nodes, size, tolerance=_SAMPLING).psfs
+        psfs = self._exact_psfs(self._sampled.flat(), 1, *states, nodes, size, tolerance=_SAMPLING).psfs
+        return psfs if self.fidelity.propagation == "paper" else psfs / self.pupil.field_share
 
     def _check_layers(self) -> None:
         check_defocus_range(self.camera.defocus_range, self.pixel_step, self.fidelity, self.fixed_window)

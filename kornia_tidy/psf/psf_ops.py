@@ -23,9 +23,9 @@ from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
 
 _LENS = (
-    "Tensor phase, Tensor weights, Tensor amplitude, float cell_pitch, float fill_factor, float[] wavelengths,"
-    " float[] channel_weights, float[] basis, float[] dispersion, float[] chromatic_defocus, float[] defocus,"
-    " float pixel_step, int window, float tolerance"
+    "Tensor phase, Tensor weights, Tensor amplitude, float cell_pitch, float fill_factor, float light,"
+    " float[] wavelengths, float[] channel_weights, float[] basis, float[] dispersion, float[] chromatic_defocus,"
+    " float[] defocus, float pixel_step, int window, float tolerance"
 )
 _TENSORS = 3
 _REMEMBERED_BYTES = 64 << 20  # larger banks are computed anew each time
@@ -112,7 +112,7 @@ def operator_psf_bank(
     """
     rows, basis = ([x for row in table for x in row] for table in (spectrum.weights, spectrum.basis or ()))
     light = list(spectrum.wavelengths), rows, basis
-    shown = phase, weights, pupil.amplitude, pupil.cell_pitch, pupil.fill_factor
+    shown = phase, weights, pupil.amplitude, pupil.cell_pitch, pupil.fill_factor, pupil.light
     psfs = torch.ops.kornia_tidy.exact_psfs(
         *shown, *light, list(dispersion), list(chromatic_defocus), list(defocus), pixel_step, window, tolerance
     )
@@ -124,10 +124,10 @@ def _rows(numbers: Sequence[float], columns: int) -> tuple[tuple[float, ...], ..
 
 
 def _computed(*arguments: Any) -> Tensor:
-    phase, weights, amplitude, pitch, fill_factor, waves, rows, basis, dispersion, shifts, nodes, *sensor = arguments
+    phase, weights, *pupil, waves, rows, basis, dispersion, shifts, nodes, step, window, tolerance = arguments
     spectrum = Spectrum(tuple(waves), _rows(rows, len(waves)), _rows(basis, len(waves)) or None)
-    lens = Pupil(amplitude, pitch, fill_factor), spectrum, dispersion, nodes
-    return exact_psf_bank(phase, weights, *lens, *sensor, chromatic_defocus=shifts).psfs
+    lens = Pupil(*pupil), spectrum, dispersion, nodes, step, window, tolerance
+    return exact_psf_bank(phase, weights, *lens, chromatic_defocus=shifts).psfs
 
 
 def _psfs(*arguments: Any) -> Tensor:
@@ -148,7 +148,7 @@ def _psfs(*arguments: Any) -> Tensor:
 
 
 def _shape(*arguments: Any) -> tuple[int, ...]:
-    waves, rows, basis, nodes, window = arguments[5], arguments[6], arguments[7], arguments[-4], arguments[-2]
+    waves, rows, basis, nodes, window = arguments[6], arguments[7], arguments[8], arguments[-4], arguments[-2]
     planes = len(rows) // len(waves) * (len(basis) // len(waves) if basis else 1)
     return len(nodes), planes, window, window
 

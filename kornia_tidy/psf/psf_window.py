@@ -36,7 +36,7 @@ class FittedWindow(NamedTuple):
             warnings.warn(
                 f"the largest PSF window allowed, {self.side} px, holds {self.held[0]:.0%} of the light where it "
                 f"should hold {fidelity.enclosed_energy:.0%}; the rest is handled by {fidelity.stray_light!r}: raise "
-                f"Fidelity.max_window, or lower Fidelity.enclosed_energy",
+                f"Fidelity.max_window, lower Fidelity.enclosed_energy, or narrow the camera's depth_range",
                 stacklevel=stacklevel,
             )
 

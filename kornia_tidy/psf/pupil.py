@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kornia_tidy.masks.base import MASK_SPAN
-from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.aperture import circular_aperture, light_through
 from kornia_tidy.runtime.precision import has_float64
 
 
@@ -20,9 +20,11 @@ class Pupil:
     """The aperture on a grid of square cells, a whole number of them for each mask pixel.
 
     Args:
-        amplitude: (n, n) in [0, 1].
+        amplitude: (n, n) in [0, 1], or an :class:`~kornia_tidy.optics.aperture.OpenArea`.
         cell_pitch: side of a cell in pupil radii.
         fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
+        light: that it lets through, in units of squared amplitude times pupil radii squared. Default: the open area of
+            an ``OpenArea``, else the sum of squared amplitudes.
 
     Example:
         >>> from kornia_tidy.optics.aperture import circular_aperture
@@ -34,8 +36,9 @@ class Pupil:
     amplitude: Tensor
     cell_pitch: float
     fill_factor: float = 1.0
-    light: float = field(init=False)
-    """Light it lets through, in units of squared amplitude times pupil radii squared."""
+    light: float = math.nan
+    transmission: Tensor = field(init=False)
+    """Share of the light that passes each cell, (n, n) float64."""
     extent: float = field(init=False)
     """Half width of the open part in pupil radii; twice it bounds the frequencies in a PSF."""
     max_rho2: float = field(init=False)
@@ -53,10 +56,18 @@ class Pupil:
         corners = torch.cat([torch.stack([rows + y, x], 1) for y in (0, 1) for x in (first, last + 1)]).double()
         return float(torch.cdist(corners, corners, compute_mode="donot_use_mm_for_euclid_dist").max()) * self.cell_pitch
 
+    @property
+    def field_share(self) -> float:
+        """Share of the light in the field of the cells: 1, and less where cells at a hard edge hold its mean only."""
+        return min(1.0, float(self.amplitude.double().square().sum()) * self.cell_pitch**2 / self.light)
+
     def __post_init__(self) -> None:
         size = self.amplitude.shape[-1]
         cells = torch.nonzero(self.amplitude) - (size - 1) / 2
-        object.__setattr__(self, "light", float(self.amplitude.double().square().sum()) * self.cell_pitch**2)
+        object.__setattr__(self, "transmission", light_through(self.amplitude))
+        if math.isnan(self.light):
+            object.__setattr__(self, "light", float(self.transmission.sum()) * self.cell_pitch**2)
+        object.__setattr__(self, "amplitude", self.amplitude.as_subclass(Tensor))
         object.__setattr__(self, "extent", (float(cells.abs().max()) + 0.5) * self.cell_pitch)
         object.__setattr__(self, "max_rho2", float((cells.abs() + 0.5).square().sum(1).max()) * self.cell_pitch**2)
 

@@ -53,7 +53,7 @@ def wide_psfs(
     for span in (far, near):
         psfs = like.new_zeros(len(span), len(shares), window, window)
         if span:
-            rays = geometric_psfs(pupil.amplitude.to(like.device), pupil.cell_pitch, span, step * grid, window)
+            rays = geometric_psfs(pupil.transmission.to(like.device), pupil.cell_pitch, span, step * grid, window)
             psfs = psfs + rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
         parts.append(psfs)
     if small:

@@ -191,7 +191,9 @@ def occlusion(
         E_d = h_d * \sum_{j \le d} O_j, \quad l_d = \frac{h_d * (O_d L_d)}{\max(E_d, 0) + \epsilon}, \quad
         a_d = \frac{h_d * O_d}{\max(E_d, 0) + \epsilon}, \quad I = \sum_d l_d \prod_{j > d} (1 - a_j)
 
-    White stays white, to :math:`\epsilon` over the smallest share of a PSF that a layer is seen by. PSFs are normalised
+    White stays white, to :math:`\epsilon` over the smallest share of a PSF that a layer is seen by. Behind near things
+    that is the tail of a far layer's PSF: one that is cut to zero sees nothing there, and white darkens. Give such PSFs
+    tails (:meth:`kornia_tidy.psf.psf_bank.PSFBank.with_tails`), as cameras do with measured ones. PSFs are normalised
     by their sums on the way, so light that a bank discards is as if renormalised; in the dark beyond a border of zeros
     there is nothing to be seen, and the image does not darken towards it. Not linear in the PSFs: PSFs averaged over
     time stand for the states of the exposure only roughly. Computed in float64, see

@@ -15,6 +15,7 @@ from torch import Tensor
 
 import kornia_tidy
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.optics.aperture import OpenArea
 from kornia_tidy.runtime.search_path import ROOT, find_program
 
 MEASURED_CODE = (
@@ -114,6 +115,8 @@ def scene_hash(optics: TiDyOptics, image: Tensor, depth: Tensor) -> str:
     for tensor in (image, depth, optics.pupil.amplitude, *state):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    if isinstance(optics.aperture, OpenArea):
+        digest.update(b"open area")
     for part in parts:
         plain = {k: v for k, v in vars(part).items() if isinstance(v, str | int | float | tuple) and k != "training"}
         digest.update(f"{type(part).__name__} {sorted(plain.items())}".encode())

@@ -236,7 +236,7 @@ def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDy
     fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
     widest = largest_window(optics.border, *image.shape[-2:])
     fidelity = replace(fidelity, max_window=min(fidelity.max_window, widest))
-    return TiDyOptics(
+    camera = TiDyOptics(
         optics.masks,
         camera=optics.camera,
         modulator=optics.modulator,
@@ -246,8 +246,10 @@ def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDy
         color_space="paper" if fidelity.propagation == "paper" else "linear",  # neither decodes nor encodes
         border=optics.border,
         spectrum=optics.spectrum,
-        aperture=optics.pupil.amplitude,
+        aperture=optics.aperture,
     )
+    # That of a wide defocus disc may be larger than the border allows.
+    return camera if camera.window <= widest else camera.with_fidelity(replace(fidelity, window=widest))
 
 
 def _touch(camera: TiDyOptics) -> None:

@@ -19,10 +19,11 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from kornia_tidy.camera.saved_camera import below
 from kornia_tidy.files import only_here
 from kornia_tidy.inference.heads import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights, weights_of
+from kornia_tidy.inference.trained import fix_window, head_prefix, load_masks, load_weights, weights_of
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.nafnet import deepened

@@ -86,6 +86,21 @@ class TestWideCaptures(BaseTester):
             assert float(learnt.masks.phase.grad.abs().max()) > 0
 
     @torch.no_grad()
+    @pytest.mark.parametrize("f_number", [1.4, 2.8, 4.0])
+    def test_feature_a_capture_depends_on_nothing_but_what_its_psfs_reach(self, f_number):
+        """Neither on captures before it, nor on pixels farther away than any PSF; it was by up to 0.02."""
+        image, near = light(192), torch.full((1, 1, 192, 192), 2.0)
+        alone = fast_camera(f_number)(image, near)
+        optics = fast_camera(f_number)
+        optics(image, torch.linspace(1.6, 9.0, 192).expand(1, 1, 192, 192))
+        assert torch.equal(optics(image, near), alone)
+        near[..., :8, :8] = 2.4
+        reach = 8 + optics.window // 2
+        assert reach < 160
+        apart = (fast_camera(f_number)(image, near) - alone)[..., reach:, reach:]
+        assert float(apart.abs().max()) < 2e-6
+
+    @torch.no_grad()
     def test_feature_bands_are_the_whole(self):
         optics, image, depth = fast_camera(), light(192), stairs(192)
         whole = optics(image, depth)
@@ -99,6 +114,14 @@ class TestWideCaptures(BaseTester):
         gathered = fast_camera()(image, depth)
         other = fast_camera(compositing=compositing)(image, depth)
         assert float((gathered - other).square().mean().sqrt()) < 1e-3
+
+    @torch.no_grad()
+    def test_feature_white_behind_something_near_stays_white(self):
+        """Geometric discs end, and so does what occlusion sees through them: it was 0.83 at the outline."""
+        optics, depth = fast_camera(1.8, compositing="occlusion"), torch.full((1, 1, 128, 128), 2.0)
+        depth[..., :64] = 1.55
+        white = optics(torch.ones(1, 3, 128, 128), depth)
+        assert 0.997 < float(white.min()) <= float(white.max()) < 1 + 1e-5
 
     def test_exception_of_occlusion_beyond_the_memory(self):
         optics = fast_camera(1.4, 0.5, compositing="occlusion")

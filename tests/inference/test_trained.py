@@ -6,10 +6,13 @@ import json
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
+from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import write_state
-from kornia_tidy.inference.trained import build_head, build_optics, load_trained
+from kornia_tidy.inference.trained import build_head, build_optics, load_masks, load_trained
+from kornia_tidy.masks import ZernikeMask
 from tests.base import BaseTester
 
 SETTINGS = SystemSettings(
@@ -112,3 +115,21 @@ class TestLoadTrained(BaseTester):
             else:
                 continue
             assert "\n" not in told
+
+
+class TestLoadMasks(BaseTester):
+    def test_feature_pixels_take_the_phase_that_was_limited(self, tmp_path):
+        saved = TiDyOptics(ZernikeMask(2, constraint="wrapped", max_height=8e-7), fidelity="draft")
+        save_file(saved.state_dict(), tmp_path / "a.safetensors")
+        optics = TiDyOptics(PixelwiseMask(2), fidelity="draft")
+        load_masks(tmp_path / "a.safetensors", optics)
+        assert torch.equal(optics.masks.phase, saved.masks.phase)
+
+    def test_exception_other_limits(self, tmp_path):
+        saved = TiDyOptics(PixelwiseMask(2, constraint="wrapped"), fidelity="draft")
+        save_file(saved.state_dict(), tmp_path / "a.safetensors")
+        optics = TiDyOptics(PixelwiseMask(2, constraint="clamp"), fidelity="draft")
+        before = optics.masks.phase.detach().clone()
+        with pytest.raises(ValueError, match="constraint is 'wrapped' in the state and 'clamp' here"):
+            load_masks(tmp_path / "a.safetensors", optics)
+        assert torch.equal(optics.masks.phase, before)

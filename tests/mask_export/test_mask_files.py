@@ -7,11 +7,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from kornia_tidy import LearnableDwellTimes, PixelwiseMask, SpatialLightModulator, TiDyOptics
-from kornia_tidy.mask_export.mask_files import read_dwell_shares, read_heights, write_heights
+from kornia_tidy import DwellTimes, LearnableDwellTimes, PixelwiseMask, SpatialLightModulator, Switching, TiDyOptics
+from kornia_tidy.mask_export.mask_files import masks_in_state, read_heights, write_heights
 from kornia_tidy.masks import ZernikeMask
 from kornia_tidy.modulator import GreyLevels
-from kornia_tidy.optics import NOA61
+from kornia_tidy.optics import NOA61, PMMA
 from tests.base import BaseTester
 
 
@@ -42,16 +42,24 @@ class TestMaskFiles(BaseTester):
         np.save(tmp_path / "one.npy", np.ones((3, 3), np.float32))
         assert read_heights(tmp_path / "one.npy").shape == (1, 3, 3)
 
-    def test_feature_learnt_dwell_times_come_with_the_state(self, tmp_path):
+    def test_feature_dwell_times_come_with_the_state(self):
         for modulator in (
+            DwellTimes((3, 1)),
+            Switching(1e-3, dwell=DwellTimes((3, 1))),
             LearnableDwellTimes((3, 1)),
             SpatialLightModulator(GreyLevels(8), LearnableDwellTimes((3, 1))),
         ):
-            save_file(TiDyOptics(PixelwiseMask(2), modulator=modulator).state_dict(), tmp_path / "c.safetensors")
-            assert read_dwell_shares(tmp_path / "c.safetensors") == pytest.approx([0.75, 0.25])
-        save_file(TiDyOptics().state_dict(), tmp_path / "c.safetensors")
-        assert read_dwell_shares(tmp_path / "c.safetensors") is None
-        assert read_dwell_shares(tmp_path / "none.npy") is None
+            state = TiDyOptics(PixelwiseMask(2), modulator=modulator, fidelity="draft").state_dict()
+            assert masks_in_state(state).dwell == pytest.approx([0.75, 0.25])
+            state.pop("_extra_state")  # as in earlier versions
+            learnt = "LearnableDwellTimes" in repr(modulator)
+            assert masks_in_state(state).dwell == (pytest.approx([0.75, 0.25]) if learnt else None)
+        assert masks_in_state(TiDyOptics(fidelity="draft").state_dict()).dwell is None
+
+    def test_exception_another_material_than_the_saved_one(self, tmp_path):
+        save_file(TiDyOptics(PixelwiseMask(1, material=NOA61)).state_dict(), tmp_path / "camera.safetensors")
+        with pytest.raises(ValueError, match="its masks are of NOA61: leave the material out, got PMMA"):
+            read_heights(tmp_path / "camera.safetensors", PMMA)
 
     def test_exception(self, tmp_path):
         save_file(ZernikeMask(2).state_dict(), tmp_path / "z.safetensors")

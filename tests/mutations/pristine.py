@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from safetensors.torch import save_file
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import write_depth, write_image
@@ -103,12 +104,15 @@ def _masks(folder: Path) -> list[Case]:
     masks = PixelwiseMask(2, generator=torch.Generator().manual_seed(0))
     write_heights(folder / "heights.npy", masks.heights().detach().double())
     write_heights(folder / "heights.safetensors", masks.heights().detach().double())
-    TiDyOptics(masks, fidelity="draft").psf_bank().save(folder / "bank.safetensors")
+    optics = TiDyOptics(masks, fidelity="draft")
+    optics.psf_bank().save(folder / "bank.safetensors")
+    save_file(optics.state_dict(), folder / "camera.safetensors")
     (folder / "lut.txt").write_text(" ".join(f"{level / 40.6:.6f}" for level in range(256)))
     write_slm_frames(folder / "frames", SLMFrames.of(20 * masks.heights().detach(), GreyLevels(8)))
     read_frames = ("masks", "import", "FOLDER", "-o", "out.npy")
     sidecar, turns, frame = (folder / "frames" / name for name in ("frames.json", "turns.npy", "frame_000.png"))
-    files = [("npy", folder / "heights.npy"), ("safetensors", folder / "heights.safetensors")]
+    files = [("npy", folder / "heights.npy")]
+    files += [("safetensors", folder / f"{name}.safetensors") for name in ("heights", "camera")]
     return [
         *(Case(kind, kind, path, ("masks", "show", "IN")) for kind, path in files),
         *(Case(kind, kind, path, ("masks", "export", "IN", "-o", "out.npy"), ("out.npy",)) for kind, path in files),

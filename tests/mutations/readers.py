@@ -33,11 +33,10 @@ from kornia_tidy.files import read_json
 from kornia_tidy.inference.hub import from_pretrained, save_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.inference.trained import load_trained
+from kornia_tidy.inference.trained import load_camera, load_trained
 from kornia_tidy.mask_design.candidates import Candidate
 from kornia_tidy.mask_design.design_memory import DesignMemory
 from kornia_tidy.mask_export import read_heights, read_response, read_slm_frames
-from kornia_tidy.mask_export.mask_files import read_dwell_shares
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
@@ -177,7 +176,7 @@ def _numbers(folder: Path) -> list[Case]:
     return [
         Case("npy", "npy", folder / "heights.npy", read_heights),
         Case("safetensors", "safetensors", folder / "heights.safetensors", read_heights),
-        Case("safetensors", "safetensors", folder / "heights.safetensors", read_dwell_shares),
+        Case("safetensors", "safetensors", folder / "camera.safetensors", load_camera),
         Case("safetensors", "safetensors", folder / "bank.safetensors", PSFBank.load),
         Case("safetensors", "safetensors", folder / "measured.safetensors", MeasuredPSFs.load),
         Case("frames", "json", frames / "frames.json", read_frames, (), frames),

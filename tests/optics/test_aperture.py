@@ -1,4 +1,6 @@
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -6,7 +8,16 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.optics.aperture import annular_aperture, check_aperture, circular_aperture, polygon_aperture
+from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.camera.saved_camera import camera_of_state
+from kornia_tidy.optics.aperture import (
+    OpenArea,
+    annular_aperture,
+    check_aperture,
+    circular_aperture,
+    light_through,
+    polygon_aperture,
+)
 from tests.base import BaseTester
 
 SQUARE = {"sides": 4, "rotation": math.pi / 4, "radius": math.sqrt(2)}  # half-width 1, sides along the axes
@@ -290,3 +301,54 @@ class TestCheckAperture(BaseTester):
     def test_exception_a_complex_pupil_is_refused(self, device):
         with pytest.raises(TypeError, match="real amplitude"):
             check_aperture(torch.ones(5, 5, device=device, dtype=torch.complex64), 5)
+
+    def test_feature_open_areas_stay_open_areas(self):
+        area = circular_aperture(5, 0.46, edges="area")
+        assert isinstance(check_aperture(area, 5), OpenArea)
+        assert not isinstance(check_aperture(0.9 * area, 5), OpenArea)
+
+
+class TestOpenArea(BaseTester):
+    @pytest.mark.parametrize(
+        "aperture",
+        [
+            circular_aperture(23, edges="area"),
+            annular_aperture(23, 0.1, 0.37, edges="area"),
+            polygon_aperture(23, 0.1, 6, 0.2, edges="area"),
+        ],
+    )
+    def test_feature_light_is_the_open_area(self, aperture):
+        assert torch.equal(light_through(aperture), torch.tensor(aperture.tolist(), dtype=torch.float64))
+        graded = 1.0 * aperture
+        assert type(graded) is torch.Tensor
+        self.assert_close(light_through(graded), graded.square())
+        for copied in (copy.deepcopy(aperture), pickle.loads(pickle.dumps(aperture))):
+            assert isinstance(copied, OpenArea)
+            assert copied.tolist() == aperture.tolist()
+
+    def test_feature_shut_and_open_cells_are_the_same_either_way(self):
+        binary = circular_aperture(23)
+        assert not isinstance(binary, OpenArea)
+        assert torch.equal(light_through(binary), light_through(binary.as_subclass(OpenArea)))
+
+    def test_feature_a_camera_and_its_state_keep_it(self):
+        area = circular_aperture(23, edges="area")
+        optics = TiDyOptics(PixelwiseMask(1), fidelity="draft", aperture=area)
+        assert optics.pupil.light == pytest.approx(math.pi, rel=1e-12)
+        assert (
+            copy.deepcopy(optics).pupil.light == camera_of_state(optics.state_dict()).pupil.light == optics.pupil.light
+        )
+        graded = TiDyOptics(PixelwiseMask(1), fidelity="draft", aperture=0.9 * area)
+        assert graded.pupil.light == pytest.approx(0.81 * float((1.0 * area).square().sum()) * 0.01, rel=1e-12)
+        graded.load_state_dict(optics.state_dict(), take_over=True)
+        assert graded.pupil.light == optics.pupil.light
+
+    def test_feature_a_state_of_before_keeps_its_captures_or_takes_the_light_of_the_camera_it_goes_to(self):
+        """Such a state holds the numbers, and not that they are areas."""
+        area = circular_aperture(23, edges="area")
+        old = TiDyOptics(PixelwiseMask(1), fidelity="draft", aperture=1.0 * area)
+        optics = TiDyOptics(PixelwiseMask(1), fidelity="draft", aperture=area)
+        optics.load_state_dict(old.state_dict())
+        optics.load_state_dict(old.state_dict(), take_over=True)
+        assert isinstance(optics.aperture, OpenArea)
+        assert camera_of_state(old.state_dict()).pupil.light == old.pupil.light

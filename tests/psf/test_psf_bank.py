@@ -6,8 +6,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from kornia_tidy import PSFBank, TiDyOptics
+from kornia_tidy import DefocusRange, PSFBank, TiDyOptics
 from kornia_tidy.psf.psf_bank import enclosing_window
+from kornia_tidy.render import render
 from tests.base import BaseTester
 
 
@@ -112,3 +113,42 @@ class TestEnclosingWindow(BaseTester):
 
     def test_feature_none_where_the_light_is_not_there(self):
         assert enclosing_window(torch.full((1, 3, 3), 0.01), 0.5) is None
+
+
+class TestTails(BaseTester):
+    def discs(self) -> PSFBank:
+        """Cut to zero: a point in focus, and a disc of 12 pixels at +10."""
+        radius = torch.hypot(*torch.meshgrid(torch.arange(-16.0, 17), torch.arange(-16.0, 17), indexing="ij"))
+        discs = [(radius <= r).float().expand(3, -1, -1) for r in (0.5, 6.0, 12.0)]
+        return PSFBank.from_measured(torch.stack(discs), torch.tensor([0.0, 5.0, 10.0]))
+
+    def test_feature_light_stays_and_nothing_is_cut(self):
+        bank = self.discs()
+        tails = bank.with_tails().psfs
+        assert float(tails.min()) > 0
+        self.assert_close(tails.sum((2, 3)), bank.psfs.sum((2, 3)))
+        assert float((tails - bank.psfs).abs().sum((2, 3)).max()) <= 2e-3 * (1 + 1e-5)
+
+    @torch.no_grad()
+    @pytest.mark.parametrize("method", ["dense", "auto"])
+    def test_feature_white_behind_something_near_stays_white(self, method):
+        psi = torch.zeros(1, 1, 64, 64)
+        psi[..., :32] = 10.0
+        white = torch.ones(1, 3, 64, 64)
+        assert float(render(white, psi, self.discs(), "occlusion", method=method).min()) < 0.6
+        assert float(render(white, psi, self.discs().with_tails(), "occlusion", method=method).min()) > 0.997
+
+    @torch.no_grad()
+    def test_feature_a_camera_gives_tails_to_measured_psfs_that_are_cut_for_occlusion(self):
+        parts = {"camera": DefocusRange(0.0, 10.0), "sensor": None, "color_space": "linear"}
+        depth, image = torch.zeros(1, 1, 64, 64), torch.ones(1, 3, 64, 64)
+        depth[..., :32] = 1.0
+        hides = TiDyOptics(**parts, compositing="occlusion").with_bank(self.discs())
+        assert float(hides(image, depth).min()) > 0.997
+        bank = self.discs()
+        gathers, whole = TiDyOptics(**parts).with_bank(bank), PSFBank.from_measured(bank.psfs + 1e-4, bank.defocus)
+        image = torch.rand(1, 3, 64, 64)
+        self.assert_close(gathers(image, depth), render(image, 10 * depth, bank), rtol=0, atol=1e-6)
+        # PSFs without zeros are taken as they are.
+        wanted = render(image, 10 * depth, whole, "occlusion")
+        self.assert_close(hides.with_bank(whole)(image, depth), wanted, rtol=0, atol=1e-6)

@@ -32,7 +32,7 @@ def pupil(side=7, fill_factor=1.0):
 def arguments(phase, weights, *, basis=()):
     rows = [x for row in SPECTRUM.weights for x in row]
     dispersion, nodes, step, window, tolerance, shifts = LENS
-    shown = phase, weights, pupil().amplitude, 0.3, 1.0, list(SPECTRUM.wavelengths)
+    shown = phase, weights, pupil().amplitude, 0.3, 1.0, pupil().light, list(SPECTRUM.wavelengths)
     return *shown, rows, list(basis), dispersion, shifts, nodes, step, window, tolerance
 
 
@@ -83,7 +83,7 @@ class TestOperatorPSFBank(BaseTester):
             operator_psf_bank(phase, weights, aperture, SPECTRUM, *lens)
             change()
             found = operator_psf_bank(phase, weights, aperture, SPECTRUM, *lens).psfs
-            own = Pupil(aperture.amplitude, aperture.cell_pitch)
+            own = Pupil(aperture.amplitude, aperture.cell_pitch, light=aperture.light)
             self.assert_close(found, exact_psf_bank(phase, weights, own, SPECTRUM, *lens).psfs)
 
     def test_feature_same_psfs_are_computed_once(self, monkeypatch):

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics.aperture import OpenArea
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
 from kornia_tidy.psf.psf_model import PSFModel
-from kornia_tidy.psf.pupil import pupil_over
+from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.wide_blur import FINE_RADIUS, blurs_widely, wide_blur, window_of
 from kornia_tidy.psf.wide_psfs import held_nodes, is_flat
 from tests.base import BaseTester
@@ -33,7 +34,7 @@ class TestGeometricPSFs(BaseTester):
     @pytest.mark.parametrize("psi", [-300.0, 40.0])
     def test_smoke_all_light_lies_in_the_window(self, psi):
         window = window_of(blur_radius(psi, STEP), STEP, PUPIL.extent)
-        psf = geometric_psfs(PUPIL.amplitude, PUPIL.cell_pitch, [psi], STEP, window)
+        psf = geometric_psfs(PUPIL.transmission, PUPIL.cell_pitch, [psi], STEP, window)
         self.assert_close(psf.sum(), torch.tensor(1.0, dtype=torch.float64), rtol=0, atol=1e-12)
         assert float(psf.min()) >= 0
 
@@ -43,6 +44,15 @@ class TestGeometricPSFs(BaseTester):
         psf = geometric_psfs(torch.ones(2, 2), 0.5, [psi], STEP, 7)[0]
         line = torch.tensor([0, 0.5, 1, 1, 1, 0.5, 0], dtype=torch.float64) / 4
         self.assert_close(psf, line[:, None] * line, rtol=0, atol=1e-12)
+
+    def test_feature_light_through_a_cell_at_the_edge_is_its_open_area(self):
+        """Two cells, one half open: two thirds of the light in the half of the image that is theirs."""
+        aperture = torch.tensor([[1.0, 0.5], [1.0, 0.5]], dtype=torch.float64).as_subclass(OpenArea)
+        psi = 4 * math.pi * STEP / REFERENCE_WAVELENGTH
+        pupil = Pupil(aperture, 1.0)
+        psf = geometric_psfs(pupil.transmission, pupil.cell_pitch, [psi], STEP, 11)[0]
+        left = float(psf[:, :5].sum() + psf[:, 5].sum() * 2 / 3)  # the middle pixel is half of each
+        assert left == pytest.approx(2 / 3, abs=1e-12)
 
     def test_convention_near_is_upright_and_far_upside_down(self):
         aperture = torch.zeros(3, 3)
@@ -63,7 +73,7 @@ class TestGeometricPSFs(BaseTester):
             window = window_of(radius, STEP, PUPIL.extent)
             exact = exact_psf(radius, window)
             psi = radius * math.pi * STEP / REFERENCE_WAVELENGTH
-            rays = geometric_psfs(PUPIL.amplitude, PUPIL.cell_pitch, [psi], STEP, window)[0]
+            rays = geometric_psfs(PUPIL.transmission, PUPIL.cell_pitch, [psi], STEP, window)[0]
             edges = ((exact / exact.sum() - rays).sum(0)).cumsum(0)
             errors.append(float(edges.abs().max()))
         assert errors[1] < 0.8 * errors[0] < 0.02
@@ -104,8 +114,7 @@ class TestWideBlur(BaseTester):
         assert PSFModel(flat).wide_blur is None
         assert PSFModel(flat, fast_lens(), fidelity="reference").wide_blur is None
         assert PSFModel(flat, fast_lens(), fidelity=Fidelity(wide_blur="waves", window=9)).wide_blur is None
-        with pytest.warns(UserWarning, match="the largest PSF window allowed"):
-            assert PSFModel(PixelwiseMask(1), fast_lens()).wide_blur is None
+        assert PSFModel(PixelwiseMask(1), fast_lens()).wide_blur is None
         assert is_flat(torch.full((2, 3, 3), 0.5))
 
     def test_feature_masks_that_are_learnt_leave_it(self):
@@ -113,8 +122,7 @@ class TestWideBlur(BaseTester):
         assert optics.psf_model.wide_blur is not None
         with torch.no_grad():
             optics.masks.phase.uniform_(-1, 1)
-        with pytest.warns(UserWarning, match="the largest PSF window allowed"):
-            optics.psf_bank(defocus=[0.0])
+        optics.psf_bank(defocus=[0.0])
         assert optics.psf_model.wide_blur is None
 
     def test_exception_of_an_unknown_choice(self):

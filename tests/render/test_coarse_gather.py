@@ -29,7 +29,7 @@ def group_of(radii: tuple[float, ...], grid: int, dtype: torch.dtype = torch.flo
     """Discs of these radii in pixels, on a grid, for the pixels of a span of radii."""
     nodes = [defocus_of(radius) for radius in radii]
     side = window_of(max(radii), STEP, PUPIL.extent, grid)
-    psfs = geometric_psfs(PUPIL.amplitude, PUPIL.cell_pitch, nodes, STEP * grid, side).to(dtype)[:, None]
+    psfs = geometric_psfs(PUPIL.transmission, PUPIL.cell_pitch, nodes, STEP * grid, side).to(dtype)[:, None]
     bank = PSFBank(psfs, torch.tensor(nodes, dtype=dtype), psfs.sum((2, 3)))
     ends = None if span is None else (defocus_of(span[0]), defocus_of(span[1]))
     return Piece(lambda: bank, 1.0, ends, grid, window)

@@ -130,7 +130,7 @@ class TestTrain(BaseTester):
 
     def test_exception_masks_of_another_number_are_refused(self, tmp_path):
         train(SETTINGS.replace(epochs=1), tmp_path / "a")
-        with pytest.raises(ValueError, match=r"optics\.masks does not fit: .*phase is \(1, 23, 23\)"):
+        with pytest.raises(ValueError, match=r"masks does not fit: .*phase is \(1, 23, 23\)"):
             train(SETTINGS.replace(masks=2), tmp_path / "b", masks_from=tmp_path / "a" / "last.safetensors")
 
     def test_feature_it_stops_when_nothing_improves_and_stays_stopped(self, tmp_path):
