@@ -1,4 +1,4 @@
-"""Operator of occlusion by direct convolution: in C, on GPUs in Triton.
+"""Operator of occlusion by direct convolution: in C.
 
 Sums are of positive terms only, so float32 keeps their relative accuracy however small the divisor that they become.
 The operator has no gradient of its own: the renderer makes gradients by tiles.
@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_tidy.kernels import triton_ops
 from kornia_tidy.kernels.build import KERNELS, load
 from kornia_tidy.kernels.window_sides import size_step
 
@@ -43,8 +42,8 @@ def occlusion_direct(
     """Render layers that hide one another by direct convolution: operator ``kornia_tidy::occlusion_direct``.
 
     Args:
-        plane: (B, C, H + P - 1, W + P - 1) image on a processor or a CUDA GPU, with all that lies beyond its
-            border; float32 or float64.
+        plane: (B, C, H + P - 1, W + P - 1) image on a processor, with all that lies beyond its border; float32
+            or float64.
         psfs: (D, C, P, P) with P odd, of the plane's dtype, not negative anywhere. Layer D - 1 is the nearest.
         layer_index: (B or 1, H + P - 1, W + P - 1) layer of each pixel, whole numbers of any dtype.
         layer_weight: share of the next layer in [0, 1], of the same shape and the plane's dtype, or None for zero.
@@ -172,7 +171,7 @@ def _new_light(
         raise ValueError(f"psfs must have shape (D, {channels}, P, P) with P odd, got {tuple(psfs.shape)}")
     height, width = rows - psfs.shape[-1] + 1, columns - psfs.shape[-1] + 1
     smallest = smallest_output(plane.dtype)
-    if plane.device.type != "cuda" and (height < smallest[0] or width < smallest[1]):
+    if height < smallest[0] or width < smallest[1]:
         raise ValueError(f"the output must have at least {smallest[0]}x{smallest[1]} pixels, got {height}x{width}")
     if tuple(layer_index.shape) not in ((batch, rows, columns), (1, rows, columns)):
         raise ValueError(
@@ -217,20 +216,6 @@ def _occlude(
     return light
 
 
-def _occlude_in_triton(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-) -> Tensor:
-    _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
-    flipped = psfs.flip((-2, -1))
-    return triton_ops.occlude(plane, flipped, layer_index, layer_weight, mean, stray_light, inside, EPSILON)
-
-
 def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
     raise NotImplementedError(
         "kornia_tidy::occlusion_direct has no gradient: call kornia_tidy.render.occlusion, which makes it by tiles"
@@ -238,6 +223,5 @@ def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
 
 
 torch.library.impl("kornia_tidy::occlusion_direct", "CPU", _occlude)
-torch.library.impl("kornia_tidy::occlusion_direct", "CUDA", _occlude_in_triton)
 torch.library.register_fake("kornia_tidy::occlusion_direct", _new_light)
 torch.library.register_autograd("kornia_tidy::occlusion_direct", _refuse)

@@ -12,14 +12,12 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.accelerator_cost import batched_seconds, is_triton_faster, triton_is_allowed, triton_seconds
 from kornia_tidy.render.backend import Backend, GradientPairs
 from kornia_tidy.render.backends.batched import MOST_SAMPLES, BatchedBackend
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.overlap import OverlapBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
-from kornia_tidy.render.backends.triton_direct import TritonBackend
 from kornia_tidy.render.cost_model import seconds_of
 from kornia_tidy.render.cost_profile import CostProfile
 from kornia_tidy.render.first_use import profile_for
@@ -32,8 +30,7 @@ BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DirectBackend(), OverlapBackend(), TiledBackend(), DenseBackend())
 }
 BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an estimate
-TRITON = TritonBackend()
-NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED, TRITON.name: TRITON}
+NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED}
 METHODS = ("auto", *NAMED)
 LARGEST_PLANE = 32 << 20  # bytes of an image with all channels; "auto" does not take dense for larger ones
 REMEMBERED = 256  # choices, each of some 500 bytes and a grid
@@ -46,8 +43,7 @@ def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"direct"``, ``"overlap"``, ``"tiled"``, ``"dense"``, ``"batched"`` or ``"triton"``, or a
-            backend.
+        method: ``"auto"``, ``"direct"``, ``"overlap"``, ``"tiled"``, ``"dense"`` or ``"batched"``, or a backend.
 
     Returns:
         (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
@@ -158,8 +154,6 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
             raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
         return backend
     accelerated = scene.image.device.type != "cpu"
-    if accelerated and _goes_by_triton(scene):
-        return TRITON
     if accelerated and not is_transformed() and BATCHED.samples(scene) <= MOST_SAMPLES:
         return BATCHED
     # With occlusion the values of PSFs matter too.
@@ -181,11 +175,6 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
             _choices.clear()
         _choices[key] = best, dict(scene.grids)
     return best
-
-
-def _goes_by_triton(scene: LayeredScene) -> bool:
-    """Return whether ``"auto"`` takes kernels in Triton: where they are allowed to, and estimated to be much faster."""
-    return triton_is_allowed() and is_triton_faster(scene) and refusal(TRITON, scene) is None
 
 
 def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
@@ -287,12 +276,6 @@ def explain(scene: LayeredScene) -> Explanation:
     seconds = {name: seconds_of(backend.work(scene), profile, threads) for name, backend in able.items()}
     if len(seconds) > 1 and (why := memory_objection(scene)) is not None:
         objections["dense"] = why
-    if scene.image.device.type != "cpu":
-        seconds |= {"batched": batched_seconds(scene), "triton": triton_seconds(scene)}
-        if (why := refusal(TRITON, scene)) is not None:
-            objections["triton"] = why
-        elif not triton_is_allowed():
-            objections["triton"] = "it was never measured on a GPU: KORNIA_TIDY_TRITON=on lets 'auto' take it"
     return Explanation(words, choose(scene).name, seconds, objections)
 
 

@@ -7,9 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy.kernels import triton_ops
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render import accelerator_cost
 from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.cost_model import seconds_of
@@ -27,7 +25,6 @@ from kornia_tidy.render.dispatch import (
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
-from tests.simulated_device import SimulatedDevice
 
 needs_compiler = pytest.mark.skipif(
     any(compiled(source, torch.float32) is None for source in (direct.SOURCE, direct_occlusion.SOURCE)),
@@ -62,7 +59,7 @@ class TestChoose(BaseTester):
                         for bound in backend.bounds(scene):
                             assert 0 <= seconds_of(bound, settled_profile()) <= own * (1 + 1e-6)
 
-    @pytest.mark.parametrize("method", [m for m in METHODS if m != "triton"])  # its interpreter would take a minute
+    @pytest.mark.parametrize("method", METHODS)
     @over_compositing
     def test_feature_the_named_backend_renders(self, compositing, method):
         bank = make_bank(6, 3, 9, dtype=torch.float32)
@@ -76,9 +73,7 @@ class TestChoose(BaseTester):
 
     def test_exception_unknown_method(self):
         bank = make_bank()
-        message = (
-            "method must be one of 'auto', 'direct', 'overlap', 'tiled', 'dense', 'batched', 'triton', got 'sparse'"
-        )
+        message = "method must be one of 'auto', 'direct', 'overlap', 'tiled', 'dense', 'batched', got 'sparse'"
         with pytest.raises(ValueError, match=message):
             render(*make_scene(bank), bank, method="sparse")
 
@@ -139,44 +134,6 @@ class TestChoose(BaseTester):
         assert len(coded) == {"gather": 4, "scatter": 3, "occlusion": 3}[compositing]
         for other in coded[1:]:
             self.assert_close(other, coded[0], rtol=0, atol=2e-5)
-
-
-class TestTriton(BaseTester):
-    """On the simulated accelerator, which is taken for a GPU with Triton."""
-
-    @pytest.fixture
-    def scene_with(self, monkeypatch):
-        monkeypatch.setattr(triton_ops, "objection", lambda device: None)
-
-        def scene_with(psf_size: int, device: SimulatedDevice):
-            bank = make_bank(6, 1, psf_size, dtype=torch.float32)
-            image, defocus = make_scene(bank, 2, 120, 120)
-            tensors = image, defocus, bank.defocus, bank.psfs
-            return layered_scene(*map(device.put, tensors), compositing="gather")
-
-        return scene_with
-
-    def test_feature_auto_takes_it_where_it_is_allowed_and_its_psfs_are_small(self, scene_with, monkeypatch):
-        monkeypatch.setattr(accelerator_cost, "GAIN", 1.5)  # small scenes are bound by launches
-        with SimulatedDevice() as device:
-            assert choose(scene_with(3, device)).name == "batched"
-            monkeypatch.setenv("KORNIA_TIDY_TRITON", "on")
-            assert [choose(scene_with(size, device)).name for size in (3, 61)] == ["triton", "batched"]
-
-    def test_feature_it_is_not_taken_where_it_does_not_run(self, scene_with, monkeypatch):
-        monkeypatch.setattr(accelerator_cost, "GAIN", 1.5)
-        monkeypatch.setenv("KORNIA_TIDY_TRITON", "on")
-        with SimulatedDevice() as device:
-            scene = scene_with(3, device)
-            monkeypatch.setattr(triton_ops, "objection", lambda device: "there is no Triton")
-            assert choose(scene).name == "batched"
-
-    def test_smoke_explain_says_that_it_was_not_measured(self, scene_with):
-        with SimulatedDevice() as device:
-            explanation = explain(scene_with(3, device))
-        assert explanation.backend == "batched"
-        assert 0 < explanation.seconds["triton"] < explanation.seconds["batched"]
-        assert "never measured on a GPU" in explanation.objections["triton"]
 
 
 class TestExplain(BaseTester):
