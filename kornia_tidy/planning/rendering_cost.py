@@ -26,9 +26,8 @@ from kornia_tidy.render.cost_model import (
     Work,
     seconds_of,
 )
-from kornia_tidy.render.cost_profile import CostProfile
-from kornia_tidy.render.dispatch import BACKENDS, LARGEST_PLANE
-from kornia_tidy.render.first_use import profile_for
+from kornia_tidy.render.cost_profile import EPYC, CostProfile
+from kornia_tidy.render.dispatch import LARGEST_PLANE
 from kornia_tidy.render.layers import assign_layers
 from kornia_tidy.render.scene import SAMPLE, Labels
 
@@ -58,7 +57,7 @@ class SceneWork:
     @property
     def profile(self) -> CostProfile:
         """The prices that the dispatcher takes for it."""
-        return profile_for(self.compositing, self.image_pixels, self.works, BACKENDS.values())
+        return EPYC
 
 
 def label_pixels(defocus: Tensor, batch: int, nodes: Sequence[float], mode: str) -> Labels:

@@ -17,7 +17,7 @@ from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.wide_blur import GRID_ERROR, LAYER_ERROR, RAY_TOLERANCE, SCENE_DEVIATION, BlurGroup
 from kornia_tidy.psf.wide_psfs import held_nodes
 from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.cost_store import settled_profile
+from kornia_tidy.render.cost_profile import EPYC
 
 # Measured: 0.13 to 0.2 s of processor time for 3 x 512 x 512 pixels and some 60 layers.
 _PIXEL_SECONDS = 1e-7  # of a channel's pixel, for its two layers
@@ -80,7 +80,7 @@ def plan_wide(optics: Any, defocus: Tensor, light: Tensor | None, tolerance: flo
     held: list[tuple[BlurGroup, tuple[float, ...]]] = held_nodes(blur, defocus)
     step, samples = float(model.pixel_step), PSFSamples(optics, channels)
     exact = [psi for _, nodes in held for psi in nodes if blur_radius(psi, step) < blur.ray_radius]
-    fidelity, threads, profile = optics.fidelity, torch.get_num_threads(), settled_profile()
+    fidelity, threads, profile = optics.fidelity, torch.get_num_threads(), EPYC
     small = fidelity.replace(window=min(blur.window, 2 * int(1.2 * blur.ray_radius + 4) + 1))
     pixels = defocus.numel() * channels
     work = sum(len(nodes) / group.grid**2 for group, nodes in held)

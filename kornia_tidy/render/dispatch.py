@@ -19,9 +19,7 @@ from kornia_tidy.render.backends.direct import DirectBackend
 from kornia_tidy.render.backends.overlap import OverlapBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.cost_profile import CostProfile
-from kornia_tidy.render.first_use import profile_for
-from kornia_tidy.render.repeatable import of_thread
+from kornia_tidy.render.cost_profile import EPYC
 from kornia_tidy.render.scene import SAMPLE, LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
@@ -179,7 +177,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
 
 def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
     """Return the backend with the least estimated time. To count takes time: what cannot be faster is not counted."""
-    best, least, profile, threads = able[0], math.inf, _profile(scene), torch.get_num_threads()
+    best, least, profile, threads = able[0], math.inf, EPYC, torch.get_num_threads()
     bounds = {backend.name: backend.bounds(scene) for backend in able}
     first = {name: seconds_of(next(own), profile, threads) for name, own in bounds.items()}
     for backend in sorted(able, key=lambda backend: first[backend.name]):
@@ -205,7 +203,7 @@ def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
     refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
     inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
     recorded = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
-    threads, shape = (torch.get_num_threads(), of_thread.repeatable), labels.layer_index.shape
+    threads, shape = torch.get_num_threads(), labels.layer_index.shape
     shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
     return scene.compositing, *shapes, refused, recorded, threads, digest.digest()
 
@@ -271,14 +269,9 @@ def explain(scene: LayeredScene) -> Explanation:
         f"{len(scene.psfs)} layers, PSFs of {side}x{side} px, {torch.get_num_threads()} threads"
     )
     objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
-    profile, threads = _profile(scene), torch.get_num_threads()
+    profile, threads = EPYC, torch.get_num_threads()
     able = {name: backend for name, backend in BACKENDS.items() if name not in objections}
     seconds = {name: seconds_of(backend.work(scene), profile, threads) for name, backend in able.items()}
     if len(seconds) > 1 and (why := memory_objection(scene)) is not None:
         objections["dense"] = why
     return Explanation(words, choose(scene).name, seconds, objections)
-
-
-def _profile(scene: LayeredScene) -> CostProfile:
-    able = [name for name, backend in BACKENDS.items() if refusal(backend, scene) is None]
-    return profile_for(scene.compositing, math.prod(scene.output_size), able, BACKENDS.values())

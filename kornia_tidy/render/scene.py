@@ -12,7 +12,6 @@ from torch import Tensor
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.render.borders import BORDERS, check_border, pad_border
 from kornia_tidy.render.layers import assign_layers, check_nodes
-from kornia_tidy.render.repeatable import of_thread
 
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
 LARGEST_REMEMBERED = 1 << 20  # pixels of a defocus map: some 24 MB with their layers
@@ -222,7 +221,7 @@ def remembered_scene(given: SceneArguments) -> LayeredScene:
     image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate = given
     if defocus.device.type != "cpu" or defocus.numel() > LARGEST_REMEMBERED:
         return assigned_scene(given)
-    options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads(), of_thread.repeatable
+    options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads()
     options += image.dtype, psfs.dtype, defocus.dtype, nodes.dtype
     last = _last.get("scene")  # another thread may put in another one meanwhile
     if (

@@ -1,8 +1,7 @@
 """How much slower the backend that is chosen is than the fastest one, over many scenes.
 
 ``python -m tests.benchmarks.dispatch_regret`` on a machine that does nothing else, some 20 minutes; ``--quick`` takes a
-share of the scenes, a minute or two. ``OMP_NUM_THREADS`` sets the threads. What is in use without ``kornia-tidy tune``
-is measured with an empty cache (``XDG_CACHE_HOME=$(mktemp -d)``).
+share of the scenes, a minute or two. ``OMP_NUM_THREADS`` sets the threads.
 
 The regret of a scene is the time of ``method="auto"`` over that of the fastest backend asked for by name. Times are the
 least of rounds in which all take their turn; a regret above 1.15 is measured again before it counts. The renderer
@@ -24,7 +23,6 @@ from typing import NamedTuple
 import torch
 
 from kornia_tidy.commands.info import _processor_name
-from kornia_tidy.render.cost_store import KINDS, measured_profile, settled
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal, render_scene
 from kornia_tidy.render.scene import LayeredScene, layered_scene
 
@@ -88,7 +86,7 @@ def measure(case: Case) -> Result:
     scene = make_scene(case)
     names = ["auto", *(name for name, backend in BACKENDS.items() if refusal(backend, scene) is None)]
     with torch.no_grad():
-        chosen = choose(scene).name  # whatever is measured on first use is measured now
+        chosen = choose(scene).name
         times = dict.fromkeys(names, math.inf)
         for number in range(AGAIN + 1):
             for _ in range(ROUNDS):
@@ -117,11 +115,9 @@ def report(results: list[Result]) -> Iterator[str]:
     regrets = sorted(result.regret for result in results)
     yield ""
     yield f"{_processor_name()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    profiles = {kind: measured_profile(kind) or settled().profile for kind in KINDS}
-    yield "; ".join(f"{kind}: {profile.name}" for kind, profile in profiles.items())
     yield "| scenes | <= 1.15 | <= 1.5 | median | worst |"
     yield "| --- | ---: | ---: | ---: | ---: |"
-    for kind in (*KINDS, None):
+    for kind in ("gather", "occlusion", None):
         own = [regret for result in results if kind in (None, result.case.compositing) for regret in [result.regret]]
         within = [sum(regret <= bound for regret in own) / len(own) for bound in (GOOD, BAD)]
         shares = " | ".join(f"{100 * share:.1f} %" for share in within)

@@ -11,7 +11,7 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.render.backends import direct, direct_occlusion
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.cost_store import settled_profile
+from kornia_tidy.render.cost_profile import EPYC
 from kornia_tidy.render.dispatch import (
     BACKENDS,
     LARGEST_PLANE,
@@ -55,9 +55,9 @@ class TestChoose(BaseTester):
                 scene = scene_of(compositing, layers, psf_size, 80, 120)
                 for backend in BACKENDS.values():
                     if backend.refusal(scene) is None:
-                        own = seconds_of(backend.work(scene), settled_profile())
+                        own = seconds_of(backend.work(scene), EPYC)
                         for bound in backend.bounds(scene):
-                            assert 0 <= seconds_of(bound, settled_profile()) <= own * (1 + 1e-6)
+                            assert 0 <= seconds_of(bound, EPYC) <= own * (1 + 1e-6)
 
     @pytest.mark.parametrize("method", METHODS)
     @over_compositing

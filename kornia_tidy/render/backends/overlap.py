@@ -20,7 +20,7 @@ from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_grad
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.tile_plan import OVERLAPS, cheapest_grid, choose_grid, least_work
 from kornia_tidy.render.cost_model import Work
-from kornia_tidy.render.cost_store import settled_profile
+from kornia_tidy.render.cost_profile import EPYC
 from kornia_tidy.render.scene import LayeredScene
 
 
@@ -43,7 +43,7 @@ class OverlapBackend:
     def bounds(self, scene: LayeredScene) -> Iterator[Work]:
         """Yield the work for a scene with one layer in each window."""
         shape, blended = tuple(scene.labels.layer_index.shape), 1 if scene.layer_weight is None else 2
-        work = least_work(shape, scene.psfs.shape[-1], blended, OVERLAPS, settled_profile())
+        work = least_work(shape, scene.psfs.shape[-1], blended, OVERLAPS, EPYC)
         yield replace(work, channels=scene.image.shape[1], itemsize=scene.image.element_size())
 
     def render(self, scene: LayeredScene) -> Tensor:

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.cost_model import OverlapWork, TiledOcclusionWork, TiledWork, seconds_of
-from kornia_tidy.render.cost_profile import CostProfile
-from kornia_tidy.render.cost_store import settled_profile
+from kornia_tidy.render.cost_profile import EPYC, CostProfile
 from kornia_tidy.render.scene import SAMPLE, Labels
 
 TileWork = TiledWork | TiledOcclusionWork
@@ -176,7 +175,7 @@ def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) ->
     )
     sample = labels.every(SAMPLE)
     works = _works(grids, [grid.present(sample, layers, SAMPLE) for grid in grids], blended, kind)
-    return _cheapest(works, grids, settled_profile())
+    return _cheapest(works, grids, EPYC)
 
 
 @lru_cache(maxsize=256)
@@ -197,7 +196,7 @@ def least_windows(labels: Labels, layers: int, psf_size: int, kind: TileKind) ->
         more = int((held - few) * grid.blocks) if held > few else 0
         counts = (*(0 for _ in range(few)), grid.blocks - more, more)
         works.append(TiledOcclusionWork(grid.size, counts, grid.batch * grid.height * grid.width))
-    return _cheapest(works, grids, settled_profile())[0]
+    return _cheapest(works, grids, EPYC)[0]
 
 
 def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -> list[Grid]:

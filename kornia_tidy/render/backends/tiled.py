@@ -28,7 +28,7 @@ from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorksp
 from kornia_tidy.render.backends.tiled_occlusion import occlude_tiled, occlusion_gradients
 from kornia_tidy.render.borders import pad_border
 from kornia_tidy.render.cost_model import TiledOcclusionWork, TiledWork, Work
-from kornia_tidy.render.cost_store import settled_profile
+from kornia_tidy.render.cost_profile import EPYC
 from kornia_tidy.render.scene import LayeredScene
 
 
@@ -59,7 +59,7 @@ class TiledBackend:
         """Yield the work for a scene with one layer in each tile; for windows then with as many as small ones hold."""
         kind = self.windows if scene.compositing == "occlusion" else self.blocks
         shape, blended = tuple(scene.labels.layer_index.shape), 1 if scene.layer_weight is None else 2
-        yield _of_scene(least_work(shape, scene.psfs.shape[-1], blended, kind, settled_profile()), scene)
+        yield _of_scene(least_work(shape, scene.psfs.shape[-1], blended, kind, EPYC), scene)
         if scene.compositing == "occlusion":
             yield _of_scene(least_windows(scene.labels, len(scene.psfs), scene.psfs.shape[-1], self.windows), scene)
 
