@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -34,7 +35,7 @@ def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: fl
 
 
 def explain_groups(bank: WideBank, light: Tensor) -> Explanation:
-    """Return how wide blur is gathered: by groups of layers on their grids, whatever their times.
+    """Return how wide blur is gathered: by groups of layers on their grids.
 
     Args:
         bank: of the scene.
@@ -47,7 +48,7 @@ def explain_groups(bank: WideBank, light: Tensor) -> Explanation:
 
 
 def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
-    """Return which backend renders a scene. Of an exposure in states, the first. See :meth:`TiDyOptics.explain`."""
+    """Return which backend renders a scene. Of an exposure in pieces, the first. See :meth:`TiDyOptics.explain`."""
     sample = read_sample(image, depth, optics)
     if len(sample.image) == 0:
         raise ValueError("an explanation needs at least one image, got a batch of none")
@@ -56,9 +57,10 @@ def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
     reach = survey_defocus([defocus], optics).reach
     if optics.compositing == "gather" and optics.psf_model.wide_blur is not None:
         return explain_groups(optics.psf_model.wide_bank(light.shape[1], sample.dtype, defocus), light)
-    (_, bank), *_ = optics.psf_model.scene_banks(light.shape[1], sample.dtype, reach, optics.compositing == "occlusion")
+    banks = optics.psf_model.scene_banks(light.shape[1], sample.dtype, reach, optics.compositing == "occlusion")
+    bank = banks[0][1]
     fidelity = optics.psf_model.fidelity
-    return explain(
+    found = explain(
         layered_scene(
             light.repeat(1, bank.psfs.shape[1] // light.shape[1], 1, 1),
             defocus,
@@ -71,3 +73,4 @@ def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
             correlate=fidelity.correlate,
         )
     )
+    return found if len(banks) == 1 else replace(found, scene=f"{found.scene}, the first of {len(banks)} pieces")

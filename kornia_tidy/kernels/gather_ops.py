@@ -97,25 +97,6 @@ def gather_direct_psf_gradient(
     )
 
 
-def count_pairs(layer_index: Tensor, layer_weight: Tensor | None, dtype: torch.dtype, every: int) -> int:
-    """Count the pairs of a strip of pixels and a layer present in it, in every n-th row of strips.
-
-    Args:
-        layer_index: (B, H, W) int64.
-        layer_weight: (B, H, W), or None.
-        dtype: of the light, which decides how many pixels a strip has.
-        every: n.
-    """
-    plane = torch.empty((), dtype=dtype).expand(len(layer_index), 1, 1, 1)
-    weight = None if layer_weight is None else layer_weight.detach().to(dtype)
-    scene, kept = _scene(plane, layer_index, weight, layers=2**31 - 1, side=1)
-    library = load(SOURCE, dtype)
-    library.count_pairs.restype = ctypes.c_int64
-    pairs = library.count_pairs(ctypes.byref(scene), ctypes.c_int64(every))
-    del kept
-    return pairs
-
-
 def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
     """Return the rows and columns of a block, below which an image is too small.
 

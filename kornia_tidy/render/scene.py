@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.render.borders import BORDERS, check_border, pad_border
+from kornia_tidy.render.borders import BORDERS, check_border, pad_border, padded_size
 from kornia_tidy.render.layers import assign_layers, check_nodes
 
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
@@ -74,9 +74,6 @@ class LayeredScene:
         sorted_layers: layer index and layer weight of the pixels that are sorted, and
         labels: the same for each image of the batch, without gradients.
         found: planes that were made of the scene, by their names, so that they are made once.
-        grids: the best tiles of each kind for the scene, as far as they were looked for.
-        layout: what else follows from the layers, kept as long as :func:`remembered_scene` remembers them; None for
-            other scenes.
     """
 
     image: Tensor
@@ -90,14 +87,17 @@ class LayeredScene:
     sorted_layers: tuple[Tensor, Tensor | None]
     labels: Labels
     found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
-    grids: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
-    layout: dict[Any, Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
         """Height and width of the rendered image."""
         lost = self.psfs.shape[-1] - 1 if self.border == "valid" else 0
         return self.image.shape[-2] - lost, self.image.shape[-1] - lost
+
+    @property
+    def padded_size(self) -> tuple[int, int]:
+        """Height and width of :attr:`plane`."""
+        return padded_size(*self.image.shape[-2:], self.psfs.shape[-1], self.border)
 
     @property
     def plane(self) -> Tensor:
@@ -230,7 +230,6 @@ def remembered_scene(given: SceneArguments) -> LayeredScene:
         or not (torch.equal(last.defocus, defocus) and torch.equal(last.nodes, nodes))
     ):
         scene = assigned_scene(given)
-        scene = replace(scene, layout={})
         nothing = image.new_empty(0)
         kept = replace(scene, image=nothing, psfs=nothing, stray_light=None, found={})
         _last["scene"] = _Remembered(options, defocus.clone(), nodes.clone(), kept)
@@ -242,7 +241,6 @@ def remembered_scene(given: SceneArguments) -> LayeredScene:
         psfs=(psfs.flip((-2, -1)) if correlate else psfs).to(dtype),
         stray_light=None if stray_light is None else stray_light.to(dtype),
         found={},
-        grids=dict(last.scene.grids),
     )
 
 
