@@ -207,7 +207,7 @@ def _from_folder(path: Path) -> object:
 
 
 def _calibrations(folder: Path) -> list[Case]:
-    """Calibrations, noise profiles, trade-offs, cost profiles and design records."""
+    """Calibrations, noise profiles, trade-offs and design records."""
     folder.mkdir()
     (folder / "calib.txt").write_text("cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n")
     (folder / "calib.json").write_text('{"focal_px": 3997.5, "baseline_m": 0.1935, "doffs_px": 131.25}')

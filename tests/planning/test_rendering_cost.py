@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import time
 from itertools import product
 from pathlib import Path
@@ -73,14 +74,21 @@ class TestRenderingWork(BaseTester):
         assert one.memory < three.memory < 3.1 * one.memory
 
     @needs_compiler
-    def test_feature_windows_are_counted_as_they_are_transformed(self):
-        """Against tiles and layers of every pixel, counted one by one; a sample of the pixels misses some of them."""
-        work = rendering_work(ramp(300, 400), 1, 1, NODES, 31, layers="nearest")
-        index = (ramp(300, 400) / 2 + 10).round()[0, 0]
-        tile = work.window - 31 + 1
-        tiles = [index[y : y + tile, x : x + tile] for y in range(0, 300, tile) for x in range(0, 400, tile)]
-        transforms = len(tiles) + sum(len(tile.unique()) for tile in tiles) + len(index.unique())
-        assert 0.8 < work.operations / (transform_operations(work.window, work.window) * transforms) < 1.3
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_a_layer_in_every_window_takes_a_transform_of_each(self, compositing):
+        """And one of its PSF; the products and sums of a transform are less than half of it."""
+        flat, options = (
+            torch.zeros(1, 1, 300, 400),
+            {"layers": "nearest", "compositing": compositing, "border": "valid"},
+        )
+        both = flat.clone()
+        both[..., ::16] = 10  # seen by a sample of every eighth pixel
+        one, two = (rendering_work(psi, 1, 1, (0.0, 10.0), 31, **options) for psi in (flat, both))
+        height, width = (270, 370) if compositing == "gather" else (300, 400)
+        tile = one.window - 31 + 1
+        windows = math.ceil(height / tile) * math.ceil(width / tile)
+        more = (two.operations - one.operations) / transform_operations(one.window, one.window)
+        assert windows + 1 <= more < 1.5 * (windows + 1)
 
 
 class TestCost(BaseTester):

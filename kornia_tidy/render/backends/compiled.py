@@ -28,6 +28,9 @@ from kornia_tidy.render.scene import SAMPLE, LayeredScene
 # `window_size`) this limit takes 1.10 times the time of the best choice for each scene, 1.54 times at most.
 LARGEST_DIRECT = 5  # px
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
+# Operations for each sample of a window, as many as take as long: to cut it out and to write its tile, and for each
+# layer to multiply by a spectrum and to add up.
+_TILE, _PAIR = 100, 14
 _WINDOW_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
 
 
@@ -117,8 +120,8 @@ class CompiledBackend:
         grid = Grid.of(tuple(labels.layer_index.shape), side, size)
         present = grid.present(labels.every(SAMPLE), len(scene.psfs), SAMPLE)
         pairs, layers = int(present.sum()), int(present.any(0).sum())
-        operations = channels * transform_operations(size, size) * (grid.blocks + pairs + layers)
-        operations += channels * 3 * size**2 * pairs
+        operations = transform_operations(size, size) * (grid.blocks + pairs + layers)
+        operations = channels * (operations + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
         planes = layers + _WINDOW_PLANES * torch.get_num_threads()
         return Work(operations, planes * itemsize * size**2 + 3 * image + kept, size)
 
