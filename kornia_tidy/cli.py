@@ -30,12 +30,11 @@ from kornia_tidy.commands import (
     systems,
     trade,
     train,
-    tune,
 )
 from kornia_tidy.runtime.signals import Stopped, ignore_interruption, raised_signals, status_and_sentence
 
 # Each has add_parser(subparsers), which sets run(args).
-COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, tune, app, info)
+COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, app, info)
 
 # Exit statuses; 70 is EX_SOFTWARE of sysexits.h, 141 is 128 and the number of SIGPIPE.
 DONE, CANNOT, BUG, NOBODY_READS = 0, 2, 70, 141

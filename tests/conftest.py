@@ -8,10 +8,6 @@ import pytest
 import torch
 from hypothesis import settings
 
-from tests import triton_interpreter  # noqa: F401 (before anything else imports Triton)
-
-os.environ["KORNIA_TIDY_TUNE"] = "off"  # every test computes with the constants that are shipped, in processes too
-
 settings.register_profile("any machine", settings(), deadline=None)  # tests are not timed: other work may slow them
 settings.load_profile("any machine")
 

@@ -30,8 +30,7 @@ KERNELS = (
     "tests/kernels/test_gather_ops.py",
     "tests/kernels/test_mutual_intensity_ops.py",
     "tests/kernels/test_occlusion_ops.py",
-    "tests/render/backends/test_direct.py",
-    "tests/render/backends/test_direct_occlusion.py",
+    "tests/render/backends/test_compiled.py",
     "tests/psf/test_mutual_intensity.py",
 )
 COMPILED = (  # what calls the C kernels
@@ -80,7 +79,7 @@ import hashlib, json, warnings
 import torch
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.compiler import NotBuiltError, find_compiler
-from kornia_tidy.render.backends.direct import SOURCE
+from kornia_tidy.kernels.gather_ops import SOURCE
 warnings.simplefilter("ignore")
 try:
     compiler = find_compiler()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 import json
 import sys
 from argparse import Namespace
@@ -19,7 +20,11 @@ from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.task_loss import psnr_ssim_loss
 from tests.base import BaseTester
 from tests.benchmarks import accelerated_training as program
-from tests.triton_interpreter import DEVICE, needs_triton
+
+needs_triton = pytest.mark.skipif(
+    importlib.util.find_spec("triton") is None or not torch.cuda.is_available(),
+    reason="no CUDA card is here, or no Triton, which PyTorch for CUDA brings along",
+)
 
 
 @pytest.fixture
@@ -159,19 +164,17 @@ class TestParts(BaseTester):
 
 @needs_triton
 class TestFastBlocks(BaseTester):
-    """By Triton's interpreter where there is no card."""
-
     @pytest.mark.parametrize("linear", [True, False])
     def test_feature_gradients_are_nearer_to_float32_than_those_of_plain_bfloat16(self, linear):
         from tests.benchmarks.accelerated_blocks import use_fast_blocks
 
         torch.manual_seed(0)
-        network = NAFNet(26, 3, width=16).to(DEVICE, memory_format=torch.channels_last)
+        network = NAFNet(26, 3, width=16).to("cuda", memory_format=torch.channels_last)
         network.looked = True
         for value in network.parameters():  # blocks are the identity at first
             torch.nn.init.normal_(value, std=0.2) if value.shape[0] == 1 else None
-        maps = torch.rand(1, 26, 16, 32, device=DEVICE)
-        slope = torch.randn(1, 3, 16, 32, device=DEVICE)
+        maps = torch.rand(1, 26, 16, 32, device="cuda")
+        slope = torch.randn(1, 3, 16, 32, device="cuda")
         fast = copy.deepcopy(network)
         use_fast_blocks(fast, linear=linear)
         exact = self.gradients(network, maps, slope, half=False)
@@ -180,7 +183,7 @@ class TestFastBlocks(BaseTester):
 
     @staticmethod
     def gradients(network, maps, slope, *, half=True):
-        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=half, cache_enabled=False):
+        with torch.autocast("cuda", torch.bfloat16, enabled=half, cache_enabled=False):
             out = network(maps)
         found = torch.autograd.grad(out.float(), list(network.parameters()), slope)
         return torch.cat([part.float().flatten() / part.float().norm() for part in found])
@@ -188,5 +191,5 @@ class TestFastBlocks(BaseTester):
     def test_feature_the_bilateral_filter_is_that_of_the_package(self):
         from tests.benchmarks.accelerated_blocks import bilateral
 
-        image, color = torch.rand(2, 3, 20, 33, device=DEVICE), 0.1 + 0.3 * torch.rand(2, 1, 20, 33, device=DEVICE)
+        image, color = torch.rand(2, 3, 20, 33, device="cuda"), 0.1 + 0.3 * torch.rand(2, 1, 20, 33, device="cuda")
         self.assert_close(bilateral(image, color, 7, 2.0), bilateral_filter(image, color, 7, 2.0), rtol=1e-5, atol=1e-6)

@@ -220,14 +220,6 @@ class TestCounts:
         assert first.waits == second.waits == (0 if fixed else 1)
         assert not fixed or second.uploads == 0
 
-    @pytest.mark.parametrize(("compositing", "waits"), [("gather", 1), ("scatter", 1), ("occlusion", 2)])
-    def test_feature_a_training_step_with_triton_launches_less(self, compositing, waits):
-        """With occlusion it looks for negative PSFs, for which it waits once more."""
-        small = {"fixed": False, "batch": 1, "side": 48, "window": 15, "steps": 1}
-        transforms, triton = (step_counts(compositing, triton=triton, **small)[-1] for triton in (False, True))
-        assert triton.launches < transforms.launches
-        assert triton.waits == waits
-
     def test_feature_one_wait_without_gradients_too(self):
         with SimulatedDevice() as device, torch.no_grad():
             optics = device.put(TiDyOptics(fidelity=fidelity_of("balanced")))

@@ -43,7 +43,6 @@ class TestMain(BaseTester):
             ["evaluate"],
             ["raw"],
             ["render"],
-            ["tune"],
             ["app"],
             ["info"],
         ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -48,7 +49,7 @@ def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
         words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
         return Explanation(words, "grids", {}, {})
     bank, rendering = pieces[0].bank(), optics.rendering(light.device)
-    return explain(
+    found = explain(
         layered_scene(
             light.repeat(1, bank.psfs.shape[1] // channels, 1, 1),
             defocus,
@@ -61,3 +62,4 @@ def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:
             correlate=rendering.correlate,
         )
     )
+    return found if len(pieces) == 1 else replace(found, scene=f"{found.scene}, the first of {len(pieces)} pieces")

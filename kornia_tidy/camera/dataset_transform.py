@@ -23,7 +23,7 @@ class DatasetTransform:
         optics: the camera; shared, so a data set without worker processes sees what training changes.
         seed: None draws noise from torch's global generator, which differs from worker to worker. A number gives each
             item its own noise, the same for any number of workers, for fork and spawn, and in every epoch; and
-            one thread takes the picture, by the shipped cost profile, so that its last digits are the same too.
+            one thread takes the picture, so that its last digits are the same too.
         key: with a seed, what tells items apart: the name of an entry of the sample, or a function of the sample that
             returns an integer.
         image_key: name of the image in a mapping.

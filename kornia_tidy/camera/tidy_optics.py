@@ -396,7 +396,7 @@ class TiDyOptics(CameraState):
 
     @torch.no_grad()
     def explain(self, image: Tensor, depth: Tensor) -> Explanation:
-        """Return which backend renders a scene and why, with the estimated time of each.
+        """Return which backend renders a scene, with operations and memory of each.
 
         Args:
             image: (B, C, H, W) or (C, H, W), as for a capture.
@@ -408,7 +408,8 @@ class TiDyOptics(CameraState):
         Example:
             >>> print(TiDyOptics(compositing="scatter").explain(torch.rand(3, 64, 64), torch.ones(1, 64, 64)))
             scatter of 1 x 3 channels of 64x64 px, ...
-              direct: direct convolution gathers light and does not scatter it
+              dense: ... operations, ... MiB
+            ...
         """
         return explain_capture(self, image, depth)
 

@@ -1,7 +1,7 @@
 """Photographing of a data set of scenes to captures on disk, resumable and by any number of processes.
 
-A capture depends on camera, scene, seed and number alone. On the CPU its last digit depends on the number of threads
-and on the backend that renders: see :mod:`kornia_tidy.render.repeatable`. Several processes share the work.
+A capture depends on camera, scene, seed and number alone. On the CPU its last digit depends on the number of threads:
+see :mod:`kornia_tidy.render.repeatable`. Several processes share the work.
 """
 
 from __future__ import annotations

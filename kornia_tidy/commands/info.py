@@ -17,11 +17,9 @@ import torch
 
 import kornia_tidy
 from kornia_tidy.commands.report import tell
-from kornia_tidy.commands.tune import in_words
 from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops
 from kornia_tidy.kernels.build import REALS, build, cache_folder, vector_bytes
 from kornia_tidy.kernels.compiler import Compiler, find_compiler
-from kornia_tidy.render.cost_store import read_profile
 
 DESCRIPTION = """\
 Print the environment of kornia_tidy: versions of packages, processor and threads, the C
@@ -76,7 +74,6 @@ def lines() -> Iterator[tuple[str, str]]:
             remark = f": {built.remark}" if built.remark else ""
             width = f"vectors of {vector_bytes(built.library)} bytes"
             yield "kernel", f"{name}: {built.origin}{threads}, {width}, {built.path.name}{remark}"
-    yield "costs", _costs()
     yield "cache", _cache()
 
 
@@ -107,11 +104,6 @@ def _compiler() -> str:
     except RuntimeError as error:
         return str(error)
     return f"{' '.join((*compiler.program, *compiler.options))}: {compiler.version}"
-
-
-def _costs() -> str:
-    threads = torch.get_num_threads()
-    return in_words(read_profile(threads), threads)
 
 
 def _cache() -> str:

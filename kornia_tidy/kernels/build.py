@@ -142,18 +142,6 @@ def build(source: Path, dtype: torch.dtype) -> Build:
     return Build(None, remark=_joined([*reasons, "" if (source.parent / LIBRARIES).is_dir() else NO_LIBRARIES]))
 
 
-def maker() -> str:
-    """Return what makes the libraries in use, without making one: the wheel's level, or the compiler's version."""
-    level = _level(KERNELS / LIBRARIES)
-    if level and not named_compiler():
-        return level
-    try:
-        compiler = find_compiler()
-        return f"{compiler.version}, vectors of {target_vector_bytes(compiler)} bytes"
-    except NotBuiltError:
-        return level or "no compiler"
-
-
 def _joined(reasons: list[str]) -> str:
     return "; ".join(filter(None, reasons))
 

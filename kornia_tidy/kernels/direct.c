@@ -18,7 +18,6 @@
 enum { ROWS = 4, WIDTH = 2 * LANES };
 enum { ROW_CHUNK = 4 };  // rows of light that are summed separately
 enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
-enum { COUNTED = 64 / sizeof(REAL) };     // width of a strip whose layers are counted: costs do not depend on vectors
 enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share one sum
 
 typedef REAL loose __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(REAL)), may_alias));
@@ -143,42 +142,6 @@ INLINE void weigh(const scene *s, const int64_t *index, const REAL *weight, int6
         else
             for (int i = 0; i < LANES; i++) w[i] = l[i] == layer;
     }
-}
-
-INLINE int count_layer(int64_t *layers, int count, int64_t layer) {
-    for (int n = count - 1; n >= 0; n--)
-        if (layers[n] == layer) return count;
-    layers[count] = layer;
-    return count + 1;
-}
-
-static int count_layers(const scene *s, const int64_t *index, const REAL *weight) {
-    int64_t layers[2 * ROWS * COUNTED];
-    int count = 0;
-    for (int v = 0; v < ROWS; v++)
-        for (int i = 0; i < (int)COUNTED; i++) {
-            int64_t layer = index[v * s->index_row + i];
-            REAL f = weight ? weight[v * s->weight_row + i] : 0;
-            if (f != 1) count = count_layer(layers, count, layer);
-            if (f > 0 && layer + 1 < s->layers) count = count_layer(layers, count, layer + 1);
-        }
-    return count;
-}
-
-// Counts the pairs of a strip and a layer present in it, in every `every`-th band of rows.
-int64_t count_pairs(const scene *s, int64_t every) {
-    int64_t bands = (s->height + ROWS - 1) / ROWS, pairs = 0;
-#pragma omp parallel for num_threads(s->threads) reduction(+ : pairs)
-    for (int64_t band = 0; band < s->images * bands; band += every) {
-        int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
-        const int64_t *index = s->index + image * s->index_image + y * s->index_row;
-        const REAL *weight = s->weight ? s->weight + image * s->weight_image + y * s->weight_row : 0;
-        for (int64_t left = 0; left < s->width; left += COUNTED) {
-            int64_t x = least(left, s->width - COUNTED);
-            pairs += count_layers(s, index + x, weight ? weight + x : 0);
-        }
-    }
-    return pairs;
 }
 
 static void mix_block(const scene *s, const REAL *light, const int64_t *index, const REAL *weight, const member *members,

@@ -1,4 +1,4 @@
-"""Operators of gather by direct convolution: blurred light, and the gradient of the PSFs. In C, on GPUs in Triton.
+"""Operators of gather by direct convolution: blurred light, and the gradient of the PSFs, in C.
 
 Gather is linear in the light, in the PSFs and in the layer weights. The derivatives of the two operators are made of
 the same two and of a transposed convolution, so they can be differentiated any number of times. The renderer replaces
@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv_transpose2d
 
-from kornia_tidy.kernels import triton_ops
 from kornia_tidy.kernels.build import KERNELS, load
 from kornia_tidy.kernels.window_sides import size_step
 
@@ -49,7 +48,7 @@ def gather_direct(
     .. math:: I_c = (1 - t) \, (L_c * h_{dc}) + t \, (L_c * h_{d+1,c})
 
     Args:
-        plane: L, (B, C, H + P - 1, W + P - 1) light on a processor or a CUDA GPU, float32 or float64.
+        plane: L, (B, C, H + P - 1, W + P - 1) light on a processor, float32 or float64.
         psfs: h, (D, C, P, P) with P odd, of the plane's dtype.
         layer_index: d, (B, H, W) int64.
         layer_weight: t, share of the next layer in [0, 1], (B, H, W) of the plane's dtype, or None for zero.
@@ -60,9 +59,8 @@ def gather_direct(
 
     Raises:
         TypeError: if a data type is not as above.
-        ValueError: if shapes do not fit, or the output is smaller than a block of 4 x 32 (float64: 4 x 16) pixels; GPUs
-            take any size.
-        IndexError: if a pixel lies in no layer; on a GPU it becomes NaN.
+        ValueError: if shapes do not fit, or the output is smaller than a block of 4 x 32 (float64: 4 x 16) pixels.
+        IndexError: if a pixel lies in no layer.
         NotBuiltError: if the source cannot be compiled.
     """
     return torch.ops.kornia_tidy.gather_direct(plane, psfs, layer_index, layer_weight, weight_gradient)
@@ -97,25 +95,6 @@ def gather_direct_psf_gradient(
     return torch.ops.kornia_tidy.gather_direct_psf_gradient(
         plane, gradient, layer_index, layer_weight, layers, weight_gradient
     )
-
-
-def count_pairs(layer_index: Tensor, layer_weight: Tensor | None, dtype: torch.dtype, every: int) -> int:
-    """Count the pairs of a strip of pixels and a layer present in it, in every n-th row of strips.
-
-    Args:
-        layer_index: (B, H, W) int64.
-        layer_weight: (B, H, W), or None.
-        dtype: of the light, which decides how many pixels a strip has.
-        every: n.
-    """
-    plane = torch.empty((), dtype=dtype).expand(len(layer_index), 1, 1, 1)
-    weight = None if layer_weight is None else layer_weight.detach().to(dtype)
-    scene, kept = _scene(plane, layer_index, weight, layers=2**31 - 1, side=1)
-    library = load(SOURCE, dtype)
-    library.count_pairs.restype = ctypes.c_int64
-    pairs = library.count_pairs(ctypes.byref(scene), ctypes.c_int64(every))
-    del kept
-    return pairs
 
 
 def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
@@ -193,7 +172,7 @@ def _check_layers(
         raise ValueError(f"PSFs must have an odd side of at least 1 pixel, got {side}")
     output = (plane.shape[0], plane.shape[-2] - side + 1, plane.shape[-1] - side + 1)
     smallest = smallest_output(plane.dtype)
-    if plane.device.type != "cuda" and (output[1] < smallest[0] or output[2] < smallest[1]):
+    if output[1] < smallest[0] or output[2] < smallest[1]:
         raise ValueError(
             f"the output must have at least {smallest[0]}x{smallest[1]} pixels, got {output[1]}x{output[2]}"
         )
@@ -228,14 +207,6 @@ def _gather(
         raise IndexError(f"a pixel lies in none of the {len(psfs)} layers: its depth or defocus is not a number")
     del kept
     return light
-
-
-def _gather_in_triton(
-    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, weight_gradient: bool
-) -> Tensor:
-    _new_light(plane, psfs, layer_index, layer_weight, weight_gradient)
-    flipped = psfs.flip((-2, -1))
-    return triton_ops.gather(plane, flipped, layer_index, layer_weight, weight_gradient=weight_gradient)
 
 
 def _keep_light(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -301,19 +272,6 @@ def _psf_gradient(
     return sums.sum(0).flip((-2, -1))
 
 
-def _psf_gradient_in_triton(
-    plane: Tensor,
-    gradient: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    layers: int,
-    weight_gradient: bool,
-) -> Tensor:
-    side = _new_psfs(plane, gradient, layer_index, layer_weight, layers, weight_gradient).shape[-1]
-    labels = layer_index, layer_weight, layers, side
-    return triton_ops.correlate(plane, gradient, *labels, weight_gradient=weight_gradient).flip((-2, -1))
-
-
 def _keep_psfs(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:4])
     ctx.weight_gradient = inputs[5]
@@ -350,14 +308,10 @@ def _transposed(
     return torch.stack(planes).sum(0)
 
 
-for _name, _function, _in_triton, _fake, _keep, _backward in (
-    ("kornia_tidy::gather_direct", _gather, _gather_in_triton, _new_light, _keep_light, _light_backward),
-    (
-        "kornia_tidy::gather_direct_psf_gradient",
-        *(_psf_gradient, _psf_gradient_in_triton, _new_psfs, _keep_psfs, _psfs_backward),
-    ),
+for _name, _function, _fake, _keep, _backward in (
+    ("kornia_tidy::gather_direct", _gather, _new_light, _keep_light, _light_backward),
+    ("kornia_tidy::gather_direct_psf_gradient", _psf_gradient, _new_psfs, _keep_psfs, _psfs_backward),
 ):
     torch.library.impl(_name, "CPU", _function)
-    torch.library.impl(_name, "CUDA", _in_triton)
     torch.library.register_fake(_name, _fake)
     torch.library.register_autograd(_name, _backward, setup_context=_keep)

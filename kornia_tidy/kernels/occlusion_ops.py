@@ -1,4 +1,4 @@
-"""Operator of occlusion by direct convolution: in C, on GPUs in Triton.
+"""Operator of occlusion by direct convolution: in C.
 
 Sums are of positive terms only, so float32 keeps their relative accuracy however small the divisor that they become.
 The operator has no gradient of its own: the renderer makes gradients by tiles.
@@ -15,14 +15,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_tidy.kernels import triton_ops
-from kornia_tidy.kernels.build import KERNELS, load
+from kornia_tidy.kernels.build import KERNELS, load, vector_bytes
 from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "occlusion.c"
 BLOCK_ROWS = 8  # of a block of pixels, see occlusion.c
 EPSILON = 1e-6  # added to the divisor, see occlusion.c
 SMALLEST_SIDE = BLOCK_ROWS - 1  # px, of PSFs; smaller ones are padded to it
+# Operations for each pixel of a block, as many as take as long: to begin and end the sums of a layer, for a column of a
+# PSF that meets a row of light, and for an end of a run of whole weights.
+_BLOCK, _COLUMN, _END = 170, 1, 3
 
 torch.library.define(
     "kornia_tidy::occlusion_direct",
@@ -43,8 +45,8 @@ def occlusion_direct(
     """Render layers that hide one another by direct convolution: operator ``kornia_tidy::occlusion_direct``.
 
     Args:
-        plane: (B, C, H + P - 1, W + P - 1) image on a processor or a CUDA GPU, with all that lies beyond its
-            border; float32 or float64.
+        plane: (B, C, H + P - 1, W + P - 1) image on a processor, with all that lies beyond its border; float32
+            or float64.
         psfs: (D, C, P, P) with P odd, of the plane's dtype, not negative anywhere. Layer D - 1 is the nearest.
         layer_index: (B or 1, H + P - 1, W + P - 1) layer of each pixel, whole numbers of any dtype.
         layer_weight: share of the next layer in [0, 1], of the same shape and the plane's dtype, or None for zero.
@@ -65,30 +67,33 @@ def occlusion_direct(
     return torch.ops.kornia_tidy.occlusion_direct(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
 
 
-def count_work(
-    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, bands: int
-) -> tuple[int, int, int, int]:
-    """Count the work of :func:`occlusion_direct` in some bands of blocks, and scale it up to the image.
+def count_operations(
+    layer_index: Tensor, layer_weight: Tensor | None, psfs: Tensor, batch: int, bands: int = 12
+) -> float:
+    """Count the operations of :func:`occlusion_direct` for one channel, in some bands of blocks, scaled to the image.
 
     Args:
-        plane: as there.
-        psfs: as there.
         layer_index: as there.
         layer_weight: as there.
-        bands: number of bands that are counted.
+        psfs: as there. Their values do not matter.
+        batch: images.
+        bands: that are counted.
 
-    Returns:
-        Numbers of blocks whose window is all of one layer; of pairs of another block and a layer present in its window;
-        of columns of PSFs that meet a row of light or of shared weights; of ends of runs of whole weights.
+    Example:
+        >>> flat, psfs = torch.zeros(1, 72, 128), torch.zeros(3, 1, 9, 9)
+        >>> 2 < count_operations(flat, None, psfs, batch=1) / (64 * 120 * 9**2) < 6  # products and sums
+        True
     """
-    scene, kept = _scene(plane, psfs, layer_index, layer_weight, None)
+    plane = psfs.new_empty(()).expand(batch, 1, *layer_index.shape[1:])
+    scene, kept = _scene(plane, psfs[:, :1], layer_index, layer_weight, None)
     every = max(1, scene.images * scene.height // (BLOCK_ROWS * bands))
-    counts = (ctypes.c_int64 * 4)()
-    if load(SOURCE, plane.dtype).count(ctypes.byref(scene), ctypes.c_int64(every), counts):
+    counts, library = (ctypes.c_int64 * 4)(), load(SOURCE, psfs.dtype)
+    if library.count(ctypes.byref(scene), ctypes.c_int64(every), counts):
         raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
     del kept
-    alone, pairs, columns, ends = (every * number for number in counts)
-    return alone, pairs, columns, ends
+    alone, pairs, columns, ends = counts  # blocks of one layer, pairs of another block and a layer, ...
+    of_pixel = alone * (2 * scene.side**2 + _BLOCK) + pairs * _BLOCK + columns * _COLUMN + ends * _END
+    return float(every * BLOCK_ROWS * vector_bytes(library) // psfs.itemsize * of_pixel)
 
 
 def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
@@ -172,7 +177,7 @@ def _new_light(
         raise ValueError(f"psfs must have shape (D, {channels}, P, P) with P odd, got {tuple(psfs.shape)}")
     height, width = rows - psfs.shape[-1] + 1, columns - psfs.shape[-1] + 1
     smallest = smallest_output(plane.dtype)
-    if plane.device.type != "cuda" and (height < smallest[0] or width < smallest[1]):
+    if height < smallest[0] or width < smallest[1]:
         raise ValueError(f"the output must have at least {smallest[0]}x{smallest[1]} pixels, got {height}x{width}")
     if tuple(layer_index.shape) not in ((batch, rows, columns), (1, rows, columns)):
         raise ValueError(
@@ -217,20 +222,6 @@ def _occlude(
     return light
 
 
-def _occlude_in_triton(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-) -> Tensor:
-    _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
-    flipped = psfs.flip((-2, -1))
-    return triton_ops.occlude(plane, flipped, layer_index, layer_weight, mean, stray_light, inside, EPSILON)
-
-
 def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
     raise NotImplementedError(
         "kornia_tidy::occlusion_direct has no gradient: call kornia_tidy.render.occlusion, which makes it by tiles"
@@ -238,6 +229,5 @@ def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
 
 
 torch.library.impl("kornia_tidy::occlusion_direct", "CPU", _occlude)
-torch.library.impl("kornia_tidy::occlusion_direct", "CUDA", _occlude_in_triton)
 torch.library.register_fake("kornia_tidy::occlusion_direct", _new_light)
 torch.library.register_autograd("kornia_tidy::occlusion_direct", _refuse)

@@ -14,6 +14,7 @@ Operators are defined by schema, as ``torch.library.custom_op`` would import the
 from __future__ import annotations
 
 import ctypes
+from itertools import count
 from typing import Any
 
 import torch
@@ -35,6 +36,20 @@ for _schema in (
     " SymInt size, bool correlate, bool weight_gradient) -> Tensor",
 ):
     torch.library.define(f"kornia_tidy::{_schema.partition('(')[0]}", "(" + _schema.partition("(")[2])
+
+
+def window_size(psf_side: int) -> int:
+    """Return the side of the windows for PSFs of P pixels: the next that both data types can have from 2.5 P on.
+
+    Larger windows waste less on their overlap, smaller ones hold fewer layers.
+
+    Example:
+        >>> [window_size(side) for side in (5, 23, 61, 129)]
+        [32, 64, 160, 384]
+    """
+    step = size_step(torch.float32)
+    sizes = count(step * max(1, -(-5 * psf_side // (2 * step))), step)
+    return next(size for size in sizes if is_window_size(size, torch.float32))
 
 
 def gather_overlap(

@@ -1,6 +1,6 @@
 """Planning: choice of the cheapest fidelity within an error tolerance, predicted without rendering.
 
-A camera, a scene and a tolerance come in; a plan with its predicted error, time and memory goes out. Read
+A camera, a scene and a tolerance come in; a plan with its predicted error, operations and memory goes out. Read
 ``planner.py`` first; the error model is in ``error_model.py``.
 """
 

@@ -11,10 +11,8 @@ import torch
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-from kornia_tidy.psf.mutual_intensity import goes_in_c
 from kornia_tidy.psf.propagation import energy_operations
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.render.cost_model import BankWork
 
 _points = cache(gauss_legendre_order)
 
@@ -63,18 +61,6 @@ def bank_operations(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> 
     return (2 if fidelity.double else 1) * layers * sum(min(ways) for ways in _operations(geometry, fidelity))
 
 
-def bank_work(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> BankWork:
-    """Return the operations of an exact PSF bank by the way they are made, see :func:`bank_operations`."""
-    in_c = goes_in_c(window_side(fidelity), torch.float64 if fidelity.double else torch.float32)
-    products = intensities = 0
-    for by_waves, by_intensity in _operations(geometry, fidelity):
-        if by_intensity < by_waves and in_c:
-            intensities += layers * by_intensity
-        else:
-            products += layers * min(by_waves, by_intensity)
-    return BankWork(products, intensities, fidelity.double)
-
-
 def _operations(geometry: BankGeometry, fidelity: Fidelity) -> list[tuple[int, int]]:
     """Of a layer, for each wavelength: by either way."""
     cells, window = geometry.pupil.amplitude.shape[-1], window_side(fidelity)
@@ -92,7 +78,7 @@ def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, laye
         channels: of the image.
         fidelity: its window, points and precision count.
         layers: PSFs held.
-        rendering: what the renderer takes, see :func:`kornia_tidy.planning.rendering_cost.rendering_bytes`.
+        rendering: what the renderer takes, see :func:`kornia_tidy.planning.rendering_cost.rendering_work`.
     """
     real = 8 if fidelity.double else 4
     psfs = real * layers * channels * window_side(fidelity) ** 2

@@ -3,9 +3,10 @@
 The error is the root mean square difference between the noise-free capture and that of the preset ``reference``, in
 linear light with full scale 1. Light beyond full scale is not clipped: a highlight of 1000 gives errors a thousand
 times those of white. The error is predicted from the power of the scene in each octave and at each depth, see
-:mod:`kornia_tidy.planning.error_model`, and the cost by formula, see :mod:`kornia_tidy.render.cost_model`. The
-candidates are all combinations of layers, spacing, window, quadrature points per pixel and precision. The light outside
-the window is spread over the image or renormalised into the window, whichever is more accurate.
+:mod:`kornia_tidy.planning.error_model`, and the cost is counted in operations, see
+:mod:`kornia_tidy.planning.rendering_cost`. The candidates are all combinations of layers, spacing, window, quadrature
+points per pixel and precision. The light outside the window is spread over the image or renormalised into the window,
+whichever is more accurate.
 
 The prediction is the sum of the errors of all single changes, each times a safety factor. It is an upper estimate,
 which holds on the scenes of ``tests/planning/adversarial_scenes.py``. It is not a strict bound, since the light of one
@@ -32,25 +33,17 @@ from torch.nn.functional import max_pool2d
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.planning.bank_cost import bank_work, memory_bytes, window_side
+from kornia_tidy.planning.bank_cost import bank_operations, memory_bytes, window_side
 from kornia_tidy.planning.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_steps
 from kornia_tidy.planning.depth_energy import Depths
 from kornia_tidy.planning.error_model import LayerErrors, change_error, layer_coefficients
 from kornia_tidy.planning.psf_samples import PlannableCamera, PSFSamples
 from kornia_tidy.planning.render_plan import RenderPlan
-from kornia_tidy.planning.rendering_cost import (
-    SceneWork,
-    count_work,
-    label_pixels,
-    rendering_bytes,
-    rendering_seconds,
-)
+from kornia_tidy.planning.rendering_cost import rendering_work
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes, guarded
+from kornia_tidy.render.backend import Work
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
-from kornia_tidy.render.borders import pad_border
-from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.scene import Labels
 from kornia_tidy.render.stray_light import share_in_frame
 
 SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.2 times the formula
@@ -104,8 +97,7 @@ class PlannedScene:
         self._batch = len(defocus if light is None else light)
         self._samples, self._defocus = samples, defocus.detach()
         self._known: dict[Any, float] = {}
-        self._works: dict[tuple[str, Sequence[float], int], SceneWork] = {}
-        self._labelled: tuple[tuple[str, Sequence[float], int], Labels] | None = None
+        self._works: dict[Any, Work] = {}
         self.reference = samples.reference(height, width)
         size = spectrum_size(window_side(self.reference))
         colours = range(1, len(samples.spectrum.basis or (1,)))
@@ -149,16 +141,11 @@ class PlannedScene:
             raise ValueError(f"errors are predicted for occlusion_states 'each', got {fidelity.occlusion_states!r}")
         return sum(error for _, error in self._parts(fidelity))
 
-    def seconds(self, fidelity: Fidelity) -> float:
-        """Return the predicted time in seconds of a capture with its PSFs on torch's threads.
-
-        See :mod:`kornia_tidy.render.cost_model`.
-        """
-        samples, scene = self._samples, self._work(fidelity)
-        bank = bank_work(samples.geometry(fidelity), fidelity, self._computed(fidelity))
-        seconds = seconds_of(bank, scene.profile, torch.get_num_threads())
-        seconds += rendering_seconds(scene, samples.planes, double=fidelity.double)
-        return (samples.captures if self._occlusion else 1) * seconds
+    def operations(self, fidelity: Fidelity) -> float:
+        """Return the operations of a capture with its PSFs, those of float64 counted twice."""
+        samples = self._samples
+        bank = bank_operations(samples.geometry(fidelity), fidelity, self._computed(fidelity))
+        return (samples.captures if self._occlusion else 1) * (bank + self._work(fidelity).operations)
 
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
@@ -166,8 +153,8 @@ class PlannedScene:
         If no candidate is, the plan is the reference, which has no error by definition.
         """
         check_positive("tolerance", tolerance)
-        chosen = min(self._within(tolerance), key=self.seconds, default=self.reference)
-        if self.seconds(chosen) >= self.seconds(self.reference):
+        chosen = min(self._within(tolerance), key=self.operations, default=self.reference)
+        if self.operations(chosen) >= self.operations(self.reference):
             return self._described(self.reference, tolerance)
         return self._described(replace(chosen, name=f"planned, tolerance {tolerance:g}"), tolerance)
 
@@ -202,8 +189,8 @@ class PlannedScene:
             tolerance=tolerance,
             predicted_error=self.error(fidelity),
             error_parts=tuple(self._parts(fidelity)),
-            seconds=self.seconds(fidelity),
-            reference_seconds=self.seconds(self.reference),
+            operations=self.operations(fidelity),
+            reference_operations=self.operations(self.reference),
             memory_bytes=self._memory(fidelity),
             layers_present=self._computed(fidelity),
             layers_total=len(self._sampled_defocus(fidelity)),
@@ -353,9 +340,11 @@ class PlannedScene:
         return int(self._known[key])
 
     def _memory(self, fidelity: Fidelity) -> int:
-        samples, scene, layers = self._samples, self._work(fidelity), self._computed(fidelity)
-        rendering = rendering_bytes(scene, samples.planes, double=fidelity.double)
-        held = samples.captures * max(layers, scene.layers)
+        samples, nodes = self._samples, self._rendered(fidelity)
+        farthest, nearest = float(self._depths.psi[0]), float(self._depths.psi[-1])
+        first, last = max(0, bisect_right(nodes, farthest) - 1), min(len(nodes) - 1, bisect_left(nodes, nearest))
+        held = samples.captures * max(self._computed(fidelity), last - first + 1)
+        rendering = self._work(fidelity).memory
         return memory_bytes(samples.geometry(fidelity), samples.planes, fidelity, held, rendering)
 
     def _rendered(self, fidelity: Fidelity) -> Sequence[float]:
@@ -363,30 +352,24 @@ class PlannedScene:
         nodes = self._samples.nodes(fidelity)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
-    def _work(self, fidelity: Fidelity) -> SceneWork:
+    def _work(self, fidelity: Fidelity) -> Work:
         """Return the work of the renderer for the scene."""
-        nodes, window = self._rendered(fidelity), window_side(fidelity)
-        mode = "nearest" if fidelity.layers == "nearest" else "linear"
-        if (mode, nodes, window) not in self._works:
-            margin = 0 if self._samples.compositing == "gather" and self._samples.border != "valid" else window // 2
-            if self._labelled is None or self._labelled[0] != (
-                mode,
+        samples, nodes, window = self._samples, self._rendered(fidelity), window_side(fidelity)
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        key = layers, nodes, window, fidelity.double
+        if key not in self._works:
+            self._works[key] = rendering_work(
+                self._defocus,
+                self._batch,
+                samples.planes,
                 nodes,
-                margin,
-            ):  # only one is cached: it is large
-                seen = self._seen(margin)
-                self._labelled = (mode, nodes, margin), label_pixels(seen, self._batch, nodes, mode)
-            work = count_work(self._labelled[1], len(nodes), window, self._samples.compositing)
-            self._works[mode, nodes, window] = work
-        return self._works[mode, nodes, window]
-
-    def _seen(self, margin: int) -> Tensor:
-        """Return the defocus of the rendered pixels: cropped for the border ``valid``, else padded by the margin."""
-        border = self._samples.border
-        if border == "valid" and not self._occlusion:
-            height, width = self._defocus.shape[-2:]
-            return self._defocus[..., margin : height - margin, margin : width - margin]
-        return pad_border(self._defocus, margin, "replicate" if border == "zero" else border)
+                window,
+                layers=layers,
+                compositing=samples.compositing,
+                border=samples.border,
+                double=fidelity.double,
+            )
+        return self._works[key]
 
     @property
     def _occlusion(self) -> bool:

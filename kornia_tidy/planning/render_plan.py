@@ -1,4 +1,4 @@
-"""Plan of a capture: the chosen fidelity with its predicted error, time and memory."""
+"""Plan of a capture: the chosen fidelity with its predicted error, operations and memory."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class RenderPlan:
         tolerance: largest error allowed.
         predicted_error: root mean square difference of the noise-free linear capture to ``reference``, full scale 1:
             an upper estimate, see :mod:`kornia_tidy.planning.planner` for its assumptions.
-        seconds: of one capture with its PSFs on torch's threads, see :mod:`kornia_tidy.render.cost_model`.
+        operations: of one capture with its PSFs, those of float64 counted twice.
         memory_bytes: peak of one capture without gradients, beyond the image.
-        reference_seconds: predicted time of the reference.
+        reference_operations: those of the reference.
         layers_present: PSFs computed for the scene.
         layers_total: those of the camera's whole range.
         states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
@@ -34,9 +34,9 @@ class RenderPlan:
     reference: Fidelity
     tolerance: float
     predicted_error: float
-    seconds: float
+    operations: float
     memory_bytes: int
-    reference_seconds: float
+    reference_operations: float
     layers_present: int
     layers_total: int
     states: int
@@ -70,7 +70,7 @@ class RenderPlan:
                 f"{knobs.window} px that hold {held} of the light, in float{64 if knobs.double else 32}"
                 + (f", and an image for each of {self.states} states of the exposure" if self.states > 1 else ""),
                 "  skips: " + "; ".join(skipped),
-                f"  costs: some {self.seconds:.2g} s, {self.seconds / self.reference_seconds:.2%} of the "
+                f"  costs: {self.operations:.2g} operations, {self.operations / self.reference_operations:.2%} of the "
                 f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",
                 f"  the reference itself is {self.reference_error:.1e} from a PSF of its own for each depth{at}",
             ]

@@ -5,23 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.planning.bank_cost import bank_work
+from kornia_tidy.planning.bank_cost import bank_operations
 from kornia_tidy.planning.candidates import REFERENCE
 from kornia_tidy.planning.psf_samples import PSFSamples
 from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.wide_blur import GRID_ERROR, LAYER_ERROR, RAY_TOLERANCE, SCENE_DEVIATION, BlurGroup
 from kornia_tidy.psf.wide_psfs import held_nodes
-from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.cost_store import settled_profile
 
-# Measured: 0.13 to 0.2 s of processor time for 3 x 512 x 512 pixels and some 60 layers.
-_PIXEL_SECONDS = 1e-7  # of a channel's pixel, for its two layers
-_LAYER_SECONDS = 2e-9  # of a channel's pixel of the grid, for each layer
+# As many as take the time measured: 0.13 to 0.2 s for 3 x 512 x 512 pixels and some 60 layers, at 5e10 a second.
+_PIXEL_OPERATIONS = 5000  # of a channel's pixel, for its two layers
+_LAYER_OPERATIONS = 100  # of a channel's pixel of the grid, for each layer
 _BYTES_A_VALUE = 48
 
 
@@ -55,7 +52,7 @@ class WidePlan(RenderPlan):
                 f"{rays:.1e}); wide_blur='waves' computes all of them exactly",
                 f"  holds: at least {self.light_held[0]:.0%} of the light of every depth, in windows up to "
                 f"{self.window} px",
-                f"  costs: some {self.seconds:.2g} s, and {self.memory_bytes / 2**20:.0f} MiB",
+                f"  costs: {self.operations:.2g} operations, and {self.memory_bytes / 2**20:.0f} MiB",
             ]
         )
 
@@ -80,24 +77,24 @@ def plan_wide(optics: Any, defocus: Tensor, light: Tensor | None, tolerance: flo
     held: list[tuple[BlurGroup, tuple[float, ...]]] = held_nodes(blur, defocus)
     step, samples = float(model.pixel_step), PSFSamples(optics, channels)
     exact = [psi for _, nodes in held for psi in nodes if blur_radius(psi, step) < blur.ray_radius]
-    fidelity, threads, profile = optics.fidelity, torch.get_num_threads(), settled_profile()
+    fidelity = optics.fidelity
     small = fidelity.replace(window=min(blur.window, 2 * int(1.2 * blur.ray_radius + 4) + 1))
     pixels = defocus.numel() * channels
     work = sum(len(nodes) / group.grid**2 for group, nodes in held)
-    seconds = seconds_of(bank_work(samples.geometry(small), small, len(exact)), profile, threads)
-    seconds += pixels * (_PIXEL_SECONDS + _LAYER_SECONDS * work)
+    operations = bank_operations(samples.geometry(small), small, len(exact))
+    operations += pixels * (_PIXEL_OPERATIONS + _LAYER_OPERATIONS * work)
     reference = REFERENCE.replace(window=blur.window)
     span = float(defocus.max() - defocus.min()) / reference.layer_spacing
-    waves = seconds_of(bank_work(samples.geometry(reference), reference, max(1, round(span))), profile, threads)
+    waves = bank_operations(samples.geometry(reference), reference, max(1, round(span)))
     parts = (("rays", RAY_TOLERANCE), ("layers", LAYER_ERROR), ("grids", GRID_ERROR))
     return WidePlan(
         fidelity=fidelity,
         reference=reference,
         tolerance=tolerance,
         predicted_error=blur.error * contrast,
-        seconds=seconds,
+        operations=operations,
         memory_bytes=min(optics.memory_budget, _BYTES_A_VALUE * pixels),
-        reference_seconds=max(waves, seconds),
+        reference_operations=max(waves, operations),
         layers_present=len({psi for _, nodes in held for psi in nodes}),
         layers_total=len(blur.nodes),
         states=1,

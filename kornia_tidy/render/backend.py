@@ -1,13 +1,15 @@
-"""The interface of a renderer backend: whether it supports a scene, what it would cost, and the rendering itself."""
+"""The interface of a renderer backend: whether it supports a scene, its work, and the rendering itself."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
 
-from kornia_tidy.render.cost_model import Work
+from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.render.scene import LayeredScene
 
 GradientPairs = list[tuple[Tensor, Tensor]]  # a tensor and its gradient
@@ -29,6 +31,37 @@ def wants_gradient(tensor: Tensor | None) -> bool:
     return tensor is not None and tensor.requires_grad
 
 
+@dataclass(frozen=True)
+class Work:
+    """Work of a backend for a scene, without gradients.
+
+    Args:
+        operations: additions and multiplications, roughly: for comparisons.
+        memory: bytes at a time beyond the image.
+        window: side of the windows that are transformed in samples; 0 if none are.
+    """
+
+    operations: float
+    memory: int
+    window: int = 0
+
+    def __str__(self) -> str:
+        """Describe in words."""
+        windows = f"windows of {self.window} px, " if self.window else ""
+        return f"{windows}{self.operations:.2g} operations, {self.memory / 2**20:.0f} MiB"
+
+
+def transform_operations(height: int, width: int) -> float:
+    """Return the operations of a Fourier transform of a real plane, padded to a size that is fast.
+
+    Example:
+        >>> transform_operations(64, 64) / 64**2
+        30.0
+    """
+    samples = next_fast_size(height) * next_fast_size(width)
+    return 2.5 * samples * math.log2(samples)
+
+
 class Backend(Protocol):
     """A way to render a layered scene. All backends give the same image to rounding."""
 
@@ -42,14 +75,7 @@ class Backend(Protocol):
         ...
 
     def work(self, scene: LayeredScene) -> Work:
-        """Return the work of the forward pass: pairs of tiles and layers, strips, samples.
-
-        :mod:`kornia_tidy.render.cost_model` prices it.
-        """
-        ...
-
-    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
-        """Yield lower bounds of :meth:`work`: one that takes no time, then closer ones that take less time than it."""
+        """Return the work of the forward pass, counted from the layers of the pixels and from no light or PSF."""
         ...
 
     def render(self, scene: LayeredScene) -> Tensor:

@@ -1,10 +1,9 @@
-"""The choice of a backend: the cheapest one that supports a scene, or the one asked for by name."""
+"""The choice of a backend: a rule, or the one asked for by name."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,42 +11,32 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.accelerator_cost import batched_seconds, is_triton_faster, triton_is_allowed, triton_seconds
-from kornia_tidy.render.backend import Backend, GradientPairs
-from kornia_tidy.render.backends.batched import MOST_SAMPLES, BatchedBackend
+from kornia_tidy.render.backend import Backend, GradientPairs, Work, wants_gradient
+from kornia_tidy.render.backends.batched import BatchedBackend
+from kornia_tidy.render.backends.compiled import CompiledBackend
 from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
-from kornia_tidy.render.backends.direct import DirectBackend
-from kornia_tidy.render.backends.overlap import OverlapBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
-from kornia_tidy.render.backends.triton_direct import TritonBackend
-from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.cost_profile import CostProfile
-from kornia_tidy.render.first_use import profile_for
-from kornia_tidy.render.repeatable import of_thread
-from kornia_tidy.render.scene import SAMPLE, LayeredScene, scene_of_layers
+from kornia_tidy.render.scene import LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.tracing import is_transformed
 
 BACKENDS: dict[str, Backend] = {
-    backend.name: backend for backend in (DirectBackend(), OverlapBackend(), TiledBackend(), DenseBackend())
+    backend.name: backend for backend in (DenseBackend(), CompiledBackend(), TiledBackend(), BatchedBackend())
 }
-BATCHED = BatchedBackend()  # for accelerators; "auto" takes it there without an estimate
-TRITON = TritonBackend()
-NAMED: dict[str, Backend] = {**BACKENDS, BATCHED.name: BATCHED, TRITON.name: TRITON}
-METHODS = ("auto", *NAMED)
-LARGEST_PLANE = 32 << 20  # bytes of an image with all channels; "auto" does not take dense for larger ones
-REMEMBERED = 256  # choices, each of some 500 bytes and a grid
-
-_choices: dict[tuple[Hashable, ...], tuple[Backend, dict[Any, Any]]] = {}
+METHODS = ("auto", *BACKENDS)
+RENAMED = {"direct": "compiled", "overlap": "compiled", "triton": "batched"}  # what method= took before
+# Occlusion in C takes P^2 operations a pixel. Beyond this side transforms of the whole plane are faster, up to three
+# times at 129 px; they are taken while an image with all channels has few bytes in float64.
+LARGEST_OCCLUSION, LARGEST_PLANE = 65, 32 << 20
+MOST_SAMPLES = 1 << 28  # of all layers: beyond, transforms take longer than launches, and tiles skip absent layers
 
 
 def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
-    """Render a layered scene by the cheapest backend, or by one that is named or given.
+    """Render a layered scene by the backend that :func:`choose` takes, or by one that is given.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"direct"``, ``"overlap"``, ``"tiled"``, ``"dense"``, ``"batched"`` or ``"triton"``, or a
-            backend.
+        method: ``"auto"``, ``"dense"``, ``"compiled"``, ``"tiled"`` or ``"batched"``, or a backend.
 
     Returns:
         (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
@@ -137,11 +126,11 @@ def leaves_of(tensors: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
-    """Return the backend that :func:`render_scene` takes.
+    """Return the backend that renders a scene.
 
-    Of those that support the scene it is the one with the least estimated time. Dense rendering is taken only while
-    its memory stays small, or if nothing else supports the scene. The choice for a sample of layers is remembered: it
-    takes as long as to render a small image.
+    Transforms of torch are for dense alone. Accelerators take batched, and tiles where the planes of all layers would
+    be too large. Processors take compiled, and tiles without a compiler; large PSFs with occlusion go densely while
+    the planes are small and no gradients are wanted, for which dense keeps every spectrum.
 
     Args:
         scene: to be rendered.
@@ -151,74 +140,27 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         ValueError: as :func:`render_scene`.
     """
     if method != "auto":
-        check_choice("method", method, METHODS)
-        backend = NAMED[method]
-        why = refusal(backend, scene)
-        if why is not None:
-            raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
-        return backend
-    accelerated = scene.image.device.type != "cpu"
-    if accelerated and _goes_by_triton(scene):
-        return TRITON
-    if accelerated and not is_transformed() and BATCHED.samples(scene) <= MOST_SAMPLES:
-        return BATCHED
-    # With occlusion the values of PSFs matter too.
-    layout = {} if scene.layout is None or scene.compositing == "occlusion" else scene.layout
-    if "fingerprint" not in layout:
-        layout["fingerprint"] = _fingerprint(scene)
-    key = layout["fingerprint"]
-    known = None if key is None else _choices.get(key)  # another thread may empty the memory meanwhile
-    if known is not None and (known[0].name != "direct" or known[0].refusal(scene) is None):  # others refuse nothing
-        best, grids = known
-        scene.grids.update(grids)
-        return best
-    able = [backend for backend in BACKENDS.values() if refusal(backend, scene) is None]
-    if len(able) > 1 and memory_objection(scene) is not None:
-        able.remove(BACKENDS["dense"])
-    best = able[0] if key is None and len(able) == 1 else _fastest(able, scene)  # and its tiles, to be remembered
-    if key is not None:
-        if len(_choices) >= REMEMBERED:
-            _choices.clear()
-        _choices[key] = best, dict(scene.grids)
-    return best
+        return _named(scene, method)
+    if is_transformed():
+        return BACKENDS["dense"]
+    if scene.image.device.type != "cpu":
+        samples = len(scene.psfs) * math.prod((*scene.image.shape[:2], *scene.padded_size))
+        return BACKENDS["batched" if samples <= MOST_SAMPLES else "tiled"]
+    if scene.compositing == "occlusion" and scene.psfs.shape[-1] > LARGEST_OCCLUSION:
+        inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+        recorded = torch.is_grad_enabled() and any(wants_gradient(x) for x in inputs)
+        if not recorded and 8 * scene.image.numel() <= LARGEST_PLANE:
+            return BACKENDS["dense"]
+    return BACKENDS["compiled" if BACKENDS["compiled"].refusal(scene) is None else "tiled"]
 
 
-def _goes_by_triton(scene: LayeredScene) -> bool:
-    """Return whether ``"auto"`` takes kernels in Triton: where they are allowed to, and estimated to be much faster."""
-    return triton_is_allowed() and is_triton_faster(scene) and refusal(TRITON, scene) is None
-
-
-def _fastest(able: list[Backend], scene: LayeredScene) -> Backend:
-    """Return the backend with the least estimated time. To count takes time: what cannot be faster is not counted."""
-    best, least, profile, threads = able[0], math.inf, _profile(scene), torch.get_num_threads()
-    bounds = {backend.name: backend.bounds(scene) for backend in able}
-    first = {name: seconds_of(next(own), profile, threads) for name, own in bounds.items()}
-    for backend in sorted(able, key=lambda backend: first[backend.name]):
-        closer = (seconds_of(work, profile, threads) for work in bounds[backend.name])
-        if first[backend.name] >= least or any(seconds >= least for seconds in closer):
-            continue
-        if (seconds := seconds_of(backend.work(scene), profile, threads)) < least:
-            best, least = backend, seconds
-    return best
-
-
-def _fingerprint(scene: LayeredScene) -> tuple[Hashable, ...] | None:
-    """Return what a choice depends on, with a digest of the sample of layers that costs are estimated from.
-
-    None on an accelerator, which one would have to wait for, and where torch transforms the renderer.
-    """
-    labels = scene.labels
-    if labels.layer_index.device.type != "cpu" or is_transformed():
-        return None
-    digest = hashlib.blake2b(digest_size=16)
-    for layer in labels.terms(slice(None), *(slice(None, None, SAMPLE),) * 2):
-        digest.update(layer.contiguous().numpy())
-    refused = scene.compositing == "occlusion" and refusal(BACKENDS["direct"], scene)
-    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
-    recorded = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
-    threads, shape = (torch.get_num_threads(), of_thread.repeatable), labels.layer_index.shape
-    shapes = scene.image.shape, scene.image.dtype, scene.psfs.shape, shape, labels.weight_gradient
-    return scene.compositing, *shapes, refused, recorded, threads, digest.digest()
+def _named(scene: LayeredScene, method: str) -> Backend:
+    if method in RENAMED:
+        raise ValueError(f"method {method!r} is now {RENAMED[method]!r}, or 'auto' for the backend that suits a scene")
+    check_choice("method", method, METHODS)
+    if (why := refusal(BACKENDS[method], scene)) is not None:
+        raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
+    return BACKENDS[method]
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:
@@ -228,42 +170,30 @@ def refusal(backend: Backend, scene: LayeredScene) -> str | None:
     return backend.refusal(scene)
 
 
-def memory_objection(scene: LayeredScene) -> str | None:
-    """Return why the memory of dense rendering is too large for a scene, or None if it is small."""
-    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
-    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
-        return "for gradients it keeps a spectrum for each layer"
-    itemsize = 8 if scene.compositing == "occlusion" else scene.image.element_size()
-    plane = scene.image.numel() * itemsize
-    return f"a dozen planes of {plane >> 20} MiB would exist at a time" if plane > LARGEST_PLANE else None
-
-
 @dataclass(frozen=True)
 class Explanation:
-    """Which backend renders a scene and why, see :func:`explain`.
+    """Which backend renders a scene, and what the others would do, see :func:`explain`.
 
     Args:
         scene: the scene in words.
         backend: name of the one that ``method="auto"`` takes.
-        seconds: estimated time of each backend that supports the scene, by name.
-        objections: why a backend does not support the scene, or is not taken for its memory, by name.
+        works: work of each backend that supports the scene, by name.
+        objections: why a backend does not support the scene, by name.
     """
 
     scene: str
     backend: str
-    seconds: dict[str, float]
+    works: dict[str, Work]
     objections: dict[str, str]
 
     def __str__(self) -> str:
-        by_time = sorted(self.seconds.items(), key=lambda item: item[1])
-        words = {name: f"about {1e3 * seconds:.3g} ms" for name, seconds in by_time}
-        for name, why in self.objections.items():
-            words[name] = f"{words[name]}, but {why}" if name in words else why
+        first = sorted(self.works, key=lambda name: name != self.backend)
+        words = {name: str(self.works[name]) for name in first} | self.objections
         return "\n".join([f"{self.scene}: {self.backend}", *(f"  {name}: {why}" for name, why in words.items())])
 
 
 def explain(scene: LayeredScene) -> Explanation:
-    """Return the choice of ``method="auto"`` for a scene, with the estimated times and the objections to the others.
+    """Return the choice of ``method="auto"`` for a scene, with the work of each backend or why it does not do it.
 
     Args:
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
@@ -271,31 +201,15 @@ def explain(scene: LayeredScene) -> Explanation:
     Example:
         >>> import torch
         >>> from kornia_tidy.render.scene import layered_scene
-        >>> image, psi, nodes = torch.rand(1, 3, 2, 40), torch.zeros(1, 1, 2, 40), torch.tensor([0.0, 4.0])
-        >>> explanation = explain(layered_scene(image, psi, nodes, torch.rand(2, 3, 3, 3), compositing="scatter"))
-        >>> sorted(explanation.seconds), explanation.objections
-        (['dense', 'overlap', 'tiled'], {'direct': 'direct convolution gathers light and does not scatter it'})
+        >>> image, psi, nodes = torch.rand(1, 3, 64, 64), torch.zeros(1, 1, 64, 64), torch.tensor([0.0, 4.0])
+        >>> print(explain(layered_scene(image, psi, nodes, torch.rand(2, 3, 23, 23))))  # doctest: +ELLIPSIS
+        gather of 1 x 3 channels of 64x64 px, 1 of 2 layers, PSFs of 23x23 px: ...
     """
     (height, width), (batch, channels), side = scene.output_size, scene.image.shape[:2], scene.psfs.shape[-1]
     words = (
         f"{scene.compositing} of {batch} x {channels} channels of {height}x{width} px, {scene.sampled_layers} of "
-        f"{len(scene.psfs)} layers, PSFs of {side}x{side} px, {torch.get_num_threads()} threads"
+        f"{len(scene.psfs)} layers, PSFs of {side}x{side} px"
     )
     objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
-    profile, threads = _profile(scene), torch.get_num_threads()
-    able = {name: backend for name, backend in BACKENDS.items() if name not in objections}
-    seconds = {name: seconds_of(backend.work(scene), profile, threads) for name, backend in able.items()}
-    if len(seconds) > 1 and (why := memory_objection(scene)) is not None:
-        objections["dense"] = why
-    if scene.image.device.type != "cpu":
-        seconds |= {"batched": batched_seconds(scene), "triton": triton_seconds(scene)}
-        if (why := refusal(TRITON, scene)) is not None:
-            objections["triton"] = why
-        elif not triton_is_allowed():
-            objections["triton"] = "it was never measured on a GPU: KORNIA_TIDY_TRITON=on lets 'auto' take it"
-    return Explanation(words, choose(scene).name, seconds, objections)
-
-
-def _profile(scene: LayeredScene) -> CostProfile:
-    able = [name for name, backend in BACKENDS.items() if refusal(backend, scene) is None]
-    return profile_for(scene.compositing, math.prod(scene.output_size), able, BACKENDS.values())
+    works = {name: backend.work(scene) for name, backend in BACKENDS.items() if name not in objections}
+    return Explanation(words, choose(scene).name, works, objections)

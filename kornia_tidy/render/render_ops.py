@@ -51,7 +51,7 @@ def render_layers(
     correlate: bool,
     method: str,
 ) -> Tensor:
-    """Render a scene by the cheapest backend, or by one that is named: operator ``kornia_tidy::render_layers``.
+    """Render a scene by the backend that suits it, or by one that is named: operator ``kornia_tidy::render_layers``.
 
     Args:
         image: (B, C, H, W) linear light.

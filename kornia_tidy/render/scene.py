@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.render.borders import BORDERS, check_border, pad_border
+from kornia_tidy.render.borders import BORDERS, check_border, pad_border, padded_size
 from kornia_tidy.render.layers import assign_layers, check_nodes
-from kornia_tidy.render.repeatable import of_thread
 
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
 LARGEST_REMEMBERED = 1 << 20  # pixels of a defocus map: some 24 MB with their layers
@@ -75,9 +74,6 @@ class LayeredScene:
         sorted_layers: layer index and layer weight of the pixels that are sorted, and
         labels: the same for each image of the batch, without gradients.
         found: planes that were made of the scene, by their names, so that they are made once.
-        grids: the best tiles of each kind for the scene, as far as they were looked for.
-        layout: what else follows from the layers, kept as long as :func:`remembered_scene` remembers them; None for
-            other scenes.
     """
 
     image: Tensor
@@ -91,14 +87,17 @@ class LayeredScene:
     sorted_layers: tuple[Tensor, Tensor | None]
     labels: Labels
     found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
-    grids: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
-    layout: dict[Any, Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
         """Height and width of the rendered image."""
         lost = self.psfs.shape[-1] - 1 if self.border == "valid" else 0
         return self.image.shape[-2] - lost, self.image.shape[-1] - lost
+
+    @property
+    def padded_size(self) -> tuple[int, int]:
+        """Height and width of :attr:`plane`."""
+        return padded_size(*self.image.shape[-2:], self.psfs.shape[-1], self.border)
 
     @property
     def plane(self) -> Tensor:
@@ -222,7 +221,7 @@ def remembered_scene(given: SceneArguments) -> LayeredScene:
     image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate = given
     if defocus.device.type != "cpu" or defocus.numel() > LARGEST_REMEMBERED:
         return assigned_scene(given)
-    options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads(), of_thread.repeatable
+    options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads()
     options += image.dtype, psfs.dtype, defocus.dtype, nodes.dtype
     last = _last.get("scene")  # another thread may put in another one meanwhile
     if (
@@ -231,7 +230,6 @@ def remembered_scene(given: SceneArguments) -> LayeredScene:
         or not (torch.equal(last.defocus, defocus) and torch.equal(last.nodes, nodes))
     ):
         scene = assigned_scene(given)
-        scene = replace(scene, layout={})
         nothing = image.new_empty(0)
         kept = replace(scene, image=nothing, psfs=nothing, stray_light=None, found={})
         _last["scene"] = _Remembered(options, defocus.clone(), nodes.clone(), kept)
@@ -243,7 +241,6 @@ def remembered_scene(given: SceneArguments) -> LayeredScene:
         psfs=(psfs.flip((-2, -1)) if correlate else psfs).to(dtype),
         stray_light=None if stray_light is None else stray_light.to(dtype),
         found={},
-        grids=dict(last.scene.grids),
     )
 
 

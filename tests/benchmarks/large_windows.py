@@ -4,8 +4,8 @@
 linearly on [-20, 20] rad, in 8 nearest layers, float32. Backends take turns. Of each the least processor time of
 ``ROUNDS`` counts, because other programs can only lengthen it.
 
-``transforms`` is the number of transformed samples of the chosen windows, their layers and PSFs, with the logarithms of
-the sides, over that of a round trip: what windows cost if nothing but transforms took time, at its speed.
+``operations`` are those that the backend counts, over those of a round trip: what it costs if nothing but its
+transforms took time, at the speed of a round trip's.
 """
 
 from __future__ import annotations
@@ -13,14 +13,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from math import log2, prod
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.window_sides import needed_side, size_step
-from kornia_tidy.render.backends.tile_plan import BLOCKS, OVERLAPS, TileKind, cheapest_grid
-from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.backend import transform_operations
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import explain
 from kornia_tidy.render.scene import layered_scene
@@ -29,8 +26,7 @@ from tests.render.scenes import Bank
 
 LAYERS, ROUNDS = 8, 3
 WINDOWS = (65, 129, 257, 513)
-LARGEST_DIRECT = 65  # px; direct convolution of larger windows takes many seconds
-KINDS = {"overlap": OVERLAPS, "tiled": BLOCKS}
+METHODS = ("compiled", "tiled", "dense")
 
 
 def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
@@ -42,25 +38,6 @@ def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
             call()
             least[name] = min(least[name], time.process_time() - begun)
     return least
-
-
-def window_transforms(image: Tensor, psi: Tensor, bank: Bank, kind: TileKind) -> str:
-    """Return the transforms of the chosen windows in round trips, and the windows in words."""
-    scene = layered_scene(image, psi, bank.defocus, bank.psfs, layers="nearest")
-    work, grid = cheapest_grid(scene.labels, LAYERS, bank.psfs.shape[-1], kind)
-    side = bank.psfs.shape[-1] - 1
-    plane = prod(next_fast_size(n + side) for n in image.shape[-2:])
-    transforms = (work.blocks + work.pairs + work.layers) * grid.across  # of real numbers; a round trip takes two
-    sides = [grid.size, grid.size]
-    if kind is OVERLAPS:
-        step = size_step(image.dtype)
-        sides = [
-            needed_side(grid.size, n, side + 1, s) for n, s in zip(image.shape[-2:], (step // 2, step), strict=True)
-        ]
-    samples = transforms / 2 * prod(sides) * log2(prod(sides))
-    pixels = f"{grid.across} x {grid.tile}" if grid.across > 1 else grid.tile
-    held = f"{pixels} px in {sides[0]} x {sides[1]}, {work.pairs / work.blocks:.1f} layers"
-    return f"{samples / (plane * log2(plane)):.1f} ({held})"
 
 
 def gradient_calls(image: Tensor, psi: Tensor, bank: Bank, compositing: str, methods: list[str]) -> dict:
@@ -78,25 +55,26 @@ def measure(window: int) -> None:
     image, psi = load_scene("aloe")
     bank = make_bank(LAYERS, window)
     scene = layered_scene(image, psi, bank.defocus, bank.psfs, layers="nearest")
-    print(explain(scene), file=sys.stderr)
-    methods = ["overlap", "tiled", "dense", *(["direct"] if window <= LARGEST_DIRECT else [])]
+    explanation = explain(scene)
+    print(explanation, file=sys.stderr)
     calls: dict[str, Callable[[], object]] = {"round trip": lambda: round_trip(image, psi, bank)}
-    for method in methods:
+    for method in METHODS:
         calls[f"gather, {method}"] = lambda m=method: render(image, psi, bank, layers="nearest", method=m)
-    for method in ("overlap", "tiled", "dense"):
+    for method in METHODS:
         calls[f"scatter, {method}"] = lambda m=method: render(image, psi, bank, "scatter", layers="nearest", method=m)
-    calls |= gradient_calls(image, psi, bank, "gather", ["overlap"])
+    calls |= gradient_calls(image, psi, bank, "gather", ["compiled"])
     times = least_seconds(calls)
     unit = times.pop("round trip")
+    trip = 2 * image.shape[1] * transform_operations(*scene.padded_size)
     for name, seconds in times.items():
-        kind = KINDS.get(name.removeprefix("gather, "))
-        bound = window_transforms(image, psi, bank, kind) if kind else ""
+        work = explanation.works.get(name.removeprefix("gather, "))
+        bound = f"{work.operations / trip:.1f}" if work else ""
         print(f"| {window} | {name} | {1e3 * seconds:.0f} | {seconds / unit:.2f} | {bound} |", flush=True)
 
 
 def main(windows: list[int]) -> None:
     torch.set_num_threads(1)
-    print("| window | call | ms | round trips | transforms |\n|---|---|---|---|---|")
+    print("| window | call | ms | round trips | operations |\n|---|---|---|---|---|")
     for window in windows:
         measure(window)
 

@@ -4,26 +4,19 @@
 PSFs of 61 px, forward and backward to the masks, on the simulated device of the tests, after one step that fills the
 memories. Counted are operators of torch, each for one launch, copies on the device included and views left out; waits
 for a value, and copies from the host, which a CUDA graph cannot hold. The counts are those of any accelerator. They
-depend on the number of layers in the scene for occlusion alone. Rows with Triton are those of a CUDA GPU with
-``KORNIA_TIDY_TRITON=on``, wherever that would be taken: each kernel counts as one launch, and gives zeros here.
+depend on the number of layers in the scene for occlusion alone.
 """
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Generator
-from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from typing import Any, NamedTuple
-from unittest import mock
+from typing import NamedTuple
 
 import torch
 from tqdm import tqdm
 
 from kornia_tidy import Fidelity, SensorNoise, TiDyOptics
-from kornia_tidy.kernels import triton_ops
-from kornia_tidy.render import accelerator_cost
 from tests.simulated_device import SimulatedDevice
 
 BATCH, SIDE, WINDOW = 8, 278, 61
@@ -38,36 +31,10 @@ class Step(NamedTuple):
     uploads: int
 
 
-@contextmanager
-def kernels_counted(device: SimulatedDevice) -> Generator[None]:
-    """Render by the Triton backend, whose kernels do nothing but count and give zeros.
-
-    Args:
-        device: that counts.
-    """
-
-    def launch(name: str, programs: int, *arguments: Any) -> None:
-        device.launches += 1
-        device.callers["launches", name] += 1
-        for tensor in arguments:
-            if torch.is_tensor(tensor) and tensor.is_floating_point():
-                out = tensor  # the last one
-        out.on_cpu.zero_()
-
-    allowed = mock.patch.dict(os.environ, {"KORNIA_TIDY_TRITON": "on"})
-    able, taken = (
-        mock.patch.object(triton_ops, "objection", return_value=None),
-        mock.patch.object(accelerator_cost, "GAIN", 0),
-    )
-    with allowed, able, taken, mock.patch.object(triton_ops, "launch", launch):
-        yield
-
-
 def step_counts(
     compositing: str,
     *,
     fixed: bool,
-    triton: bool = False,
     batch: int = BATCH,
     side: int = SIDE,
     window: int = WINDOW,
@@ -78,7 +45,6 @@ def step_counts(
     Args:
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         fixed: take the camera with fixed layers.
-        triton: take the Triton backend.
         batch: images.
         side: of the images in pixels.
         window: of the PSFs in pixels.
@@ -87,7 +53,7 @@ def step_counts(
     fidelity = replace(Fidelity.of("balanced"), window=window)
     optics = TiDyOptics(fidelity=fidelity, compositing=compositing, sensor=SensorNoise(0.01))
     counts = []
-    with SimulatedDevice() as device, kernels_counted(device) if triton else nullcontext():
+    with SimulatedDevice() as device:
         camera = device.put(optics.with_fixed_layers() if fixed else optics)
         for _ in range(steps):
             image = device.put(torch.rand(batch, 3, side, side))
@@ -101,18 +67,14 @@ def step_counts(
 
 
 def main(compositings: list[str]) -> None:
-    """Print a row for each compositing: layers of the scene, with and without Triton, and fixed layers."""
+    """Print a row for each compositing: layers of the scene, and fixed layers."""
     torch.manual_seed(0)
     print(f"{BATCH} x 3 x {SIDE} x {SIDE}, five masks, PSFs of {WINDOW} px, forward and backward, second step")
-    print(f"{'compositing':12} {'layers':20} {'launches':>8} {'waits':>6} {'uploads':>8}")
+    print(f"{'compositing':12} {'layers':8} {'launches':>8} {'waits':>6} {'uploads':>8}")
     for compositing in tqdm(compositings or COMPOSITINGS, leave=False):
-        for layers, fixed, triton in (
-            ("of scene", False, False),
-            ("fixed", True, False),
-            ("of scene, Triton", False, True),
-        ):
-            last = step_counts(compositing, fixed=fixed, triton=triton)[-1]
-            tqdm.write(f"{compositing:12} {layers:20} {last.launches:8d} {last.waits:6d} {last.uploads:8d}")
+        for layers, fixed in (("of scene", False), ("fixed", True)):
+            last = step_counts(compositing, fixed=fixed)[-1]
+            tqdm.write(f"{compositing:12} {layers:8} {last.launches:8d} {last.waits:6d} {last.uploads:8d}")
 
 
 if __name__ == "__main__":

@@ -23,13 +23,20 @@ class TestExplain(BaseTester):
         )
         image, depth = _scene()
         explanation, psi = optics.explain(image, depth), optics.defocus(depth)
-        assert set(explanation.seconds) | set(explanation.objections) == set(dispatch.BACKENDS)
+        assert set(explanation.works) | set(explanation.objections) == set(dispatch.BACKENDS)
         assert str(explanation).startswith(f"{explanation.scene}: {explanation.backend}")
         with torch.no_grad():
             bank = optics.psf_model.scene_bank(3, torch.float32, psi)
-            named = {name: render(image, psi, bank, compositing, method=name) for name in explanation.seconds}
+            named = {name: render(image, psi, bank, compositing, method=name) for name in explanation.works}
             assert torch.equal(optics(image, depth), named[explanation.backend])
-        assert explanation.backend == min(explanation.seconds, key=explanation.seconds.__getitem__)
+
+    def test_feature_states_that_are_rendered_one_by_one_are_pieces(self):
+        options = {"fidelity": Fidelity(window=9), "sensor": None}
+        image, depth = _scene()
+        cameras = (TiDyOptics(PixelwiseMask(3), compositing=way, **options) for way in ("occlusion", "gather"))
+        hiding, other = (optics.explain(image, depth).scene for optics in cameras)
+        assert hiding.endswith(", the first of 3 pieces")
+        assert "pieces" not in other
 
     def test_cardinality_images_without_a_batch(self):
         optics = TiDyOptics(PixelwiseMask(1), fidelity=Fidelity(window=9))

@@ -12,7 +12,7 @@ from torch.func import functional_call, grad, jacrev, jvp, vmap
 
 from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render.backends.direct import SOURCE
+from kornia_tidy.kernels.occlusion_ops import SOURCE
 from kornia_tidy.render.compositing import COMPOSITING
 from tests.base import BaseTester
 
@@ -133,12 +133,12 @@ class TestSecondDerivatives(BaseTester):
             self.assert_close(product, expected, rtol=0, atol=1e-4 * scale)
 
     @pytest.mark.parametrize("layers", ["linear", "nearest"])
-    @pytest.mark.parametrize("way", ["direct", "tiled"])
+    @pytest.mark.parametrize("way", ["compiled", "tiled", "batched"])
     @over_compositing
     def test_gradgradcheck(self, compositing, way, layers):
-        """Of image, defocus, PSFs and veil, by tiles and, where there is a compiler, directly."""
-        if way == "direct" and (compositing == "scatter" or compiled(SOURCE, torch.float64) is None):
-            pytest.skip("there is no direct way")
+        """Of image, defocus, PSFs and veil."""
+        if way == "compiled" and compiled(SOURCE, torch.float64) is None:
+            pytest.skip("there is no C compiler")
         image, psfs = torch.rand(1, 1, 8, 16).double(), torch.rand(3, 1, 3, 3).double()
         defocus = torch.tensor([-4.5, -1.0, 2.2, 3.9]).double()[torch.randint(4, (1, 1, 8, 16))]
         nodes, veil = torch.tensor([-5.0, 0.0, 5.0]).double(), 0.1 * torch.rand(3, 1).double()

@@ -80,11 +80,9 @@ class _Scene:
 
 
 def gather(draw: random.Random) -> Call:
-    """``mix`` and ``count_pairs`` of direct.c."""
+    """``mix`` of direct.c."""
     scene = _gathered(draw)
     weight_gradient = scene.fraction is not None and draw.random() < 0.5
-    pairs = gather_ops.count_pairs(scene.lower, scene.fraction, scene.light.dtype, 1)
-    assert pairs >= 0, scene.about
 
     def truth() -> tuple[Tensor, Tensor]:
         weights = _weights(scene, gradient=weight_gradient)
@@ -193,8 +191,7 @@ def occlude(draw: random.Random) -> Call:
     share = None if fraction is None else pad_border(fraction[:, None], radius, border)[:, 0]
     inside = pad_border(torch.ones(1, 1, height, width, dtype=dtype), radius, border)[0] if border == "zero" else None
     mean = None if veil is None else image.mean((-2, -1))
-    counts = occlusion_ops.count_work(plane, psfs, below, share, bands=12)
-    assert min(counts) >= 0, about
+    assert occlusion_ops.count_operations(below, share, psfs, images) >= 0, about
     seen = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
 
     def truth() -> tuple[Tensor, float]:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from kornia_tidy.kernels.gather_ops import SOURCE, count_pairs, gather_direct, gather_direct_psf_gradient
+from kornia_tidy.kernels.gather_ops import SOURCE, gather_direct, gather_direct_psf_gradient
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
 
@@ -100,14 +100,6 @@ class TestGatherDirect(OperatorTester):
     def test_exception(self, changes, error, words):
         with pytest.raises(error, match=words):
             gather_direct(**scene(**changes))
-
-    @needs_compiler
-    def test_feature_pairs_are_the_layers_that_strips_contain(self, dtype):
-        """Counted pixel by pixel."""
-        lanes = 64 // dtype.itemsize
-        index = torch.randint(5, (1, 4, 4 * lanes))
-        expected = sum(len(strip.unique()) for strip in index[0].split(lanes, dim=1))
-        assert count_pairs(index, None, dtype, 1) == expected
 
 
 class TestGatherDirectPsfGradient(OperatorTester):

@@ -56,16 +56,6 @@ class TestVectors(CompiledTester):
             assert f"-{width}-" in build(source, torch.float32).path.name
         assert len(list(folder.iterdir())) == len(TARGETS)
 
-    @on_x86
-    def test_feature_another_width_has_other_costs(self, tmp_path, monkeypatch):
-        from kornia_tidy.render.cost_store import profile_path
-
-        paths = set()
-        for target in TARGETS.values():
-            self.compiler_for(target, tmp_path, monkeypatch)
-            paths.add(profile_path(threads=1))
-        assert len(paths) == len(TARGETS)
-
     @pytest.mark.slow
     @pytest.mark.parametrize("width", widths_here())
     def test_feature_every_width_gives_the_numbers_of_the_definition(self, width, monkeypatch):

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from kornia_tidy.kernels import build as module
-from kornia_tidy.kernels.build import CompiledCodeWarning, build, compiled, maker
+from kornia_tidy.kernels.build import CompiledCodeWarning, build, compiled
 from kornia_tidy.kernels.gather_ops import SOURCE
 from kornia_tidy.kernels.make_libraries import make_library
 from kornia_tidy.kernels.processor import LEVELS, levels, levels_here
@@ -133,15 +133,6 @@ class TestWheel(WheelTester):
         monkeypatch.setenv("CC", "false")
         assert compiled(source, torch.float64).rank() >= 0
         assert build(source, torch.float64).remark == "the C compiler false failed (status 1): no word"
-
-    def test_feature_costs_are_kept_by_what_is_in_use(self, wheel, monkeypatch):
-        """Times of the wheel's libraries are not those of libraries that were compiled here."""
-        assert maker().startswith("cc ")
-        monkeypatch.setattr(module, "KERNELS", wheel.parent)
-        assert maker() == levels_here()[0]
-        monkeypatch.setenv("CC", "false")
-        forget()
-        assert maker() == levels_here()[0]
 
 
 class TestThreads(WheelTester):

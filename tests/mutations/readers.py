@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +28,6 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.picture_header import check_header
 from kornia_tidy.data.rgbd_folder import described_folder
 from kornia_tidy.figures.learning_curve import draw_learning_curve
-from kornia_tidy.files import read_json
 from kornia_tidy.inference.hub import from_pretrained, save_pretrained
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state
@@ -42,7 +40,6 @@ from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
 from kornia_tidy.raw.tags import camera_tags, kodak_matrix, tiff_directories
 from kornia_tidy.reconstruction.midas_small import load_midas_small
-from kornia_tidy.render.cost_profile import EPYC, CostProfile
 from kornia_tidy.tradeoff import TradeRun
 from kornia_tidy.tradeoff import files as trade_files
 from kornia_tidy.training.callbacks import drop_rows_after
@@ -209,7 +206,7 @@ def _from_folder(path: Path) -> object:
 
 
 def _calibrations(folder: Path) -> list[Case]:
-    """Calibrations, noise profiles, trade-offs, cost profiles and design records."""
+    """Calibrations, noise profiles, trade-offs and design records."""
     folder.mkdir()
     (folder / "calib.txt").write_text("cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n")
     (folder / "calib.json").write_text('{"focal_px": 3997.5, "baseline_m": 0.1935, "doffs_px": 131.25}')
@@ -220,7 +217,6 @@ def _calibrations(folder: Path) -> list[Case]:
     write_json(folder / "noise.json", noise)
     trade_files.write_json(folder / "trade.json", TradeRun(CONDITIONS, (ROW,)))
     trade_files.write_csv(folder / "trade.csv", [ROW])
-    (folder / "costs.json").write_text(json.dumps(EPYC.as_json()))
     DesignMemory(folder / "design.json", {"f_number": 4}).candidate("a", lambda: CANDIDATE)
     return [
         Case("calibration", "text", folder / "calib.txt", read_calibration),
@@ -228,13 +224,8 @@ def _calibrations(folder: Path) -> list[Case]:
         Case("noise", "json", folder / "noise.json", lambda path: read_noise(path).sensor_noise()),
         Case("trade", "json", folder / "trade.json", trade_files.read_json),
         Case("trade", "text", folder / "trade.csv", trade_files.read_csv),
-        Case("costs", "json", folder / "costs.json", _cost_profile),
         Case("design", "json", folder / "design.json", _design),
     ]
-
-
-def _cost_profile(path: Path) -> CostProfile:
-    return CostProfile.from_json(read_json(path))
 
 
 def _design(path: Path) -> object:

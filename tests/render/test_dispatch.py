@@ -7,31 +7,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy.kernels import triton_ops
+from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render import accelerator_cost
-from kornia_tidy.render.backends import direct, direct_occlusion
+from kornia_tidy.render import dispatch
 from kornia_tidy.render.compositing import COMPOSITING, render
-from kornia_tidy.render.cost_model import seconds_of
-from kornia_tidy.render.cost_store import settled_profile
-from kornia_tidy.render.dispatch import (
-    BACKENDS,
-    LARGEST_PLANE,
-    METHODS,
-    NAMED,
-    choose,
-    explain,
-    memory_objection,
-    render_scene,
-)
+from kornia_tidy.render.dispatch import BACKENDS, METHODS, choose, explain, render_scene
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
 from tests.simulated_device import SimulatedDevice
 
 needs_compiler = pytest.mark.skipif(
-    any(compiled(source, torch.float32) is None for source in (direct.SOURCE, direct_occlusion.SOURCE)),
-    reason="no C compiler on this machine: nothing is rendered directly",
+    any(compiled(source, torch.float32) is None for source in (gather_ops.SOURCE, occlusion_ops.SOURCE)),
+    reason="no C compiler on this machine: nothing is rendered in C",
 )
 over_compositing = pytest.mark.parametrize("compositing", COMPOSITING)
 
@@ -43,46 +31,69 @@ def scene_of(compositing="gather", layers=6, psf_size=9, height=40, width=60, **
 
 
 class TestChoose(BaseTester):
+    @needs_compiler
     @over_compositing
-    def test_smoke_auto_takes_the_least_time_of_those_that_support_the_scene(self, compositing):
-        for psf_size in (3, 9, 31):
-            scene = scene_of(compositing, psf_size=psf_size)
-            explanation = explain(scene)
-            assert choose(scene).name == explanation.backend == min(explanation.seconds, key=explanation.seconds.get)
-
-    @over_compositing
-    def test_feature_a_lower_bound_of_the_time_is_one(self, compositing):
-        """Of scenes of one layer and of noise, however large the PSFs are."""
+    def test_feature_processors_take_compiled_code(self, compositing):
         for psf_size in (1, 9, 31):
-            for layers in (1, 6):
-                scene = scene_of(compositing, layers, psf_size, 80, 120)
-                for backend in BACKENDS.values():
-                    if backend.refusal(scene) is None:
-                        own = seconds_of(backend.work(scene), settled_profile())
-                        for bound in backend.bounds(scene):
-                            assert 0 <= seconds_of(bound, settled_profile()) <= own * (1 + 1e-6)
+            assert choose(scene_of(compositing, psf_size=psf_size)).name == "compiled"
 
-    @pytest.mark.parametrize("method", [m for m in METHODS if m != "triton"])  # its interpreter would take a minute
+    @over_compositing
+    def test_feature_processors_without_a_compiler_take_tiles(self, compositing, monkeypatch):
+        monkeypatch.setattr("kornia_tidy.render.backends.compiled.compiled", lambda source, dtype: None)
+        scene = scene_of(compositing)
+        assert choose(scene).name == "tiled"
+        assert explain(scene).objections == {"compiled": "it needs a C compiler (see `kornia-tidy info`)"}
+        with pytest.raises(ValueError, match=r"method 'compiled' does not support this scene: it needs a C compiler"):
+            choose(scene, "compiled")
+
+    @over_compositing
+    def test_feature_accelerators_take_all_layers_at_once_while_they_are_few_samples(self, compositing, monkeypatch):
+        with SimulatedDevice() as device:
+            bank = make_bank(6, 1, 9, dtype=torch.float32)
+            tensors = (*make_scene(bank, 2, 40, 60), bank.defocus, bank.psfs)
+            scene = layered_scene(*map(device.put, tensors), compositing=compositing)
+            assert choose(scene).name == "batched"
+            monkeypatch.setattr(dispatch, "MOST_SAMPLES", 2 * 6 * 48 * 68)
+            assert choose(scene).name == "batched"
+            monkeypatch.setattr(dispatch, "MOST_SAMPLES", 2 * 6 * 48 * 68 - 1)
+            assert choose(scene).name == "tiled"
+
+    def test_feature_large_psfs_with_occlusion_go_densely_while_memory_is_small(self, monkeypatch):
+        scene = scene_of("occlusion", 3, 67, 70, 80)
+        assert choose(scene).name == "dense"
+        assert choose(scene_of("gather", 3, 67, 70, 80)).name != "dense"
+        recorded = replace(scene, psfs=scene.psfs.clone().requires_grad_())
+        assert choose(recorded).name != "dense"
+        with torch.no_grad():
+            assert choose(recorded).name == "dense"
+        monkeypatch.setattr(dispatch, "LARGEST_PLANE", 8 * scene.image.numel() - 1)
+        assert choose(scene).name != "dense"
+
+    @pytest.mark.parametrize("method", METHODS)
     @over_compositing
     def test_feature_the_named_backend_renders(self, compositing, method):
         bank = make_bank(6, 3, 9, dtype=torch.float32)
         image, defocus = make_scene(bank, 1, 40, 60)
         scene = layered_scene(image, defocus, bank.defocus, bank.psfs, compositing=compositing)
         expected = explain(scene).backend if method == "auto" else method
-        if (why := NAMED[expected].refusal(scene)) is not None:
+        if (why := BACKENDS[expected].refusal(scene)) is not None:
             pytest.skip(why)
-        coded = render_scene(scene, NAMED[expected])
+        coded = render_scene(scene, BACKENDS[expected])
         assert torch.equal(render(image, defocus, bank, compositing, method=method), coded)
 
     def test_exception_unknown_method(self):
         bank = make_bank()
-        message = (
-            "method must be one of 'auto', 'direct', 'overlap', 'tiled', 'dense', 'batched', 'triton', got 'sparse'"
-        )
+        message = "method must be one of 'auto', 'dense', 'compiled', 'tiled', 'batched', got 'sparse'"
         with pytest.raises(ValueError, match=message):
             render(*make_scene(bank), bank, method="sparse")
 
-    @pytest.mark.parametrize("method", ["direct", "overlap", "tiled"])
+    @pytest.mark.parametrize(("old", "new"), [("direct", "compiled"), ("overlap", "compiled"), ("triton", "batched")])
+    def test_exception_a_method_of_before_names_the_one_that_took_its_place(self, old, new):
+        bank = make_bank()
+        with pytest.raises(ValueError, match=f"^method '{old}' is now '{new}', or 'auto' .*"):
+            render(*make_scene(bank), bank, method=old)
+
+    @pytest.mark.parametrize("method", [name for name in BACKENDS if name != "dense"])
     @over_compositing
     def test_exception_a_transform_of_torch_needs_dense(self, compositing, method):
         bank = make_bank(3, 1, 3)
@@ -96,101 +107,20 @@ class TestChoose(BaseTester):
             torch.func.grad(total)(image, method)
         self.assert_close(torch.func.grad(total)(image, "auto"), torch.func.grad(total)(image, "dense"), rtol=0, atol=0)
 
-    def test_feature_auto_keeps_its_memory_small(self):
-        """Dense is passed over where gradients are wanted, and for large images."""
-        scene = scene_of("scatter", 2, 31, 32, 32)
-        assert memory_objection(scene) is None
-        recorded = replace(scene, psfs=scene.psfs.clone().requires_grad_(), grids={})
-        assert choose(recorded).name != "dense"
-        assert "a spectrum for each layer" in explain(recorded).objections["dense"]
-        with torch.no_grad():
-            assert memory_objection(recorded) is None
-        large = scene_of("scatter", 1, 1, LARGEST_PLANE // 12 // 2048 + 1, 2048)
-        assert "a dozen planes" in explain(large).objections["dense"]
-        assert choose(large).name != "dense"
-
-    def test_feature_a_choice_is_remembered_for_the_same_layers_and_for_no_others(self):
-        """With the tiles, which take as long to choose as a small image to render."""
-        flat, nodes = torch.zeros(1, 1, 200, 300), torch.arange(20.0)
-        ramp = torch.linspace(0, 19, 300).expand(flat.shape)
-        image = torch.rand(1, 1, 200, 300)
-        psfs = torch.rand(20, 1, 23, 23).requires_grad_()  # dense is no choice, whose time needs no tiles
-        sizes = []
-        for psi in (flat, ramp, flat):
-            first, again = (
-                layered_scene(image, psi, nodes, psfs, compositing="scatter", layers="nearest") for _ in range(2)
-            )
-            assert choose(first) is choose(again)
-            assert first.grids == again.grids
-            sizes.append([grid.size for grid in first.grids.values()])
-            assert torch.equal(render_scene(first), render_scene(again))
-        assert all(sizes)
-        assert sizes[0] == sizes[2] != sizes[1]
-
-    def test_feature_dense_is_taken_where_psfs_are_as_large_as_the_image(self):
-        """Tiles would each hold all layers and be as large as the image."""
-        assert choose(scene_of("scatter", 6, 63, 64, 64)).name == "dense"
-
-    @needs_compiler
-    @over_compositing
-    def test_feature_backends_agree(self, compositing):
-        scene = scene_of(compositing)
-        coded = [render_scene(scene, b).double() for b in BACKENDS.values() if b.refusal(scene) is None]
-        assert len(coded) == {"gather": 4, "scatter": 3, "occlusion": 3}[compositing]
-        for other in coded[1:]:
-            self.assert_close(other, coded[0], rtol=0, atol=2e-5)
-
-
-class TestTriton(BaseTester):
-    """On the simulated accelerator, which is taken for a GPU with Triton."""
-
-    @pytest.fixture
-    def scene_with(self, monkeypatch):
-        monkeypatch.setattr(triton_ops, "objection", lambda device: None)
-
-        def scene_with(psf_size: int, device: SimulatedDevice):
-            bank = make_bank(6, 1, psf_size, dtype=torch.float32)
-            image, defocus = make_scene(bank, 2, 120, 120)
-            tensors = image, defocus, bank.defocus, bank.psfs
-            return layered_scene(*map(device.put, tensors), compositing="gather")
-
-        return scene_with
-
-    def test_feature_auto_takes_it_where_it_is_allowed_and_its_psfs_are_small(self, scene_with, monkeypatch):
-        monkeypatch.setattr(accelerator_cost, "GAIN", 1.5)  # small scenes are bound by launches
-        with SimulatedDevice() as device:
-            assert choose(scene_with(3, device)).name == "batched"
-            monkeypatch.setenv("KORNIA_TIDY_TRITON", "on")
-            assert [choose(scene_with(size, device)).name for size in (3, 61)] == ["triton", "batched"]
-
-    def test_feature_it_is_not_taken_where_it_does_not_run(self, scene_with, monkeypatch):
-        monkeypatch.setattr(accelerator_cost, "GAIN", 1.5)
-        monkeypatch.setenv("KORNIA_TIDY_TRITON", "on")
-        with SimulatedDevice() as device:
-            scene = scene_with(3, device)
-            monkeypatch.setattr(triton_ops, "objection", lambda device: "there is no Triton")
-            assert choose(scene).name == "batched"
-
-    def test_smoke_explain_says_that_it_was_not_measured(self, scene_with):
-        with SimulatedDevice() as device:
-            explanation = explain(scene_with(3, device))
-        assert explanation.backend == "batched"
-        assert 0 < explanation.seconds["triton"] < explanation.seconds["batched"]
-        assert "never measured on a GPU" in explanation.objections["triton"]
-
 
 class TestExplain(BaseTester):
-    def test_smoke_it_says_what_is_chosen_and_why(self):
-        scene = scene_of("scatter", psf_size=31)
-        explanation = explain(scene)
+    @needs_compiler
+    def test_smoke_it_says_what_is_chosen_and_what_it_takes(self):
+        explanation = explain(scene_of("scatter", psf_size=31))
         lines = str(explanation).splitlines()
-        assert lines[0].startswith("scatter of 1 x 3 channels of 40x60 px, 6 of 6 layers, PSFs of 31x31 px, ")
-        assert lines[0].endswith(f": {explanation.backend}")
-        assert lines[1].startswith(f"  {explanation.backend}: about ")
-        assert "  direct: direct convolution gathers light and does not scatter it" in lines
+        assert lines[0] == "scatter of 1 x 3 channels of 40x60 px, 6 of 6 layers, PSFs of 31x31 px: compiled"
+        assert lines[1] == f"  compiled: {explanation.works['compiled']}"
+        assert lines[1].startswith("  compiled: windows of 96 px, ")
+        assert " operations, " in lines[1]
+        assert lines[1].endswith(" MiB")
 
-    def test_feature_every_backend_has_a_time_or_an_objection(self):
+    def test_feature_every_backend_has_its_work_or_an_objection(self):
         for compositing in COMPOSITING:
-            explanation = explain(scene_of(compositing))
-            assert explanation.seconds.keys() | explanation.objections.keys() == set(BACKENDS)
-            assert all(seconds > 0 for seconds in explanation.seconds.values())
+            explanation = explain(scene_of(compositing, psf_size=3))
+            assert explanation.works.keys() | explanation.objections.keys() == set(BACKENDS)
+            assert all(work.operations > 0 and work.memory > 0 for work in explanation.works.values())

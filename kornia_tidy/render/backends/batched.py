@@ -7,21 +7,18 @@ hand, of spectra that are computed again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
+from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends.batched_occlusion import occlude_batched, occlusion_gradients
+from kornia_tidy.render.backends.dense import dense_work
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
-from kornia_tidy.render.cost_model import Work
 from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
 PART_BYTES = 672 << 20  # that the planes of all layers of the images worked on together may take
-MOST_SAMPLES = 1 << 28  # of all planes: beyond, transforms take longer than launches, and tiles skip absent layers
 
 
 class BatchedBackend:
@@ -33,18 +30,8 @@ class BatchedBackend:
         """Return None: it supports every scene."""
 
     def work(self, scene: LayeredScene) -> Work:
-        """Raise: it is chosen by the number of samples, since its time on no accelerator was measured."""
-        raise NotImplementedError("the work of the batched backend is not estimated")
-
-    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
-        """Raise as :meth:`work` does."""
-        raise NotImplementedError("the work of the batched backend is not estimated")
-
-    def samples(self, scene: LayeredScene) -> int:
-        """Return the number of samples of the planes of all layers."""
-        batch, channels, height, width = scene.image.shape
-        reach = 0 if scene.border == "valid" else scene.psfs.shape[-1] - 1
-        return batch * channels * len(scene.psfs) * (height + reach) * (width + reach)
+        """Return the work for all layers of the bank."""
+        return dense_work(scene, len(scene.psfs), at_once=len(scene.psfs))
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64 where the device has it."""

@@ -6,18 +6,18 @@ differentiated in turn is made by this backend instead.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backend import GradientPairs, gradient_pairs
+from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations
 from kornia_tidy.render.backends.dense_occlusion import occlude_dense, occlusion_planes
-from kornia_tidy.render.borders import from_spectrum, padded_size, to_spectrum
-from kornia_tidy.render.cost_model import DenseOcclusionWork, DenseWork, Work
+from kornia_tidy.render.borders import from_spectrum, to_spectrum
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
+
+_PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy
 
 
 class DenseBackend:
@@ -29,12 +29,8 @@ class DenseBackend:
         """Return None: it supports every scene."""
 
     def work(self, scene: LayeredScene) -> Work:
-        """Return the work for the layers in a sample of the scene's pixels."""
-        return _work(scene, scene.sampled_layers)
-
-    def bounds(self, scene: LayeredScene) -> Iterator[Work]:
-        """Yield the work for a scene of one layer."""
-        yield _work(scene, 1)
+        """Return the work for the layers in every eighth row and column of the scene."""
+        return dense_work(scene, scene.sampled_layers, at_once=1)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64."""
@@ -125,11 +121,20 @@ def differentiable_gradients(
     return [next(found) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
-def _work(scene: LayeredScene, layers: int) -> Work:
-    batch, channels, height, width = scene.image.shape
-    height, width = padded_size(height, width, scene.psfs.shape[-1], scene.border)
-    pixels = batch * math.prod(scene.output_size)
-    if scene.compositing == "occlusion":
-        return DenseOcclusionWork(height, width, layers, pixels, batch, channels)
-    blended, itemsize = 1 if scene.layer_weight is None else 2, scene.image.element_size()
-    return DenseWork(height, width, layers, pixels, blended, batch, channels, itemsize)
+def dense_work(scene: LayeredScene, layers: int, at_once: int) -> Work:
+    """Return the work of transforms of the whole plane.
+
+    Args:
+        scene: to be rendered.
+        layers: that are convolved.
+        at_once: layers whose planes are in memory together.
+    """
+    (batch, channels), (height, width) = scene.image.shape[:2], scene.padded_size
+    occludes, itemsize = scene.compositing == "occlusion", scene.image.element_size()
+    samples, transform = batch * channels * height * width, transform_operations(height, width)
+    memory = 2 * samples * itemsize + (4 if occludes else 2) * 8 * scene.labels.layer_index.numel()
+    memory += (_PLANES + at_once - 1) * samples * (2 * 8 if occludes else itemsize)
+    if not occludes:
+        return Work(channels * (batch + layers * (batch + 1)) * transform, memory)
+    # For each layer the spectra of its light, two weights and its PSF, and three products back, in float64.
+    return Work(2 * layers * (channels + batch * (4 * channels + 2)) * transform, memory)

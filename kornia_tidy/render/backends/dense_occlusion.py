@@ -6,7 +6,7 @@ behind, scatter darkens or brightens the seam. Here layers of blurred opacity ar
 A pixel takes light from a layer through a quotient, and where it sees little of a layer the divisor is small: the
 round-off of a transform in float32, some 1e-7, would be divided by as little as ``EPSILON``. So layers are blurred in
 float64 whatever the type of the image. Direct sums need not be, see
-:mod:`kornia_tidy.render.backends.direct_occlusion`.
+:mod:`kornia_tidy.render.backends.compiled`.
 """
 
 from __future__ import annotations

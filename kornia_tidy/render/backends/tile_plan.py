@@ -1,27 +1,20 @@
 """Tiles: how a plane is cut into pieces that each meet only the layers they contain.
 
 Seen through PSFs of P pixels, a tile needs a window of ``size = tile + P - 1`` pixels a side, which is transformed.
-Larger tiles waste less on their overlap, smaller ones hold fewer layers: the grid with the lowest cost is chosen from a
-sample of the scene's labels. Gather and scatter work on blocks of two tiles (:data:`BLOCKS`), in C on single ones
-(:data:`OVERLAPS`), occlusion on single windows (:data:`WINDOWS`).
+Larger tiles waste less on their overlap, smaller ones hold fewer layers: windows have some 2.5 P pixels a side. Gather
+and scatter work on blocks of two tiles (:data:`BLOCKS`), occlusion on single windows (:data:`WINDOWS`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.render.cost_model import OverlapWork, TiledOcclusionWork, TiledWork, seconds_of
-from kornia_tidy.render.cost_profile import CostProfile
-from kornia_tidy.render.cost_store import settled_profile
-from kornia_tidy.render.scene import SAMPLE, Labels
-
-TileWork = TiledWork | TiledOcclusionWork
+from kornia_tidy.render.scene import Labels
 
 
 @dataclass(frozen=True)
@@ -29,52 +22,34 @@ class TileKind:
     """Sizes and limits of the tiles of gather and scatter, or of occlusion.
 
     Args:
-        sizes: sides of windows to choose from, in samples.
-        candidates: how many of them are tried at most.
+        sizes: sides of windows with fast transforms, ascending, in samples.
         across: tiles that stand side by side in a block.
         windowed: a layer counts wherever it lies in the window, not only in the tile.
         chunk_bytes: that the planes of a chunk may take on a processor, near its cache (see allocator.py), and
         accelerator_bytes: on an accelerator, enough to keep it busy.
-        every: sides are multiples of it.
-        work: what the work of gather and scatter is counted as.
     """
 
     sizes: tuple[int, ...]
-    candidates: int
     across: int
     windowed: bool
     chunk_bytes: int
     accelerator_bytes: int = 256 << 20
-    every: int = 1
-    work: type[TiledWork] = TiledWork
 
 
 # A block is two tiles: the left window is the real and the right one the imaginary part of a complex plane, so that one
-# transform serves both. The sizes are those with the fastest transforms. Bytes are those of one channel.
+# transform serves both. Bytes are those of one channel. Smaller windows are slower by what each call takes.
 BLOCKS = TileKind(
     sizes=(
-        *(8, 12, 16, 24, 32, 48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384),
-        *(512, 576, 768, 1024, 1536, 2048),
+        *(48, 64, 72, 80, 96, 112, 128, 144, 160, 192, 200, 216, 240, 256, 288, 320, 384, 512, 576, 768, 1024),
+        *(1536, 2048),
     ),
-    candidates=8,
     across=2,
     windowed=False,
     chunk_bytes=5 << 20,
 )
-# Transforms in C, of vectors of rows and of columns. Nothing is held but a window and the spectra of the PSFs.
-OVERLAPS = TileKind(
-    sizes=tuple(32 * n for n in range(1, 65) if next_fast_size(n) == n),
-    candidates=8,
-    across=1,
-    windowed=False,
-    chunk_bytes=0,
-    every=32,
-    work=OverlapWork,
-)
 # With occlusion the neighbours of a tile emit and hide light in it. Bytes are those of all channels.
 WINDOWS = TileKind(
-    sizes=(16, 24, 32, 36, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024),
-    candidates=17,
+    sizes=(32, 48, 64, 72, 96, 128, 144, 192, 256, 288, 384, 512, 768, 1024),
     across=1,
     windowed=True,
     chunk_bytes=4 << 20,
@@ -108,6 +83,26 @@ class Grid:
     rows: int
     columns: int
     spare: tuple[int, int]
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], psf_size: int, size: int, kind: TileKind | None = None) -> Grid:
+        """Return the grid of the fewest blocks with windows of a size; where overlap is free, of no larger tiles.
+
+        Args:
+            shape: of the output, (B, H, W).
+            psf_size: side P of the PSFs.
+            size: side of the windows in samples.
+            kind: of the tiles. Default: single tiles with the layers in them.
+        """
+        batch, height, width = shape
+        across, windowed = (1, False) if kind is None else (kind.across, kind.windowed)
+        tile, reach = size - psf_size + 1, psf_size - 1 if windowed else 0
+        rows, columns = math.ceil(height / tile), math.ceil(width / (across * tile))
+        if not windowed:
+            tile = min(tile, max(math.ceil(height / rows), math.ceil(width / (across * columns)), (size + 1) // 2))
+            rows, columns = math.ceil(height / tile), math.ceil(width / (across * tile))
+        spare = rows * tile - height, columns * across * tile - width
+        return cls(batch, height, width, size, tile, across, reach, rows, columns, spare)
 
     @property
     def blocks(self) -> int:
@@ -153,89 +148,23 @@ class Grid:
         return (pixels - own * block < self.reach) & (own > 0)
 
 
-def choose_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind = BLOCKS) -> Grid:
-    """Return the grid with the lowest cost, see :func:`cheapest_grid`."""
-    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
-    return grids[0] if len(grids) == 1 else cheapest_grid(labels, layers, psf_size, kind)[1]
-
-
-def cheapest_grid(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> tuple[TileWork, Grid]:
-    """Return the work of the grid that takes the least time, in float32 and for one channel, and the grid.
-
-    The layers of each candidate's blocks are found on every eighth row and column.
+def tile_grid(shape: tuple[int, ...], psf_size: int, kind: TileKind) -> Grid:
+    """Return the tiles for labels of a shape (B, H, W), in windows of some 2.5 P pixels and no larger than needed.
 
     Args:
-        labels: of all pixels of the scene.
-        layers: number of layers D.
+        shape: of the labels: of the pixels, for a windowed kind of their windows.
         psf_size: side P of the PSFs.
         kind: of the tiles.
+
+    Example:
+        >>> tile_grid((1, 500, 600), 23, BLOCKS).size, tile_grid((1, 20, 30), 23, BLOCKS).size
+        (64, 48)
     """
-    grids, blended = (
-        candidates(tuple(labels.layer_index.shape), psf_size, kind),
-        1 if labels.layer_weight is None else 2,
-    )
-    sample = labels.every(SAMPLE)
-    works = _works(grids, [grid.present(sample, layers, SAMPLE) for grid in grids], blended, kind)
-    return _cheapest(works, grids, settled_profile())
-
-
-@lru_cache(maxsize=256)
-def least_work(shape: tuple[int, ...], psf_size: int, blended: int, kind: TileKind, profile: CostProfile) -> TileWork:
-    """Return the work for labels of a shape with one layer in each block, in float32 and for one channel."""
-    grids = candidates(shape, psf_size, kind)
-    works = _works(grids, [torch.ones(grid.blocks, 1, dtype=torch.bool) for grid in grids], blended, kind)
-    return _cheapest(works, grids, profile)[0]
-
-
-def least_windows(labels: Labels, layers: int, psf_size: int, kind: TileKind) -> TileWork:
-    """Return the work where larger windows hold no more layers than the smallest ones do on average."""
-    grids = candidates(tuple(labels.layer_index.shape), psf_size, kind)
-    held = float(grids[0].present(labels.every(SAMPLE), layers, SAMPLE).sum(1).double().mean())
-    few = max(1, int(held))  # some windows hold so many, the rest one more
-    works = []
-    for grid in grids:
-        more = int((held - few) * grid.blocks) if held > few else 0
-        counts = (*(0 for _ in range(few)), grid.blocks - more, more)
-        works.append(TiledOcclusionWork(grid.size, counts, grid.batch * grid.height * grid.width))
-    return _cheapest(works, grids, settled_profile())[0]
-
-
-def candidates(shape: tuple[int, ...], psf_size: int, kind: TileKind = BLOCKS) -> list[Grid]:
-    """Return the grids to choose from, for labels of a shape."""
     batch, height, width = shape
-    if kind.windowed:  # labels are those of the windows
-        height, width = height - psf_size + 1, width - psf_size + 1
-    smallest = 2 * psf_size - 1  # a tile is no shorter than its overlap: only next neighbours overlap
-    whole = psf_size - 1 + max(height, math.ceil(width / kind.across))
-    sizes = [size for size in kind.sizes if smallest <= size < 2 * whole][: kind.candidates]
-    only = kind.every * next_fast_size(math.ceil(smallest / kind.every))
-    return [_grid(batch, height, width, size, psf_size, kind) for size in sizes or [only]]
-
-
-def _grid(batch: int, height: int, width: int, size: int, psf_size: int, kind: TileKind) -> Grid:
-    """Return the grid of the fewest blocks; where overlap is free, in tiles no larger than needed."""
-    tile, reach = size - psf_size + 1, psf_size - 1 if kind.windowed else 0
-    rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
-    if not kind.windowed:
-        tile = min(tile, max(math.ceil(height / rows), math.ceil(width / (kind.across * columns)), (size + 1) // 2))
-        rows, columns = math.ceil(height / tile), math.ceil(width / (kind.across * tile))
-    spare = rows * tile - height, columns * kind.across * tile - width
-    return Grid(batch, height, width, size, tile, kind.across, reach, rows, columns, spare)
-
-
-def _works(grids: list[Grid], present: list[Tensor], blended: int, kind: TileKind) -> list[TileWork]:
-    """Return the work of each grid from the layers that each of its blocks holds. Waits once for a device."""
-    pixels = [grid.batch * grid.height * grid.width for grid in grids]
     if kind.windowed:
-        layers = present[0].shape[1]
-        held = torch.stack([torch.bincount(own.sum(1), minlength=layers + 1) for own in present]).tolist()
-        return [TiledOcclusionWork(grid.size, tuple(own), n) for grid, own, n in zip(grids, held, pixels, strict=True)]
-    layers, *pairs = torch.stack([present[0].any(0).sum(), *(own.sum() for own in present)]).tolist()
-    return [
-        kind.work(grid.size, grid.blocks, count, layers, n, blended)
-        for grid, count, n in zip(grids, pairs, pixels, strict=True)
-    ]
-
-
-def _cheapest(works: list[TileWork], grids: list[Grid], profile: CostProfile) -> tuple[TileWork, Grid]:
-    return min(zip(works, grids, strict=True), key=lambda pair: seconds_of(pair[0], profile))
+        height, width = height - psf_size + 1, width - psf_size + 1
+    whole = psf_size - 1 + max(height, math.ceil(width / kind.across))
+    # A tile is no shorter than its overlap: only next neighbours overlap.
+    wanted = max(2 * psf_size - 1, min(math.ceil(2.5 * psf_size), whole))
+    size = next((size for size in kind.sizes if size >= wanted), next_fast_size(wanted))
+    return Grid.of((batch, height, width), psf_size, size, kind)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kornia_tidy.render.backends.block_plan import plan_blocks
-from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, choose_grid
+from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, tile_grid
 from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.borders import BORDERS
@@ -167,7 +167,8 @@ class TestTiledRender(RenderTester):
         bank = make_bank(5, 2, 5, device=device)
         image, defocus = make_scene(bank, 2, 31, 46)
         labels = layered_scene(image, defocus, bank.defocus, bank.psfs).labels
-        plan = plan_blocks(labels, 5, choose_grid(labels, 5, 5, SMALL_TILES.blocks), SMALL_TILES.blocks, offset=4)
+        grid = tile_grid(tuple(labels.layer_index.shape), 5, SMALL_TILES.blocks)
+        plan = plan_blocks(labels, 5, grid, SMALL_TILES.blocks, offset=4)
         plane = torch.nn.functional.pad(image, (2, 2, 2, 2))
         results = []
         for by_slices in (True, False):
@@ -269,7 +270,8 @@ class TestPlan(BaseTester):
         psi = depth_map(kind, bank, 37, 51)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
         labels = Labels.of(label, None)
-        plan = plan_blocks(labels, 6, choose_grid(labels, 6, 5, SMALL_TILES.blocks), SMALL_TILES.blocks, offset=4)
+        grid = tile_grid(tuple(labels.layer_index.shape), 5, SMALL_TILES.blocks)
+        plan = plan_blocks(labels, 6, grid, SMALL_TILES.blocks, offset=4)
         tile = plan.grid.tile
         expected = {
             (b, y // tile, x // (2 * tile), int(label[b, y, x])) for b in range(2) for y in range(37) for x in range(51)
@@ -285,14 +287,15 @@ class TestPlan(BaseTester):
         assert len(found) == len(set(found))
         assert set(found) == expected
 
-    def test_feature_the_grid_follows_the_scene(self, device):
-        """A scene of one layer gets tiles much longer than the overlap; one full of layers, shorter ones."""
-        sides = []
-        for layers in (1, 100):
-            x = torch.arange(600, device=device) * layers // 600
-            sides.append(choose_grid(Labels.of(x.expand(1, 500, 600), None), 100, 23).size)
-        assert sides[0] > sides[1]
-        assert all(side - 23 + 1 >= 23 - 1 for side in sides)
+    @pytest.mark.parametrize("kind", [BLOCKS, WINDOWS])
+    def test_feature_tiles_are_no_shorter_than_their_overlap_and_windows_no_larger_than_needed(self, kind):
+        for psf_size in (1, 5, 23, 129, 513):
+            for height, width in ((1, 1), (40, 2000), (500, 600)):
+                shape = (1, height + psf_size - 1, width + psf_size - 1) if kind.windowed else (1, height, width)
+                grid = tile_grid(shape, psf_size, kind)
+                assert (grid.height, grid.width) == (height, width)
+                assert grid.blocks == 1 or grid.size - psf_size + 1 >= psf_size - 1
+                assert grid.size <= max(48, 1.5 * max(2.5 * psf_size, 2 * psf_size - 1))
 
     def test_property_sizes_transform_fast(self):
         assert all((2 * 3) ** 16 * 5**2 * 7 % size == 0 for size in BLOCKS.sizes + WINDOWS.sizes)
