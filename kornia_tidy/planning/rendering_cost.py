@@ -27,8 +27,6 @@ def rendering_work(
 ) -> Work:
     """Return the work of rendering a scene through a bank, from the layers of its pixels.
 
-    In float64 every operation counts twice.
-
     Args:
         defocus: (B or 1, 1, H, W) radians.
         batch: images B.
@@ -51,5 +49,4 @@ def rendering_work(
     image = torch.zeros((), dtype=dtype, device=defocus.device).expand(batch, channels, *defocus.shape[-2:])
     psfs = image.new_zeros(()).expand(len(nodes), channels, window, window)
     scene = scene_of_layers(image, index, weight, psfs, None, border, compositing, dtype)
-    work = choose(scene).work(scene)
-    return Work(2 * work.operations, work.memory, work.window) if double else work
+    return choose(scene).work(scene)

@@ -36,7 +36,7 @@ class Work:
     """Work of a backend for a scene, without gradients.
 
     Args:
-        operations: additions and multiplications, roughly: for comparisons.
+        operations: additions and multiplications, roughly: for comparisons. Those of float64 count twice.
         memory: bytes at a time beyond the image.
         window: side of the windows that are transformed in samples; 0 if none are.
     """

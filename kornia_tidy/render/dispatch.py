@@ -25,9 +25,9 @@ BACKENDS: dict[str, Backend] = {
 }
 METHODS = ("auto", *BACKENDS)
 RENAMED = {"direct": "compiled", "overlap": "compiled", "triton": "batched"}  # what method= took before
-# Occlusion in C takes P^2 operations a pixel. Beyond this side transforms of the whole plane are faster, up to three
-# times at 129 px; they are taken while an image with all channels has few bytes in float64.
-LARGEST_OCCLUSION, LARGEST_PLANE = 65, 32 << 20
+# Where dense is the faster one: occlusion in C takes P^2 operations a pixel, and tiles of a small image through large
+# PSFs are as large as it. It is taken while an image with all channels has few bytes in float64.
+LARGEST_OCCLUSION, LARGEST_SHARE, LARGEST_PLANE = 65, 1 / 4, 32 << 20
 MOST_SAMPLES = 1 << 28  # of all layers: beyond, transforms take longer than launches, and tiles skip absent layers
 
 
@@ -129,8 +129,8 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """Return the backend that renders a scene.
 
     Transforms of torch are for dense alone. Accelerators take batched, and tiles where the planes of all layers would
-    be too large. Processors take compiled, and tiles without a compiler; large PSFs with occlusion go densely while
-    the planes are small and no gradients are wanted, for which dense keeps every spectrum.
+    be too large. Processors take compiled, and tiles without a compiler; large PSFs go densely where that is faster,
+    while the planes are small and no gradients are wanted, for which dense keeps every spectrum.
 
     Args:
         scene: to be rendered.
@@ -146,12 +146,19 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     if scene.image.device.type != "cpu":
         samples = len(scene.psfs) * math.prod((*scene.image.shape[:2], *scene.padded_size))
         return BACKENDS["batched" if samples <= MOST_SAMPLES else "tiled"]
-    if scene.compositing == "occlusion" and scene.psfs.shape[-1] > LARGEST_OCCLUSION:
-        inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
-        recorded = torch.is_grad_enabled() and any(wants_gradient(x) for x in inputs)
-        if not recorded and 8 * scene.image.numel() <= LARGEST_PLANE:
-            return BACKENDS["dense"]
-    return BACKENDS["compiled" if BACKENDS["compiled"].refusal(scene) is None else "tiled"]
+    side = scene.psfs.shape[-1]
+    if BACKENDS["compiled"].refusal(scene) is None:
+        name, large = "compiled", scene.compositing == "occlusion" and side > LARGEST_OCCLUSION
+    else:
+        name, large = "tiled", side >= LARGEST_SHARE * min(scene.output_size)
+    return BACKENDS["dense" if large and _keeps_little(scene) else name]
+
+
+def _keeps_little(scene: LayeredScene) -> bool:
+    """Return whether dense rendering takes little memory: for gradients it keeps a spectrum of each layer."""
+    inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
+    recorded = torch.is_grad_enabled() and any(wants_gradient(x) for x in inputs)
+    return not recorded and 8 * scene.image.numel() <= LARGEST_PLANE
 
 
 def _named(scene: LayeredScene, method: str) -> Backend:

@@ -58,10 +58,14 @@ class TestChoose(BaseTester):
             monkeypatch.setattr(dispatch, "MOST_SAMPLES", 2 * 6 * 48 * 68 - 1)
             assert choose(scene).name == "tiled"
 
-    def test_feature_large_psfs_with_occlusion_go_densely_while_memory_is_small(self, monkeypatch):
+    @pytest.mark.parametrize("compiler", [pytest.param(True, marks=needs_compiler), False])
+    def test_feature_large_psfs_go_densely_where_that_is_faster_and_memory_small(self, compiler, monkeypatch):
+        if not compiler:
+            monkeypatch.setattr("kornia_tidy.render.backends.compiled.compiled", lambda source, dtype: None)
         scene = scene_of("occlusion", 3, 67, 70, 80)
         assert choose(scene).name == "dense"
-        assert choose(scene_of("gather", 3, 67, 70, 80)).name != "dense"
+        assert choose(scene_of("gather", 3, 67, 70, 80)).name == ("compiled" if compiler else "dense")
+        assert choose(scene_of("gather", 3, 17, 70, 80)).name == ("compiled" if compiler else "tiled")
         recorded = replace(scene, psfs=scene.psfs.clone().requires_grad_())
         assert choose(recorded).name != "dense"
         with torch.no_grad():

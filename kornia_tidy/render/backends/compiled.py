@@ -108,20 +108,20 @@ class CompiledBackend:
         """Return the work: of occlusion as the C code counts it, of windows with the layers in a sample of pixels."""
         labels, (batch, channels), side = scene.labels, scene.image.shape[:2], scene.psfs.shape[-1]
         pixels, itemsize = batch * scene.output_size[0] * scene.output_size[1], scene.image.element_size()
-        image = channels * labels.layer_index.numel() * itemsize
+        image, words = channels * labels.layer_index.numel() * itemsize, channels * itemsize // 4
         if scene.compositing == "occlusion":
-            operations = channels * occlusion_ops.count_operations(*scene.sorted_layers, scene.psfs, batch)
+            operations = words * occlusion_ops.count_operations(*scene.sorted_layers, scene.psfs, batch)
             return Work(operations, 2 * image + 32 * labels.layer_index.numel())
         kept = 16 * labels.layer_index.numel()
         if _goes_directly(scene):
             blended = 1 if labels.layer_weight is None else 2
-            return Work(2 * blended * channels * pixels * side**2, 2 * image + kept)
+            return Work(2 * blended * words * pixels * side**2, 2 * image + kept)
         size = window_size(side)
         grid = Grid.of(tuple(labels.layer_index.shape), side, size)
         present = grid.present(labels.every(SAMPLE), len(scene.psfs), SAMPLE)
         pairs, layers = int(present.sum()), int(present.any(0).sum())
         operations = transform_operations(size, size) * (grid.blocks + pairs + layers)
-        operations = channels * (operations + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
+        operations = words * (operations + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
         planes = layers + _WINDOW_PLANES * torch.get_num_threads()
         return Work(operations, planes * itemsize * size**2 + 3 * image + kept, size)
 

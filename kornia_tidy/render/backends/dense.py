@@ -135,6 +135,6 @@ def dense_work(scene: LayeredScene, layers: int, at_once: int) -> Work:
     memory = 2 * samples * itemsize + (4 if occludes else 2) * 8 * scene.labels.layer_index.numel()
     memory += (_PLANES + at_once - 1) * samples * (2 * 8 if occludes else itemsize)
     if not occludes:
-        return Work(channels * (batch + layers * (batch + 1)) * transform, memory)
+        return Work(channels * itemsize // 4 * (batch + layers * (batch + 1)) * transform, memory)
     # For each layer the spectra of its light, two weights and its PSF, and three products back, in float64.
     return Work(2 * layers * (channels + batch * (4 * channels + 2)) * transform, memory)

@@ -81,7 +81,8 @@ class TiledBackend:
             chunk = _OCCLUSION_PLANES * max(kind.chunk_bytes, 2 * plane * most)
             return Work(operations, 2 * layers * plane + chunk + 2 * image + 32 * labels.layer_index.numel(), grid.size)
         plane = 2 * scene.image.element_size() * grid.size**2
-        operations = channels * (transform * (grid.blocks + pairs + layers) + _PRODUCT * grid.size**2 * pairs)
+        operations = transform * (grid.blocks + pairs + layers) + _PRODUCT * grid.size**2 * pairs
+        operations *= channels * scene.image.element_size() // 4
         chunk = 3 * max(kind.chunk_bytes, plane * math.ceil(pairs / grid.blocks))
         memory = 2 * layers * channels * plane + chunk + 4 * image + 16 * labels.layer_index.numel()
         return Work(operations, memory, grid.size)
