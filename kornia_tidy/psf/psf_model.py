@@ -31,7 +31,7 @@ class PSFModel(ScenePSFs):
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
-            Default: the binary disc.
+            Default: the pixels whose centres lie in the disc; the smooth disc for ``NoMask``.
 
     Raises:
         TypeError: if a part is of another type.

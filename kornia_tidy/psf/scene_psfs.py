@@ -403,7 +403,8 @@ class ScenePSFs(WidePSFs):
         """The aperture over the masks' pixels."""
         fill_factor, pupil = getattr(self.modulator, "fill_factor", 1.0), self._derived.pupil
         if pupil is None or pupil.fill_factor != fill_factor:
-            pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, self.aperture, fill_factor)
+            aperture = getattr(self.masks, "iris", None) if self.aperture is None else self.aperture
+            pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
         return pupil
 
     def _band(self) -> float:
