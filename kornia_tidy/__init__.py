@@ -14,6 +14,7 @@ from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.fresnel import FresnelLens
+from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
 from kornia_tidy.modulator.switching import Switching
@@ -33,6 +34,7 @@ __all__ = [
     "Fidelity",
     "FresnelLens",
     "LearnableDwellTimes",
+    "NoMask",
     "PSFBank",
     "PixelwiseMask",
     "SensorNoise",

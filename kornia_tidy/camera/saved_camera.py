@@ -155,7 +155,7 @@ def _made(described: Any, weights: Mapping[str, Tensor], pixels: tuple[int, ...]
 
 def _check_tables(weights: Mapping[str, Tensor], pixels: tuple[int, ...]) -> None:
     rows, columns = pixels
-    values = rows * columns * max(weight[0].numel() for weight in weights.values())
+    values = rows * columns * max((weight[0].numel() for weight in weights.values()), default=1)
     if "phase" in weights:
         values = weights["phase"].numel()
     if min(rows, columns) < 1 or values > MOST_VALUES:

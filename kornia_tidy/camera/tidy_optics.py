@@ -73,7 +73,8 @@ class TiDyOptics(CameraState):
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel. Images of
             one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
             has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
-        aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the binary disc.
+        aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the pixels whose centres
+            lie in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`.
         check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
             unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go

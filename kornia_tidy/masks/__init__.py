@@ -17,6 +17,7 @@ from kornia_tidy.masks.cubic import CubicMask
 from kornia_tidy.masks.fourier import FourierMask
 from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import fisher_mask, initial_heights
+from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.masks.radial import RadialMask
 from kornia_tidy.masks.spiral import SpiralMask
@@ -27,6 +28,7 @@ __all__ = [
     "CubicMask",
     "FourierMask",
     "FresnelLens",
+    "NoMask",
     "PhaseMasks",
     "PixelwiseMask",
     "RadialMask",

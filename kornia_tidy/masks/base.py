@@ -118,6 +118,11 @@ class PhaseMasks(nn.Module):
         phase = self.phase
         return phase.to(torch.promote_types(phase.dtype, torch.float32)) / metres_to_radians(self.material)
 
+    @property
+    def iris(self) -> Tensor | None:
+        """Aperture where the camera is given none; None for the pixels whose centres lie in the disc."""
+        return None
+
     def is_flat(self) -> bool:
         """Return whether each mask has one height everywhere, so that the camera is a lens alone.
 

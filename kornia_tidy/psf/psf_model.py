@@ -73,7 +73,7 @@ class PSFModel:
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
-            Default: the binary disc.
+            Default: the pixels whose centres lie in the disc; the smooth disc for ``NoMask``.
 
     Raises:
         TypeError: if a part is of another type.
@@ -593,7 +593,8 @@ class PSFModel:
         """The aperture over the masks' pixels."""
         fill_factor, pupil = getattr(self.modulator, "fill_factor", 1.0), self._derived.pupil
         if pupil is None or pupil.fill_factor != fill_factor:
-            pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, self.aperture, fill_factor)
+            aperture = getattr(self.masks, "iris", None) if self.aperture is None else self.aperture
+            pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
         return pupil
 
     def _band(self) -> float:

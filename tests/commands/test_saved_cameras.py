@@ -62,7 +62,7 @@ CROSSED = [
     for pair, name in product(LIMITED, MODULATORS)
 ]
 FIDELITY = Fidelity(window=9, layer_spacing=20.0)
-PANEL = ["--panel", "60x60"]
+PANEL = ["--panel", "100x100"]
 
 
 @torch.no_grad()
