@@ -7,6 +7,7 @@ before or after the picture is taken if it is a container.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import cycle, product
 from typing import Any, NamedTuple
 
 import cv2
@@ -125,7 +126,7 @@ class Way(NamedTuple):
     whole: bool = True
     """Whether it takes whole numbers with ``depth_scale``; else 16 bits are float16."""
     moves: tuple[str, ...] = ("never",)
-    asks: str = r"depth must be floating point .* convert it with depth\.float\(\) \* 0\.001"
+    asks: str = r"depths? must be floating point .* convert it with depths?\.float\(\) \* 0\.001"
     """What whole numbers without a scale are told. Empty: kornia's containers make them floating point themselves."""
 
 
@@ -318,35 +319,44 @@ def picture() -> Tensor:
     return torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
 
 
-def check(way: Way, depth: NDArray[Any]) -> None:
+def check(way: Way, depth: NDArray[Any], when: str) -> None:
     """A depth that is filled on the way gives what the depth filled by hand gives, and the mask of its holes."""
-    for when in way.moves:
-        seen, image = (moved(depth), moved(picture())) if when == "before" else (depth, picture())
-        filled, known = fill_holes(seen)
-        expected = way.take("error", image, filled, "never").image
-        if when == "after":
-            expected, known = moved(expected), moved(known)
-        found = way.take("fill", picture(), depth, when)
-        assert torch.equal(found.image, expected), when
-        if found.valid is not None:
-            assert np.array_equal(found.valid, known), when
+    seen, image = (moved(depth), moved(picture())) if when == "before" else (depth, picture())
+    filled, known = fill_holes(seen)
+    expected = way.take("error", image, filled, "never").image
+    if when == "after":
+        expected, known = moved(expected), moved(known)
+    found = way.take("fill", picture(), depth, when)
+    assert torch.equal(found.image, expected)
+    if found.valid is not None:
+        assert np.array_equal(found.valid, known)
+
+
+def of_kind(way: Way, depth: NDArray[np.float32], kind: str) -> NDArray[Any]:
+    if kind == "float":
+        return depth
+    return millimetres(depth) if way.whole else depth.astype(np.float16)
 
 
 class TestDepthWithHoles(BaseTester):
     @pytest.mark.parametrize("kind", ["float", "16 bits"])
     def test_feature_every_adapter_fills_as_by_hand_and_tells_where(self, way, kind):
-        for name, make in MAPS.items():
-            depth = make()
-            if kind == "16 bits":
-                depth = millimetres(depth) if way.whole else depth.astype(np.float16)
-            assert not (depth > 0).all(), name
-            check(way, depth)
+        for make, when in zip(MAPS.values(), cycle(way.moves), strict=False):
+            check(way, of_kind(way, make(), kind), when)
 
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize("kind", ["float", "16 bits"])
+    def test_property_every_map_flipped_and_cropped_before_and_after(self, way, kind):
+        for make, when in product(MAPS.values(), way.moves):
+            check(way, of_kind(way, make(), kind), when)
+
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("name", FILES)
     def test_feature_published_files(self, way, name):
         depth = from_file(name)
         assert 0 < (depth > 0).mean() < 1
-        check(way, millimetres(depth) if way.whole else depth)
+        for when in way.moves:
+            check(way, of_kind(way, depth, "16 bits"), when)
 
     def test_exception_without_the_option_a_hole_is_refused(self, way):
         """With the line to type."""
