@@ -160,7 +160,7 @@ def tapped(image: Tensor) -> Call:
 
 def holes(depth: Tensor) -> Call:
     valid = torch.rand(depth.shape, generator=torch.Generator().manual_seed(3)) > 0.4
-    return lambda x: fill_holes(x.where(valid, 0))[0]
+    return lambda x: fill_holes(x.masked_fill(~valid.to(x.device), 0))[0]
 
 
 def first(module: Callable[[Tensor], tuple[Tensor, ...]]) -> Callable[[Tensor], Call]:

@@ -134,7 +134,7 @@ class SceneGeometry(nn.Module):
         seen &= warped > 0
         if self.scale_depth:
             warped = warped / self._magnification().to(warped)
-        warped = fill_holes(warped.where(seen, 0))[0].to(depth.dtype)
+        warped = fill_holes(warped.masked_fill(~seen, 0))[0].to(depth.dtype)
         whole = out.pop("image").to(image.dtype)
         scene = (whole, warped, seen) if batched else (whole[0], warped[0], seen[0])
         return Scene(*scene, out)

@@ -147,7 +147,7 @@ def read_sample(
     wide = compute_dtype(image.dtype, model.fidelity, image.device) == torch.float64
     bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * (2 if wide else 1)
     sample = Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once)
-    return filled_sample(sample) if fills_holes(camera) else sample
+    return filled_sample(sample) if camera.holes == "fill" and fills_holes(camera) else sample
 
 
 def filled_sample(sample: Sample) -> Sample:

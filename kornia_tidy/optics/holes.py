@@ -6,7 +6,6 @@ from typing import Any, overload
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.checks import check_part, check_values
@@ -24,10 +23,10 @@ def fill_holes(depth: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
 @overload
-def fill_holes(depth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_]]: ...
+def fill_holes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
 
-def fill_holes(depth: Tensor | NDArray[Any]) -> tuple[Tensor, Tensor] | tuple[NDArray[Any], NDArray[np.bool_]]:
+def fill_holes(depth: Tensor | np.ndarray) -> tuple[Tensor, Tensor] | tuple[np.ndarray, np.ndarray]:
     """Fill the holes of depth maps from the nearest known pixel.
 
     A hole is a depth of NaN, 0 or less, or a masked value of a masked array. Infinity is a depth.
@@ -94,7 +93,7 @@ def _fill_tensor(depth: Tensor) -> tuple[Tensor, Tensor]:
     return filled.to(depth.dtype), known
 
 
-def _nearest(known: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _nearest(known: np.ndarray) -> np.ndarray:
     """Return for each pixel of maps (N, H, W) the index of the nearest known one, counted along the rows of its map."""
     transform = import_installed("scipy.ndimage").distance_transform_edt  # 0.2 s, which only holes need
     nearest = np.empty(known.shape, np.int64)
