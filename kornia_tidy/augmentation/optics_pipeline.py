@@ -147,11 +147,11 @@ class OpticsPipeline(nn.Module):
         params: Mapping[str, Any] | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Mapping[str, Any]]:
         """Return capture, depth, clean image, where the depth is valid, and the other entries."""
-        given, drawn = params or {}, {}
+        given, drawn, fills = params or {}, {}, fills_holes(self.optics, self.holes)
         if self.geometry is not None:
             image, depth, valid, others = self.geometry(image, depth, valid, others, params=given.get("geometry"))
             drawn["geometry"] = self.geometry.params
-        elif fills_holes(self.optics, self.holes):
+        elif fills:
             depth, known = fill_holes(depth)
             valid = known if valid is None else both_valid(known, valid)
         if isinstance(self.optics, TiDyOptics):

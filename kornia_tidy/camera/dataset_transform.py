@@ -143,7 +143,8 @@ class DatasetTransform:
         return int(sample[self.key])
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r})"
+        holes = ", holes='fill'" if self.holes == "fill" else ""
+        return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r}{holes})"
 
 
 def item_generator(seed: int, item: int) -> torch.Generator:

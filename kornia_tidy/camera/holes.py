@@ -26,7 +26,7 @@ def fills_holes(optics: Any, holes: str = "error") -> bool:
         (False, True, True)
     """
     camera = getattr(optics, "optics", optics)  # of an augmentation
-    filled = "fill" in {holes, optics.holes, getattr(camera, "holes", "error")}
+    filled = "fill" in {holes, *(getattr(part, "holes", "error") for part in (optics, camera))}
     if filled and isinstance(getattr(camera, "camera", None), DefocusRange):
         raise ValueError(
             "holes='fill' takes a depth of 0 as unknown, and to a DefocusRange 0 is the far end: fill the holes of "

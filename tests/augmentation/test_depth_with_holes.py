@@ -453,7 +453,8 @@ class TestDepthWithHoles(BaseTester):
     def test_feature_a_setting_like_others(self):
         optics = camera(masks=PLAIN.masks, sensor=None, holes="fill")
         assert "holes of depth filled" in repr(optics)
-        assert "holes" not in repr(PLAIN)
+        assert "holes" not in repr(PLAIN) + repr(PLAIN.as_transform())
+        assert "holes='fill'" in repr(PLAIN.as_transform(holes="fill"))
         assert optics.with_fidelity("draft").holes == "fill"
         optics.load_state_dict(PLAIN.state_dict(), take_over=True)  # a state says nothing about them
         assert optics.holes == "fill"
