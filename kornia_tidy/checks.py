@@ -158,4 +158,7 @@ def check_depth(depth: Tensor) -> None:
     check_values("depth", depth)
     if depth.numel() and not bool(depth.detach().amin() > 0):  # False for NaN too
         bad = depth[~(depth > 0)][0].item()
-        raise ValueError(f"depth must be positive metres, got {bad} (fill holes and mark them in a mask first)")
+        raise ValueError(
+            f"depth must be positive metres, got {bad}: fill holes with "
+            f"depth, valid = kornia_tidy.data.fill_holes(depth), or give the camera holes='fill'"
+        )

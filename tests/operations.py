@@ -29,6 +29,7 @@ from kornia_tidy import (
     sensor,
 )
 from kornia_tidy import augmentation as ours
+from kornia_tidy.data import fill_holes
 from tests.augmentation.coded_scene import MarkDepth
 from tests.camera.pipeline_samples import camera
 
@@ -159,7 +160,7 @@ def tapped(image: Tensor) -> Call:
 
 def holes(depth: Tensor) -> Call:
     valid = torch.rand(depth.shape, generator=torch.Generator().manual_seed(3)) > 0.4
-    return lambda x: ours.fill_holes(x, valid)
+    return lambda x: fill_holes(x.masked_fill(~valid.to(x.device), 0))[0]
 
 
 def first(module: Callable[[Tensor], tuple[Tensor, ...]]) -> Callable[[Tensor], Call]:

@@ -8,7 +8,6 @@ containers. The adapters of other libraries are imported by name: ``torchvision_
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, DepthTap, bound_depth
 from kornia_tidy.augmentation.depth_blur import DepthBlur, RandomDepthBlur, depth_blur
-from kornia_tidy.augmentation.holes import fill_holes
 from kornia_tidy.augmentation.linear_camera import LinearCamera
 from kornia_tidy.augmentation.optics_pipeline import OpticsPipeline
 from kornia_tidy.augmentation.random_tidy_optics import RandomTiDyOptics
@@ -28,6 +27,5 @@ __all__ = [
     "SceneGeometry",
     "bound_depth",
     "depth_blur",
-    "fill_holes",
     "sensor_noise",
 ]

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
-from kornia_tidy.augmentation.holes import fill_holes
+from kornia_tidy.camera.holes import both_valid, fills_holes
 from kornia_tidy.camera.image_types import depth_tensor, image_tensor, like_image
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_part, unmasked
+from kornia_tidy.checks import check_choice, check_part, unmasked
+from kornia_tidy.optics.holes import HOLES, fill_holes
 
 try:
     import albumentations as A  # ty: ignore[import-not-found]
@@ -27,8 +28,6 @@ try:
 except ImportError as error:
     raise ImportError(f"kornia_tidy.augmentation.albumentations_v2 needs albumentations 2: {error}") from error
 
-_REMEDY = "A.Compose([...], additional_targets={'depth': 'mask'})"
-
 
 class OpticsTransform(A.DualTransform):
     """Take the picture of an image with its depth, as a transform of albumentations.
@@ -37,20 +36,26 @@ class OpticsTransform(A.DualTransform):
         optics: :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth, such as
             :class:`~kornia_tidy.augmentation.RandomTiDyOptics`. Default: ``TiDyOptics()``.
         p: probability of the picture to be taken.
+        depth_scale: metres in one unit of the depth; 0.001 for millimetres. Whole numbers need it; others are metres.
+        holes: ``"fill"`` fills holes of the depth, such as the zeros that a rotation leaves, from the nearest known
+            pixel, as :func:`kornia_tidy.data.fill_holes` does; ``"error"`` leaves them to the optics.
 
     Shape:
         - ``image``: (H, W, 3), (H, W, 1) or (H, W), 8-bit, 16-bit or float in [0, 1]; comes back in its type.
-        - ``depth``: (H, W) or (H, W, 1), metres; comes back as it was, as do masks, boxes and keypoints.
+        - ``depth``: (H, W) or (H, W, 1); comes back as it was, or filled in its type. Masks, boxes and keypoints come
+          back as they were.
+        - ``valid``, only where holes are filled: uint8 in the depth's shape, 0 in holes, and where a ``valid`` that was
+          given is 0. It comes back whether or not the picture is taken.
 
     Raises:
         ValueError: if there is no depth, the ``Compose`` does not warp depth as a mask or interpolates masks, or the
-            camera's border is ``"valid"``; if image or depth have masked values; as the camera.
+            camera's border is ``"valid"``; if image or depth have masked values, or a depth of whole numbers has no
+            scale; as the camera.
 
     Convention:
         - Give ``additional_targets={"depth": "mask"}`` to ``Compose``: else its flips would flip the image and not the
-          depth. That is refused.
-        - Holes of the depth, which are 0, are filled for the capture. The depth that comes out still has them. Give
-          ``Compose`` no masked arrays of NumPy, whose mask it drops, but ``depth.filled(0)``.
+          depth. That is refused. Where holes are filled, give it ``"valid": "mask"`` too.
+        - Give ``Compose`` no masked arrays of NumPy, whose mask it drops, but ``depth.filled(0)``: zeros are holes.
         - Noise and draws follow from the seed of ``Compose``. The generator of torch is left as it is.
 
     Example:
@@ -66,9 +71,19 @@ class OpticsTransform(A.DualTransform):
         """Arguments, as albumentations checks them."""
 
         optics: Any
+        depth_scale: Any
+        holes: Any
 
-    def __init__(self, optics: torch.nn.Module | None = None, p: float = 1.0) -> None:
+    def __init__(
+        self,
+        optics: torch.nn.Module | None = None,
+        p: float = 1.0,
+        depth_scale: float | None = None,
+        holes: str = "error",
+    ) -> None:
+        check_choice("holes", holes, HOLES)
         super().__init__(p=p)
+        self.depth_scale, self.holes = depth_scale, holes
         self.optics = TiDyOptics() if optics is None else optics
         expected = "TiDyOptics or an augmentation that reads depth"
         check_part("optics", self.optics, (TiDyOptics, DepthAugmentation), expected)
@@ -79,10 +94,20 @@ class OpticsTransform(A.DualTransform):
 
     def __call__(self, *args: Any, force_apply: bool = False, **kwargs: Any) -> Any:
         """Apply the transform; depth that others would not warp is refused whether or not the picture is taken."""
-        if "depth" in kwargs and self._additional_targets.get("depth") != "mask":
-            raise ValueError(f"depth passes through other transforms unwarped: tell them of it with {_REMEDY}")
+        fills = "depth" in kwargs and fills_holes(self.optics, self.holes)
+        for name in ("depth", *(["valid"] if fills else [])):
+            if (name in kwargs or fills) and self._additional_targets.get(name) != "mask":
+                targets = "'depth': 'mask', 'valid': 'mask'" if fills else "'depth': 'mask'"
+                raise ValueError(
+                    f"{name} passes through other transforms unwarped: tell them of it with "
+                    f"A.Compose([...], additional_targets={{{targets}}})"
+                )
         for name in ("image", "depth"):  # albumentations would drop the mask of a masked array
             unmasked(name, kwargs.get(name))
+        if fills:
+            kwargs["depth"], valid = fill_holes(kwargs["depth"])
+            valid = both_valid(valid, kwargs["valid"]) if "valid" in kwargs else valid
+            kwargs["valid"] = valid.astype(np.uint8)  # OpenCV warps no bool
         return super().__call__(*args, force_apply=force_apply, **kwargs)
 
     @property
@@ -95,13 +120,12 @@ class OpticsTransform(A.DualTransform):
         return {"seed": int(self.random_generator.integers(2**31))}
 
     def get_params_dependent_on_data(self, params: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
-        """Return the depth of a sample, without holes."""
+        """Return the depth of a sample in metres."""
         if self.mask_interpolation != cv2.INTER_NEAREST:
             raise ValueError(
                 "depth must be resampled by the nearest pixel, got a Compose with another mask_interpolation"
             )
-        depth = depth_tensor(data["depth"])
-        return {"depth_of_capture": fill_holes(depth, depth > 0)}
+        return {"depth_of_capture": depth_tensor(data["depth"], self.depth_scale)}
 
     def apply(self, img: np.ndarray, depth_of_capture: torch.Tensor, seed: int, **params: Any) -> np.ndarray:
         """Return the capture of an image."""

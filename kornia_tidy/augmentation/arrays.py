@@ -12,15 +12,16 @@ from kornia.color import rgb_to_linear_rgb
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_part, check_positive, described, unmasked
-from kornia_tidy.data.depth_files import fill_holes
+from kornia_tidy.checks import check_choice, check_part, described, unmasked
 from kornia_tidy.inference.hub import from_pretrained
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
 from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.optics.units import check_depth_scale
+from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
 
 Color = Literal["bgr", "rgb"]
 IMAGES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -44,30 +45,32 @@ def simulate(
     optics: TiDyOptics | None = None,
     color: Color = "bgr",
     seed: int | None = None,
+    holes: str = "error",
 ) -> NDArray[Any]:
     """Simulate the coded capture of arrays, such as OpenCV reads.
 
     Args:
         image: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8 or uint16 in the range of the type,
             or float32 in [0, 1]. Encoded as sRGB, or as the camera's colour space has it.
-        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. 0, NaN and what
-            is masked in a masked array are unknown.
+        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. Holes are 0 or less, NaN, and what
+            is masked in a masked array.
         depth_scale: metres per unit of the depth; 0.001 for millimetres, where Open3D and ROS say 1000. Integers need
             it; default of floats: 1.
         optics: the camera. Default: ``TiDyOptics`` with five random masks, the same ones in every call.
         color: order of the three channels of image and capture; ``cv2.imread`` gives ``"bgr"``.
         seed: of the sensor's noise. Default: drawn from torch's global generator.
+        holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
+            does; ``"error"`` leaves them to the camera. Where they were, ``fill_holes(depth)`` says.
 
     Returns:
         The capture, in the layout, data type and colour order of the image; integers are rounded.
 
     Raises:
         TypeError: if an argument is no array, or of another data type.
-        ValueError: if shapes do not fit, a value is out of range, no depth is known, integers come without
+        ValueError: if shapes do not fit, a value is out of range, a depth is not positive, integers come without
             ``depth_scale``, it is units per metre, or the image is a masked array with masked values.
 
     Convention:
-        - Unknown depth is taken from the nearest known pixel.
         - Nothing is differentiated: gradients need tensors and :class:`~kornia_tidy.TiDyOptics`.
 
     Example:
@@ -79,10 +82,13 @@ def simulate(
     """
     optics = _default_optics() if optics is None else optics
     check_part("optics", optics, TiDyOptics, "a TiDyOptics")
+    check_choice("holes", holes, HOLES)
     pixels = to_tensor(unmasked("image", image), color, light=optics.color_space == "linear")
     metres = depth_to_tensor(depth, depth_scale)
     if metres.shape[0] != pixels.shape[0] or metres.shape[-2:] != pixels.shape[-2:]:
         raise ValueError(f"depth must have the rows, columns and batch of the image {image.shape}, got {depth.shape}")
+    if fills_holes(optics, holes):
+        metres, _ = fill_holes(metres)
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     with torch.no_grad():
         coded = optics(pixels, metres, generator=generator)
@@ -175,7 +181,7 @@ def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) ->
 
 
 def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Tensor:
-    """Convert an array of depths to metres, (B, 1, H, W) float32; unknown ones get that of the nearest known pixel.
+    """Convert an array of depths to metres, (B, 1, H, W) float32; 0 where a masked array is masked.
 
     Args:
         depth: as for :func:`simulate`.
@@ -183,11 +189,11 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
 
     Raises:
         TypeError: if it is no array of integers or floats.
-        ValueError: if the shape or a value is not allowed, no depth is known, or integers come without a scale.
+        ValueError: if the shape is not allowed, integers come without a scale, or it is units per metre.
 
     Example:
         >>> depth_to_tensor(np.array([[0, 500, 2000]], np.uint16), 0.001)
-        tensor([[[[0.5000, 0.5000, 2.0000]]]])
+        tensor([[[[0.0000, 0.5000, 2.0000]]]])
     """
     if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "uif":
         kind = depth.dtype if isinstance(depth, np.ndarray) else described(depth)
@@ -195,27 +201,13 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
     depth = np.ma.filled(depth, 0)
     if depth.ndim not in {2, 3, 4} or 0 in depth.shape[-2:] or (depth.ndim == 4 and depth.shape[3] != 1):
         raise ValueError(f"depth must have shape (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1), got {depth.shape}")
-    if depth_scale is None and depth.dtype.kind != "f":
-        raise ValueError(f"a depth of {depth.dtype} needs depth_scale, metres per unit, such as 0.001 for millimetres")
-    scale = 1.0 if depth_scale is None else depth_scale
-    check_positive("depth_scale", scale, "metres per unit")
+    scale = metres_per_unit(depth_scale, depth.dtype.kind != "f", depth.dtype)
     if depth.ndim == 2 or (depth.ndim == 3 and depth.shape[2] == 1):
         maps = depth.reshape(1, *depth.shape[:2])
     else:
         maps = depth.reshape(depth.shape[:3])
-    if (bad := maps < 0).any():
-        raise ValueError(f"depth must not be negative, got {maps[bad][0]}")
     check_depth_scale(scale, maps)
-    metres = (maps.astype(np.float64) * scale).astype(np.float32)
-    known = metres > 0  # False for NaN too
-    for i, one in enumerate(known):
-        if not one.any():
-            raise ValueError(
-                f"depth must be known at one pixel or more, and map {i} of {len(known)} holds 0, NaN or masked "
-                f"pixels alone"
-            )
-    filled = [fill_holes(one, where) for one, where in zip(metres, known, strict=True)]
-    return torch.from_numpy(np.stack(filled)[:, None] if filled else metres[:, None])
+    return torch.from_numpy((maps.astype(np.float64) * scale).astype(np.float32)[:, None])
 
 
 def to_array(images: Tensor, dtype: np.dtype[Any], color: Color, ndim: int) -> NDArray[Any]:

@@ -24,6 +24,7 @@ class CameraPhysics(LinearPhysics):
     Args:
         optics: the camera, gather or scatter.
         depth: (B, 1, H, W), (1, 1, H, W) or (1, H, W), as the camera takes it.
+        holes: as for :class:`~kornia_tidy.augmentation.LinearCamera`, whose ``valid`` is ``physics.camera.valid``.
         options: of ``deepinv.physics.LinearPhysics``, such as ``noise_model=deepinv.physics.GaussianNoise(0.01)``.
 
     Raises:
@@ -41,9 +42,9 @@ class CameraPhysics(LinearPhysics):
         torch.Size([1, 3, 64, 64])
     """
 
-    def __init__(self, optics: TiDyOptics, depth: Tensor, **options: Any) -> None:
+    def __init__(self, optics: TiDyOptics, depth: Tensor, holes: str = "error", **options: Any) -> None:
         super().__init__(**options)
-        self.camera = LinearCamera(optics, depth)
+        self.camera = LinearCamera(optics, depth, holes)
 
     def A(self, x: Tensor, **kwargs: Any) -> Tensor:
         """Return the irradiance of linear light."""

@@ -13,7 +13,9 @@ from torch import Tensor, nn
 
 from kornia_tidy.augmentation.ranges import check_probability
 from kornia_tidy.augmentation.rows import changed_rows
-from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.camera.holes import fills_holes
+from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.optics.holes import HOLES, fill_holes
 
 _PIXELWISE = ("kornia.color", "kornia.enhance", "kornia.filters")  # packages whose modules move no pixel
 HALVES = (torch.float16, torch.bfloat16)
@@ -117,19 +119,28 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         same_on_batch: one draw for the whole batch.
         p: probability of each image to be changed.
         keepdim: return (C, H, W) for (C, H, W).
+        holes: ``"fill"`` fills holes of the depth of the images that are changed; ``"error"`` refuses them.
 
     Raises:
         TypeError: if ``p`` is no number.
-        ValueError: if ``p`` is not from 0 to 1.
+        ValueError: if ``p`` is not from 0 to 1, or ``holes`` is another word.
 
     Shape:
         - ``augmentation(image, depth)``: (B, C, H, W) and (B, 1, H, W) or (1, 1, H, W), or both without B.
         - ``augmentation(image)`` inside a container: behind ``augmentation.depth_tap``, or with :func:`bound_depth`.
+
+    Convention:
+        - The depth that comes out of a container of kornia has its holes still, moved with it: behind the container
+          ``depth, valid = kornia_tidy.data.fill_holes(depth)`` gives both.
     """
 
-    def __init__(self, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False) -> None:
+    def __init__(
+        self, same_on_batch: bool = False, p: float = 0.5, keepdim: bool = False, holes: str = "error"
+    ) -> None:
         check_probability(p)
+        check_choice("holes", holes, HOLES)
         super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
+        self.holes = holes
         self.depth_tap = DepthTap()
         self.bound: Tensor | None = None  # while a call or bound_depth lasts
 
@@ -180,7 +191,8 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         depth = self._depth_of(input)
 
         def change(rows: Tensor | slice, drawn: dict[str, Tensor]) -> Tensor:
-            return self.change(input[rows], depth if depth.shape[0] == 1 else depth[rows], drawn)
+            seen = depth if depth.shape[0] == 1 else depth[rows]
+            return self.change(input[rows], fill_holes(seen)[0] if fills_holes(self, self.holes) else seen, drawn)
 
         # kornia does not look at batch_prob where p is 1
         return changed_rows(input, params, self.p == 1 and self.p_batch == 1, change)
@@ -188,6 +200,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
     def _depth_of(self, image: Tensor) -> Tensor:
         name = type(self).__name__
         depth = self.depth_tap.take(image, name) if self.bound is None else self.bound
+        check_float_tensor("depth", depth, depth.ndim, "(B, 1, H, W)")
         depth = depth[None] if depth.ndim == 3 else depth
         if depth.shape[1:] != (1, *image.shape[-2:]) or depth.shape[0] not in (1, image.shape[0]):
             raise ValueError(

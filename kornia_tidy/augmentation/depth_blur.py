@@ -221,6 +221,8 @@ class RandomDepthBlur(DepthAugmentation):
         same_on_batch: one draw for the whole batch.
         p: probability of each image to be blurred. Images that are not are not computed.
         keepdim: return (C, H, W) for (C, H, W).
+        holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
+            does; ``"error"`` refuses them.
 
     Shape:
         - As :class:`~kornia_tidy.augmentation.DepthAugmentation`.
@@ -250,8 +252,9 @@ class RandomDepthBlur(DepthAugmentation):
         same_on_batch: bool = False,
         p: float = 0.5,
         keepdim: bool = False,
+        holes: str = "error",
     ) -> None:
-        super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim, holes=holes)
         nearest, farthest = checked_range("focus_distance", focus_distance, "metres")
         check_positive("focal_length", focal_length)
         if nearest <= focal_length:

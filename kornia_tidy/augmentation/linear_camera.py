@@ -7,8 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_float_tensor, check_part
+from kornia_tidy.checks import check_choice, check_float_tensor, check_part
+from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.psf.psf_bank import PSFBank
 
 _WANTED = [True, False, False, False, False]  # of image, defocus, nodes, PSFs and stray light
@@ -22,6 +24,8 @@ class LinearCamera(nn.Module):
     Args:
         optics: the camera, gather or scatter. It is shared: A is that of its masks as they are at each call.
         depth: (B, 1, H, W), (1, 1, H, W) or (1, H, W), as the camera takes it.
+        holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
+            does; ``"error"`` leaves them to the camera. :attr:`valid` is False where they were.
 
     Shape:
         - ``camera(x)``: (B, C, H, W) linear light to (B, C, H, W) irradiance, smaller for the border ``"valid"``.
@@ -46,8 +50,10 @@ class LinearCamera(nn.Module):
     """
 
     depth: Tensor
+    valid: Tensor | None
+    """Where the depth was known, (B, 1, H, W) bool, if holes are filled."""
 
-    def __init__(self, optics: TiDyOptics, depth: Tensor) -> None:
+    def __init__(self, optics: TiDyOptics, depth: Tensor, holes: str = "error") -> None:
         super().__init__()
         check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics()")
         if optics.compositing == "occlusion":
@@ -55,8 +61,13 @@ class LinearCamera(nn.Module):
         if optics.spectrum.basis is not None:
             raise ValueError("a linear camera needs colours without spectra of their own, got a spectrum with a basis")
         check_float_tensor("depth", depth, 3 if depth.ndim == 3 else 4, "(B, 1, H, W) or (1, H, W)")
+        check_choice("holes", holes, HOLES)
         self.optics = optics
-        self.register_buffer("depth", depth[None] if depth.ndim == 3 else depth, persistent=False)
+        depth, valid = depth[None] if depth.ndim == 3 else depth, None
+        if fills_holes(optics, holes):
+            depth, valid = fill_holes(depth)
+        self.register_buffer("depth", depth, persistent=False)
+        self.register_buffer("valid", valid, persistent=False)
         optics.defocus(depth)  # raises
 
     def forward(self, light: Tensor) -> Tensor:

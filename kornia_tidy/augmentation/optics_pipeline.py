@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any, cast
 
 import kornia.augmentation as K
@@ -11,9 +12,10 @@ from torch import Tensor, nn
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, container_leaves, moves_pixels
 from kornia_tidy.augmentation.pipeline_transform import PipelineTransform
 from kornia_tidy.augmentation.scene_geometry import SceneGeometry, warped_entries
-from kornia_tidy.camera.samples import DEPTH_KEYS
+from kornia_tidy.camera.holes import DEPTH_KEYS, both_valid, fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_part
+from kornia_tidy.checks import check_choice, check_part
+from kornia_tidy.optics.holes import HOLES, fill_holes
 
 
 class OpticsPipeline(nn.Module):
@@ -25,13 +27,17 @@ class OpticsPipeline(nn.Module):
         optics: :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth, such as
             :class:`~kornia_tidy.augmentation.RandomTiDyOptics`. Default: ``TiDyOptics()``.
         photometry: augmentations that move no pixel, for the image alone. None: none.
+        holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
+            does; ``"error"`` leaves them to the optics. Geometry fills those that it meets or makes.
 
     Shape:
         - ``pipeline(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to image and depth.
         - ``pipeline((image, depth, ...))`` to the same tuple.
         - ``pipeline({"image": ..., "depth": ..., ...})`` to the same mapping, with ``"all_in_focus"`` the warped image
           without optics, and, where geometry left holes in the depth, ``"mask"`` False there. The depth may stand
-          under ``"mask_depth"``.
+          under ``"mask_depth"``. With ``holes="fill"``, here or of the optics, ``"valid"`` is always there: bool in the
+          depth's shape, False in holes, and where a ``"valid"`` or a bool ``"mask"`` that was given is False. A named
+          tuple asks for it by a field ``valid``.
 
     Raises:
         TypeError: if a part is of another kind.
@@ -42,8 +48,8 @@ class OpticsPipeline(nn.Module):
     Convention:
         - The depth that comes out is that of the geometry alone, with holes filled. It keeps its type, which should be
           float32, whatever the image's is.
-        - A mapping's masks, boxes and keypoints are warped too, by the names that kornia knows; ``"mask"``, if it is
-          bool, tells where the depth is valid.
+        - A mapping's masks, boxes and keypoints are warped too, by the names that kornia knows; ``"valid"``, and
+          ``"mask"`` if it is bool, tell where the depth is valid.
         - :attr:`params` holds the draws of the last call; ``params=`` repeats them.
 
     Example:
@@ -60,8 +66,11 @@ class OpticsPipeline(nn.Module):
         geometry: nn.Module | None = None,
         optics: nn.Module | None = None,
         photometry: nn.Module | None = None,
+        holes: str = "error",
     ) -> None:
+        check_choice("holes", holes, HOLES)
         super().__init__()
+        self.holes = holes
         optics = TiDyOptics() if optics is None else optics
         check_part("optics", optics, (TiDyOptics, DepthAugmentation), "TiDyOptics or an augmentation that reads depth")
         camera = optics if isinstance(optics, TiDyOptics) else getattr(optics, "optics", None)
@@ -92,9 +101,13 @@ class OpticsPipeline(nn.Module):
         if isinstance(image, (tuple, list)):
             if len(image) < 2 or depth is not None:
                 raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
-            coded, warped, *_ = self._scene(image[0], image[1], None, {}, params)
-            parts, make = (coded, warped, *image[2:]), cast("Any", type(image))
-            return make(*parts) if hasattr(image, "_fields") else make(parts)
+            coded, warped, _, valid, _ = self._scene(image[0], image[1], getattr(image, "valid", None), {}, params)
+            parts, make = [coded, warped, *image[2:]], cast("Any", type(image))
+            if not hasattr(image, "_fields"):
+                return make(parts)
+            if "valid" in image._fields:
+                parts[image._fields.index("valid")] = valid
+            return make(*parts)
         if depth is None:
             raise ValueError(
                 "depth is missing: call pipeline(image, depth), pipeline((image, depth)) or pipeline(mapping)"
@@ -113,16 +126,17 @@ class OpticsPipeline(nn.Module):
                 f"got the keys {list(sample)}"
             )
         mask = sample.get("mask")
-        own = mask is not None and str(mask.dtype) == "torch.bool"
-        taken = ("image", keys[0], *(["mask"] if own else []))
+        given = {} if mask is None or str(mask.dtype) != "torch.bool" else {"mask": mask}
+        given |= {"valid": sample["valid"]} if isinstance(sample.get("valid"), Tensor) else {}
+        taken = ("image", keys[0], *given)
         others = {} if self.geometry is None else warped_entries(sample, taken)
-        coded, depth, clean, valid, warped = self._scene(
-            sample["image"], sample[keys[0]], mask if own else None, others, params
-        )
+        known = reduce(both_valid, given.values()) if given else None
+        coded, depth, clean, valid, warped = self._scene(sample["image"], sample[keys[0]], known, others, params)
         out = {**sample, **warped, "image": coded, "all_in_focus": clean, keys[0]: depth}
-        if valid is not None and (own or not bool(valid.all())):
-            out["mask" if own or mask is None else "mask_of_valid_depth"] = valid
-        return out
+        names = [*given, *(["valid"] if fills_holes(self.optics, self.holes) else [])]
+        if valid is not None and not names and not bool(valid.all()):
+            names = ["mask" if mask is None else "mask_of_valid_depth"]
+        return out if valid is None else {**out, **dict.fromkeys(names, valid)}
 
     def _scene(
         self,
@@ -133,10 +147,13 @@ class OpticsPipeline(nn.Module):
         params: Mapping[str, Any] | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Mapping[str, Any]]:
         """Return capture, depth, clean image, where the depth is valid, and the other entries."""
-        given, drawn = params or {}, {}
+        given, drawn, fills = params or {}, {}, fills_holes(self.optics, self.holes)
         if self.geometry is not None:
             image, depth, valid, others = self.geometry(image, depth, valid, others, params=given.get("geometry"))
             drawn["geometry"] = self.geometry.params
+        elif fills:
+            depth, known = fill_holes(depth)
+            valid = known if valid is None else both_valid(known, valid)
         if isinstance(self.optics, TiDyOptics):
             drawn["optics"] = given["optics"] if "optics" in given else self.optics.draw(image)
             coded = self.optics(image, depth, params=drawn["optics"])

@@ -35,6 +35,8 @@ class RandomTiDyOptics(DepthAugmentation):
         same_on_batch: one draw for the whole batch, noise included.
         p: probability of each image to be taken. Images that are not are not computed.
         keepdim: return (C, H, W) for (C, H, W).
+        holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
+            does; ``"error"`` leaves them to the camera.
 
     Shape:
         - ``augmentation(image, depth)``: (B, C, H, W) and (B, 1, H, W) or (1, 1, H, W), or both without B, to the
@@ -82,8 +84,9 @@ class RandomTiDyOptics(DepthAugmentation):
         same_on_batch: bool = False,
         p: float = 0.5,
         keepdim: bool = False,
+        holes: str = "error",
     ) -> None:
-        super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim)
+        super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim, holes=holes)
         self.optics = TiDyOptics() if optics is None else optics
         check_part("optics", self.optics, TiDyOptics, "a camera such as TiDyOptics()")
         if self.optics.border == "valid":

@@ -11,8 +11,8 @@ from kornia.augmentation.container.base import ImageSequentialBase
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, DepthTap, container_leaves, moves_pixels
-from kornia_tidy.augmentation.holes import fill_holes
 from kornia_tidy.checks import check_float_tensor, check_values
+from kornia_tidy.optics.holes import fill_holes
 
 KNOWN = (
     "IMAGE",
@@ -134,7 +134,7 @@ class SceneGeometry(nn.Module):
         seen &= warped > 0
         if self.scale_depth:
             warped = warped / self._magnification().to(warped)
-        warped = fill_holes(warped, seen).to(depth.dtype)
+        warped = fill_holes(warped.masked_fill(~seen, 0))[0].to(depth.dtype)
         whole = out.pop("image").to(image.dtype)
         scene = (whole, warped, seen) if batched else (whole[0], warped[0], seen[0])
         return Scene(*scene, out)

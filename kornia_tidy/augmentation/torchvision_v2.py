@@ -5,16 +5,18 @@ Needs torchvision 0.22 or newer; nothing else of the package imports it.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
-from kornia_tidy.augmentation.holes import fill_holes
-from kornia_tidy.camera.image_types import image_tensor, like_image
+from kornia_tidy.camera.holes import fills_holes, with_filled
+from kornia_tidy.camera.image_types import depth_tensor, image_tensor, like_image
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_part
+from kornia_tidy.checks import check_choice, check_part
+from kornia_tidy.optics.holes import HOLES, fill_holes
 
 try:
     from PIL import Image as PILImage
@@ -39,17 +41,22 @@ class Depth(tv_tensors.Mask):
     """
 
 
+class Valid(tv_tensors.Mask):
+    """Where a depth map was known, bool: warped with the :class:`Depth`, and False beyond the image, too."""
+
+
 def _register_kernels() -> None:
     """Register kernels for depth where a mask would take the fill value of the image."""
     functional = v2.functional
     for name in ("pad", "rotate", "affine", "perspective", "elastic"):
         kernel = getattr(functional, f"{name}_mask")
 
-        def of_depth(depth: Depth, *args: Any, _kernel: Any = kernel, **options: Any) -> Any:
+        def of_depth(depth: Depth | Valid, *args: Any, _kernel: Any = kernel, **options: Any) -> Any:
             options = {key: value for key, value in options.items() if key not in ("fill", "interpolation")}
             return tv_tensors.wrap(_kernel(depth.as_subclass(Tensor), *args, **options), like=depth)
 
-        functional.register_kernel(getattr(functional, name), Depth)(of_depth)
+        for kind in (Depth, Valid):
+            functional.register_kernel(getattr(functional, name), kind)(of_depth)
 
 
 _register_kernels()
@@ -61,6 +68,9 @@ class OpticsTransform(v2.Transform):
     Args:
         optics: :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth, such as
             :class:`~kornia_tidy.augmentation.RandomTiDyOptics`. Default: ``TiDyOptics()``.
+        depth_scale: metres in one unit of the depth; 0.001 for millimetres. Whole numbers need it; others are metres.
+        holes: ``"fill"`` fills holes of the depth, such as the zeros that a rotation leaves, from the nearest known
+            pixel, as :func:`kornia_tidy.data.fill_holes` does; ``"error"`` leaves them to the optics.
 
     Shape:
         - Any structure with one :class:`Depth` and one or more images of its size: ``tv_tensors.Image``, a PIL image, a
@@ -68,11 +78,15 @@ class OpticsTransform(v2.Transform):
           in the type in which they came, 8-bit ones rounded; all else as it was.
 
     Raises:
-        ValueError: if the sample has no Depth or several, or no image; as the camera.
+        ValueError: if the sample has no Depth or several, or no image, or its Depth holds whole numbers without a
+            scale; as the camera.
 
     Convention:
-        - The structure of the sample is kept: no entry is added, so that ``v2.RandomApply`` keeps one set of keys.
-        - Holes of the depth, which are 0, are filled for the capture. The depth that comes out still has them.
+        - The structure of the sample is kept: without ``holes="fill"`` no entry is added, so that ``v2.RandomApply``
+          keeps one set of keys.
+        - With ``holes="fill"``, here or of the optics, the Depth comes out filled, and a mapping that holds it gets
+          ``"valid"``, a :class:`Valid` that later transforms move with it: False in holes, and where a ``"valid"`` or a
+          bool ``"mask"`` of the depth's shape that it had was False. A named tuple asks for it by a field ``valid``.
 
     Example:
         >>> from torchvision.transforms import v2
@@ -84,8 +98,12 @@ class OpticsTransform(v2.Transform):
 
     _transformed_types = (Tensor, PILImage.Image)
 
-    def __init__(self, optics: torch.nn.Module | None = None) -> None:
+    def __init__(
+        self, optics: torch.nn.Module | None = None, depth_scale: float | None = None, holes: str = "error"
+    ) -> None:
+        check_choice("holes", holes, HOLES)
         super().__init__()
+        self.depth_scale, self.holes = depth_scale, holes
         self.optics = TiDyOptics() if optics is None else optics
         expected = "TiDyOptics or an augmentation that reads depth"
         check_part("optics", self.optics, (TiDyOptics, DepthAugmentation), expected)
@@ -93,8 +111,14 @@ class OpticsTransform(v2.Transform):
         if getattr(camera, "border", None) == "valid":
             raise ValueError("border 'valid' crops the image and not the other entries of a sample: use another border")
 
+    def forward(self, *inputs: Any) -> Any:
+        """Return the sample with its images coded, and with its depth filled first if holes are to be filled."""
+        if fills_holes(self.optics, self.holes):
+            inputs = tuple(map(_without_holes, inputs))
+        return super().forward(*inputs)
+
     def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
-        """Return the depth of a sample, without holes."""
+        """Return the depth of a sample in metres."""
         depths = [entry for entry in flat_inputs if isinstance(entry, Depth)]
         if len(depths) != 1:
             raise ValueError(
@@ -103,8 +127,7 @@ class OpticsTransform(v2.Transform):
             )
         if not any(_is_image(entry) for entry in flat_inputs):
             raise ValueError("a sample must hold an image beside its Depth: an Image, a PIL image or a tensor")
-        depth = depths[0].as_subclass(Tensor)
-        return {"depth": fill_holes(depth, depth > 0)}
+        return {"depth": depth_tensor(depths[0], self.depth_scale)}
 
     def transform(self, entry: Any, params: dict[str, Any]) -> Any:
         """Return the capture of an image, and all else as it is."""
@@ -120,3 +143,28 @@ class OpticsTransform(v2.Transform):
 def _is_image(entry: Any) -> bool:
     plain = isinstance(entry, Tensor) and not isinstance(entry, tv_tensors.TVTensor)
     return plain or isinstance(entry, (tv_tensors.Image, tv_tensors.Video, PILImage.Image))
+
+
+def _without_holes(entry: Any) -> Any:
+    """Return a sample, or a part of it, with its depth filled and the mask of known pixels where it has a place."""
+    if isinstance(entry, Depth):
+        return Depth(fill_holes(entry.as_subclass(Tensor))[0])
+    if isinstance(entry, Mapping):
+        names = [name for name, value in entry.items() if isinstance(value, Depth)]
+        sample = {name: value if name in names else _without_holes(value) for name, value in entry.items()}
+        return _with_valid(sample, names) if len(names) == 1 else sample
+    if not isinstance(entry, (tuple, list)):
+        return entry
+    if "valid" in getattr(entry, "_fields", ()) and isinstance(entry[1], Depth):
+        return _with_valid(entry, [])
+    parts, make = [_without_holes(value) for value in entry], cast("Any", type(entry))
+    return make(*parts) if hasattr(entry, "_fields") else make(parts)
+
+
+def _with_valid(sample: Any, names: list[Any]) -> Any:
+    """Return a mapping that holds its depth under the first name, or a named tuple, filled and with its valid mask."""
+    named = isinstance(sample, Mapping)
+    depth, valid = fill_holes((sample[names[0]] if named else sample[1]).as_subclass(Tensor))
+    filled = with_filled(sample, Depth(depth), valid, names)
+    mask = Valid(filled["valid"] if named else filled.valid)
+    return {**filled, "valid": mask} if named else filled._replace(valid=mask)

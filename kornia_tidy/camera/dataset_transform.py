@@ -10,9 +10,10 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera.image_types import cropped_image, depth_tensor, image_tensor, like_image
-from kornia_tidy.camera.samples import DEPTH_KEYS
-from kornia_tidy.checks import check_positive
+from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_cropped_valid, with_filled
+from kornia_tidy.camera.image_types import cropped_image, depth_tensor, filled_depth, image_tensor, like_image
+from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.render.repeatable import repeatable
 
 
@@ -28,14 +29,17 @@ class DatasetTransform:
             returns an integer.
         image_key: name of the image in a mapping.
         depth_key: name of the depth in a mapping. Default: ``"depth"`` or ``"mask_depth"``.
-        depth_scale: metres in one unit of the depth; 0.001 for millimetres.
+        depth_scale: metres in one unit of the depth; 0.001 for millimetres. Whole numbers need it; others are metres.
+        holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as
+            :func:`kornia_tidy.data.fill_holes` does; ``"error"`` leaves them to the camera.
 
     Shape:
         - A tuple ``(image, depth, ...)``, or a mapping, such as a sample of MONAI or of a Hugging Face data set; a
           mapping of lists is a batch of them.
         - The image is a tensor (C, H, W), an array (H, W, C) or (H, W), or a PIL image, of floating-point, 8-bit or
           16-bit numbers, see :func:`~kornia_tidy.camera.image_types.image_tensor`; the capture is of the same kind.
-        - The depth is a tensor (1, H, W), an array (H, W) or a PIL image, and comes back as it was.
+        - The depth is a tensor (1, H, W), an array (H, W) or a PIL image, and comes back as it was. Where holes are
+          filled, it comes back filled, in its type, and a mapping gets ``"valid"`` of its kind, False in holes.
 
     Raises:
         KeyError: if a mapping has no such image or depth, or a seed is set and the sample has no such entry.
@@ -60,13 +64,16 @@ class DatasetTransform:
         key: str | Callable[[Any], int] = "index",
         image_key: str = "image",
         depth_key: str | None = None,
-        depth_scale: float = 1.0,
+        depth_scale: float | None = None,
+        holes: str = "error",
     ) -> None:
-        check_positive("depth_scale", depth_scale, "metres")
+        check_positive("depth_scale", 1.0 if depth_scale is None else depth_scale, "metres per unit")
+        check_choice("holes", holes, HOLES)
         self.optics = optics
         self.seed = seed
         self.key = key
         self.image_key, self.depth_key, self.depth_scale = image_key, depth_key, depth_scale
+        self.holes = holes
 
     def __call__(self, sample: Any) -> Any:
         """Return the sample with its image coded, in the structure in which it came."""
@@ -89,10 +96,13 @@ class DatasetTransform:
             image, depth = (sample[name] for name in names)
             plain = names[0] == "image" and names[1] in DEPTH_KEYS
         elif isinstance(sample, (tuple, list)) and len(sample) > 1:
-            (image, depth), plain = sample[:2], True
+            names, (image, depth), plain = DEPTH_KEYS, sample[:2], True
         else:
             return self.optics(sample, **options)  # raises
-        metres = self.depth_scale == 1 and isinstance(depth, Tensor) and depth.is_floating_point()
+        if fills_holes(self.optics, self.holes):
+            depth, valid = filled_depth(depth)
+            sample = with_filled(sample, depth, valid, names[1:])
+        metres = self.depth_scale in (None, 1) and isinstance(depth, Tensor) and depth.is_floating_point()
         device = next(chain(self.optics.parameters(), self.optics.buffers()), torch.empty(0)).device
         ready = plain and metres and isinstance(image, Tensor) and image.is_floating_point()
         if ready and image.device == depth.device == device:
@@ -102,6 +112,7 @@ class DatasetTransform:
         coded = coded.to(whole.device)
         margin = (whole.shape[-2] - coded.shape[-2]) // 2
         taken, warped = like_image(coded, image), cropped_image(depth, margin)
+        sample = with_cropped_valid(sample, margin, cropped_image)
         if not named:
             parts, make = (taken, warped, *sample[2:]), cast("Any", type(sample))
             return make(*parts) if hasattr(sample, "_fields") else make(parts)
@@ -132,7 +143,8 @@ class DatasetTransform:
         return int(sample[self.key])
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r})"
+        holes = ", holes='fill'" if self.holes == "fill" else ""
+        return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r}{holes})"
 
 
 def item_generator(seed: int, item: int) -> torch.Generator:

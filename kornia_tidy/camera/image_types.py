@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive, described, unmasked
-from kornia_tidy.optics.units import check_depth_scale
+from kornia_tidy.checks import described, unmasked
+from kornia_tidy.optics.holes import fill_holes
+from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
 
 
 def image_tensor(image: Any) -> Tensor:
@@ -65,26 +66,25 @@ def like_image(image: Tensor, like: Any) -> Any:
     return out if isinstance(like, np.ndarray) else sys.modules["PIL.Image"].fromarray(out)
 
 
-def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
+def depth_tensor(depth: Any, scale: float | None = None) -> Tensor:
     """Return a depth map in metres as a floating-point tensor (..., 1, H, W).
 
     Args:
         depth: a tensor (..., 1, H, W); an array (H, W), (H, W, 1) or (B, H, W, 1); or a PIL image of one channel.
-        scale: metres in one stored unit; 0.001 for millimetres.
+        scale: metres in one stored unit; 0.001 for millimetres. Whole numbers need it; default of others: 1.
 
     Returns:
         Float32, or float64 where it came so; 0 where a masked array is masked.
 
     Raises:
         TypeError: if it is none of these.
-        ValueError: if an array has another number of axes or several channels, or the scale is not positive or
-            is units per metre.
+        ValueError: if an array has another number of axes or several channels, whole numbers come without a scale, or
+            it is not positive or is units per metre.
 
     Example:
         >>> depth_tensor(np.array([[500, 2000]], np.uint16), 0.001)
         tensor([[[0.5000, 2.0000]]])
     """
-    check_positive("depth_scale", scale, "metres")
     if type(depth) is not Tensor and isinstance(depth, Tensor):
         depth = depth.as_subclass(Tensor)
     if not isinstance(depth, Tensor):
@@ -93,10 +93,27 @@ def depth_tensor(depth: Any, scale: float = 1.0) -> Tensor:
             raise ValueError(f"depth must have one channel, got {depth.shape[-3]}")
     if depth.is_complex() or depth.dtype == torch.bool:
         raise TypeError(f"depth must hold numbers, got {depth.dtype}")
+    scale = metres_per_unit(scale, not depth.is_floating_point(), str(depth.dtype).removeprefix("torch."))
     wide = depth if depth.is_floating_point() else depth.to(torch.float32)
     if scale > 1:
         check_depth_scale(scale, wide.detach().double().cpu().numpy())
     return wide if scale == 1 else wide.to(torch.promote_types(wide.dtype, torch.float32)) * scale
+
+
+def filled_depth(depth: Any) -> tuple[Any, Any]:
+    """Fill the holes of a depth map that :func:`depth_tensor` takes. See :func:`kornia_tidy.data.fill_holes`.
+
+    Returns:
+        The depth in its kind, and where it was known: a tensor of bool for a tensor, else an array.
+
+    Example:
+        >>> filled_depth(np.array([[500, 0, 2000]], np.uint16))
+        (array([[ 500,  500, 2000]], dtype=uint16), array([[ True, False,  True]]))
+    """
+    if isinstance(depth, Tensor):
+        return fill_holes(depth if type(depth) is Tensor else depth.as_subclass(Tensor))
+    filled, valid = fill_holes(_array("depth", depth))
+    return filled if isinstance(depth, np.ndarray) else sys.modules["PIL.Image"].fromarray(filled), valid
 
 
 def cropped_image(image: Any, margin: int) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
+from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_cropped_valid, with_filled
 from kornia_tidy.checks import check_finite, check_float_tensor, check_generator
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
@@ -24,7 +26,6 @@ from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.threads import CaptureNotes
 from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
-DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
 ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
@@ -35,6 +36,7 @@ class Watchful(Protocol):
 
     psf_model: PSFModel
     check_inputs: bool
+    holes: str
     color_space: str
     notes: CaptureNotes
 
@@ -76,11 +78,12 @@ class Sample:
             coded = coded[0]
         if self.form is None:
             return coded
-        if not isinstance(self.form, Mapping):
-            parts, make = (coded, cropped(self.form[1], margin), *self.form[2:]), cast("Any", type(self.form))
-            return make(*parts) if hasattr(self.form, "_fields") else make(parts)
-        maps = {name: cropped(self.form[name], margin) for name in (*DEPTH_KEYS, "mask") if name in self.form}
-        return {**self.form, "image": coded, "all_in_focus": cropped(self.form["image"], margin), **maps}
+        form = with_cropped_valid(self.form, margin, cropped)
+        if not isinstance(form, Mapping):
+            parts, make = (coded, cropped(form[1], margin), *form[2:]), cast("Any", type(form))
+            return make(*parts) if hasattr(form, "_fields") else make(parts)
+        maps = {name: cropped(form[name], margin) for name in (*DEPTH_KEYS, "mask") if name in form}
+        return {**form, "image": coded, "all_in_focus": cropped(form["image"], margin), **maps}
 
 
 def read_sample(
@@ -97,7 +100,8 @@ def read_sample(
 
     Raises:
         TypeError: if image or depth are not floating-point tensors, or the generator is none.
-        ValueError: if shapes or devices do not fit, there is no depth, or the light makes no sense.
+        ValueError: if shapes or devices do not fit, there is no depth, the light makes no sense, or a depth map that is
+            to be filled has holes alone.
         KeyError: if a mapping has no image or no depth.
     """
     form = None
@@ -143,7 +147,17 @@ def read_sample(
             check_light(image, camera)
     wide = compute_dtype(image.dtype, model.fidelity, image.device) == torch.float64
     bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * (2 if wide else 1)
-    return Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once)
+    sample = Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once)
+    return filled_sample(sample) if camera.holes == "fill" and fills_holes(camera) else sample
+
+
+def filled_sample(sample: Sample) -> Sample:
+    """Return a sample whose depth has no holes, and whose form holds that depth and the mask of known pixels."""
+    depth, valid = fill_holes(sample.depth)
+    if sample.form is None:
+        return replace(sample, depth=depth)
+    parts = (depth, valid) if sample.batched else (depth[0], valid[0])
+    return replace(sample, depth=depth, form=with_filled(sample.form, *parts))
 
 
 def compute_dtype(dtype: torch.dtype, fidelity: Fidelity, device: torch.device) -> torch.dtype:

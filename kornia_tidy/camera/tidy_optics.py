@@ -27,6 +27,7 @@ from kornia_tidy.camera.strips import placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
+from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
@@ -80,6 +81,9 @@ class TiDyOptics(CameraState):
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
             through in bands of 64 rows or more, and PSFs that exceed half of it are computed in pieces, some layers at
             a time, with gradients too. That changes nothing but the last digits.
+        holes: ``"error"`` refuses a depth of NaN, 0 or less; ``"fill"`` fills such pixels from the nearest known one,
+            as :func:`kornia_tidy.data.fill_holes` does, with gradients and in compiled graphs. Like ``check_inputs`` it
+            is not part of the state.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -87,11 +91,14 @@ class TiDyOptics(CameraState):
         - ``optics({"image": ..., "depth": ..., ...})`` to the same mapping with ``"image"`` coded, and
           ``"all_in_focus"`` the clean image. The depth may stand under ``"mask_depth"`` instead; a ``"mask"`` of what
           is valid is cropped like the depth.
+        - With ``holes="fill"`` the depth of a tuple or a mapping comes back filled, and a mapping gets ``"valid"``,
+          bool in the depth's shape: False in holes, and where a ``"valid"`` or a bool ``"mask"`` that it had was False.
+          A named tuple asks for it by a field ``valid``, as :class:`kornia_tidy.data.Scene` has it.
 
     Raises:
         TypeError: if image or depth are not floating-point tensors, or an argument is of another type.
-        ValueError: if shapes do not fit, a value or a mask is NaN, an sRGB value is above 16, a depth is not positive,
-            the defocus needs PSFs too large, or options contradict each other.
+        ValueError: if shapes do not fit, a value or a mask is NaN, an sRGB value is above 16, a depth is not positive
+            (with ``holes="fill"``: of no pixel), the defocus needs PSFs too large, or options contradict each other.
         KeyError: if a mapping has no image or no depth.
 
     Convention:
@@ -132,6 +139,7 @@ class TiDyOptics(CameraState):
         aperture: Tensor | None = None,
         check_inputs: bool = True,
         memory_budget: int = 512 << 20,
+        holes: str = "error",
     ) -> None:
         check_positive("memory_budget", memory_budget, "bytes")
         fidelity = Fidelity.of(fidelity)
@@ -140,6 +148,7 @@ class TiDyOptics(CameraState):
         check_choice("color_space", color_space, COLOR_SPACES)
         check_choice("compositing", compositing, tuple(COMPOSITING))
         check_choice("border", border, BORDERS)
+        check_choice("holes", holes, HOLES)
         if paper and (color_space != "paper" or compositing != "gather"):
             raise ValueError(
                 f"fidelity 'paper' means color_space='paper' and compositing='gather', got {color_space!r} and "
@@ -158,6 +167,7 @@ class TiDyOptics(CameraState):
         self.color_space = color_space
         self.border = border
         self.check_inputs = check_inputs
+        self.holes = holes
         self.memory_budget = memory_budget
         self.notes = CaptureNotes()  # shared with cameras made by _replace
 
@@ -458,4 +468,5 @@ class TiDyOptics(CameraState):
             f"fidelity {settings.name!r}: {len(self.defocus_nodes)} {settings.layers} layers of defocus, PSF window "
             f"{self.window}x{self.window} px holding {held[0]:.0%} to {held[1]:.0%} of the light "
             f"({settings.stray_light} the rest); {self.compositing}, {self.border} border, {self.color_space} colour"
+            f"{', holes of depth filled' if self.holes == 'fill' else ''}"
         )

@@ -22,6 +22,7 @@ from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -33,12 +34,13 @@ during one exposure. The scene is a picture and a depth map of the same size.
 EXAMPLES = """\
 examples:
   A Kinect frame, depth in millimetres:
-    kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 -o coded.png
+    kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --holes fill \\
+        -o coded.png
 
   A Middlebury stereo scene, with a lens chosen for its depths:
     kornia-tidy simulate im0.png --depth disp0.pfm --depth-kind disparity \\
         --invalid inf --focal-px 999.421 --baseline-m 0.193001 --doffs-px 32.778 \\
-        --fit-depth
+        --holes fill --fit-depth
 
 The first one in Python, the same but for the rounding to 8 bits:
   import torch
@@ -67,6 +69,13 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--bits", type=int, choices=(8, 16), default=8, help="bits a sample of OUT (default: 8)")
     add_depth_options(parser)
+    parser.add_argument(
+        "--holes",
+        choices=HOLES,
+        default="error",
+        help="pixels of unknown depth: error refuses them, fill takes the depth of the nearest known pixel (default: "
+        "error)",
+    )
     add_camera_options(parser)
 
     masks = parser.add_argument_group("masks", "23 x 23 pixels of random height, the start of training.")
@@ -114,6 +123,11 @@ def run(args: argparse.Namespace) -> None:
     with torch.no_grad():
         with stages("read"):
             scene = read_scene(args)
+            if args.holes == "error" and (count := int((~scene.valid).sum())):
+                raise ValueError(
+                    f"{args.depth} has no depth at {count} of its {scene.valid.numel()} pixels: take it from the "
+                    f"nearest known ones with --holes fill"
+                )
         tell("scene", scene_in_words(scene))
 
         with stages("PSFs"):

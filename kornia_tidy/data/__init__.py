@@ -1,6 +1,7 @@
 """Scenes with depth: readers for image and depth files, published data sets, and scenes painted at random.
 
-Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first.
+Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first. Depth of your own with
+unknown pixels goes through :func:`fill_holes`.
 """
 
 from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
@@ -18,6 +19,7 @@ from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
 from kornia_tidy.data.sun_rgbd import SUNRGBD
 from kornia_tidy.data.tum_sequence import TUMSequence
+from kornia_tidy.optics.holes import fill_holes
 
 __all__ = [
     "SUNRGBD",
@@ -37,6 +39,7 @@ __all__ = [
     "crop",
     "dead_leaves",
     "described_folder",
+    "fill_holes",
     "from_opencv",
     "hypersim",
     "kitti",

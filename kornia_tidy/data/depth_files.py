@@ -20,6 +20,7 @@ from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
+from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.units import check_depth_scale, tell_once
 
 UNKNOWN = {np.dtype(np.uint16): 65535, np.dtype(np.float16): 65504}  # largest numbers, which often mark unknown depth
@@ -86,7 +87,7 @@ def read_depth(
         - Renderers write 1e10 (Blender) or infinity where a ray hits nothing. Both are depths, and to a lens the same.
         - A grey level that a PNG file declares transparent is unknown, as GDAL means it.
         - The orientation of a file is not applied. A warning, once per folder, size and orientation, tells of it.
-        - A hole takes the value of a pixel that is nearest by OpenCV's 5x5 chamfer distance (within 2 % Euclidean).
+        - A hole takes the value of the nearest known pixel; see :func:`~kornia_tidy.data.fill_holes`.
 
     Example:
         >>> import tempfile
@@ -127,7 +128,8 @@ def read_depth(
     known &= depth > 0
     if not known.any():
         raise ValueError(f"cannot read {path}: it has no valid {kind} at any pixel")
-    return DepthMap(torch.from_numpy(fill_holes(depth, known))[None], torch.from_numpy(known)[None])
+    filled, _ = fill_holes(np.ma.masked_array(depth, ~known))
+    return DepthMap(torch.from_numpy(filled)[None], torch.from_numpy(known)[None])
 
 
 def _tell_of_scale(path: str | os.PathLike[str], of_file: float, scale: float) -> None:
@@ -288,15 +290,3 @@ def _disparity_to_depth(disparity: NDArray[np.float64], focal_baseline: float) -
     with np.errstate(over="ignore"):
         np.divide(focal_baseline, disparity, out=depth, where=disparity > 0)
     return depth
-
-
-def fill_holes(depth: NDArray[np.float32], known: NDArray[Any]) -> NDArray[np.float32]:
-    """Fill every hole of a map (H, W) with the value of the nearest known pixel; at least one must be known."""
-    if known.all():
-        return depth
-    _, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    value_of = np.empty(label.max() + 1, np.float32)
-    value_of[label[known]] = depth[known]  # every known pixel has a label of its own
-    return value_of[label.astype(np.int32, copy=False)]

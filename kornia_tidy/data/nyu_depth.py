@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_tidy.data.depth_files import fill_holes
 from kornia_tidy.data.hdf5 import DAMAGE, stored_numbers
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import read_text
+from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.runtime.search_path import import_installed
 
 LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
@@ -41,7 +41,7 @@ class NYUDepthV2(SceneDataset):
 
     Raises:
         FileNotFoundError: if the data are missing; the message says what to download and where it goes.
-        ImportError: if h5py is missing, or SciPy where it is needed.
+        ImportError: if h5py is missing.
         ValueError: if a file is damaged or has other contents.
 
     Convention:
@@ -90,12 +90,12 @@ class NYUDepthV2(SceneDataset):
         # MATLAB stores columns, HDF5 rows: (480, 640, 3) is read as (3, 640, 480).
         window = INSIDE if self.crop_border else (slice(None), slice(None))
         image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
-        known = depth > 0  # False for NaN too
-        if not known.any():
+        if not (depth > 0).any():  # False for NaN too
             raise ValueError(f"cannot read {self.path}: the frame has no valid depth at any pixel")
+        filled, known = fill_holes(depth)
         return Scene(
             torch.from_numpy(np.ascontiguousarray(image, np.float32) / np.float32(255)),
-            torch.from_numpy(fill_holes(depth, known))[None],
+            torch.from_numpy(filled)[None],
             torch.from_numpy(known)[None],
         )
 
@@ -161,13 +161,7 @@ def _read_split(root: Path, split: str | os.PathLike[str]) -> list[int]:
 
 
 def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
-    try:
-        loadmat = import_installed("scipy.io").loadmat  # only this needs it
-    except ImportError:
-        raise ImportError(
-            f"{path} is a MATLAB 5 file, which needs SciPy: pip install 'kornia-tidy[data]', or give split= a text "
-            "file with the numbers of the frames, one per line"
-        ) from None
+    loadmat = import_installed("scipy.io").loadmat  # only this needs it
     if path.stat().st_size > LARGEST_SPLITS:
         raise ValueError(f"cannot read {path}: it must have at most {LARGEST_SPLITS} bytes, got {path.stat().st_size}")
     try:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Hashable
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.checks import check_positive
 from kornia_tidy.runtime.threads import CaptureNotes
 
 if TYPE_CHECKING:
@@ -151,6 +152,27 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
                 f"these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"
             )
     return None
+
+
+def metres_per_unit(scale: float | None, whole: bool, kind: Any) -> float:
+    """Return the metres in one stored unit of a depth map: the scale, or 1 for floating-point numbers without one.
+
+    Args:
+        scale: metres per unit, or None.
+        whole: whether whole numbers are stored.
+        kind: their data type, for the message.
+
+    Raises:
+        ValueError: if whole numbers come without a scale, or it is not positive.
+
+    Example:
+        >>> metres_per_unit(None, False, "float32"), metres_per_unit(0.001, True, "uint16")
+        (1.0, 0.001)
+    """
+    if scale is None and whole:
+        raise ValueError(f"a depth of {kind} needs depth_scale, metres per unit, such as 0.001 for millimetres")
+    check_positive("depth_scale", 1.0 if scale is None else scale, "metres per unit")
+    return 1.0 if scale is None else scale
 
 
 def check_depth_scale(scale: float, stored: np.ndarray) -> None:

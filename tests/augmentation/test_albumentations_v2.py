@@ -20,6 +20,7 @@ from tests.base import BaseTester  # noqa: E402
 from tests.camera.pipeline_samples import camera, scene  # noqa: E402
 
 DEPTH = {"additional_targets": {"depth": "mask"}}
+FILLED = {"additional_targets": {"depth": "mask", "valid": "mask"}}
 
 
 def arrays(kind: type = np.float32) -> dict[str, np.ndarray]:
@@ -109,14 +110,28 @@ class TestOpticsTransform(BaseTester):
 
     def test_feature_holes_of_a_rotation_are_filled_for_the_capture(self):
         given = arrays()
-        out = A.Compose([A.Rotate((30, 30), p=1.0), OpticsTransform(camera())], **DEPTH)(**given)
-        assert (out["depth"] == 0).any()
-        assert np.isin(out["depth"], np.append(given["depth"], 0)).all()
+        chain = [A.Rotate((30, 30), p=1.0), OpticsTransform(camera(), holes="fill")]
+        out = A.Compose(chain, **FILLED)(**given)
+        assert np.isin(out["depth"], given["depth"]).all()
+        assert (out["valid"].dtype, set(np.unique(out["valid"]))) == (np.uint8, {0, 1})
         assert np.isfinite(out["image"]).all()
+
+    def test_feature_the_mask_of_holes_is_moved_beyond_the_image_too(self):
+        """Whether or not the picture is taken, so that a data loader finds one set of keys."""
+        given = arrays()
+        given["depth"][8:14, 20:30] = 0
+        for p in (0.0, 1.0):
+            chain = [OpticsTransform(camera(), p=p, holes="fill"), A.HorizontalFlip(p=1.0), A.Rotate((90, 90), p=1.0)]
+            out = A.Compose(chain, **FILLED)(**given)
+            turned = A.Compose(chain[1:], **DEPTH)(**given)["depth"]
+            assert np.array_equal(out["valid"], (turned > 0).astype(np.uint8))
 
     def test_exception_depth_that_other_transforms_do_not_warp(self):
         chain = A.Compose([A.HorizontalFlip(p=1.0), OpticsTransform(camera(), p=0.01)])
         with pytest.raises(ValueError, match="depth passes through other transforms unwarped: tell them"):
+            chain(**arrays())
+        chain = A.Compose([OpticsTransform(camera(), holes="fill"), A.HorizontalFlip(p=1.0)], **DEPTH)
+        with pytest.raises(ValueError, match=r"valid passes .* additional_targets={'depth': 'mask', 'valid': 'mask'}"):
             chain(**arrays())
 
     def test_exception_interpolated_masks(self):

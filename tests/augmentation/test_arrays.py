@@ -11,7 +11,6 @@ import kornia_tidy
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
 from kornia_tidy.data import read_rgbd
-from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.inference.light_head import LightHead, reconstruct_opencv
 from kornia_tidy.inference.pretrained import load_pretrained
 from tests.base import BaseTester
@@ -82,7 +81,7 @@ class TestSimulate(BaseTester):
         scene = read_rgbd(tmp_path / "a.png", tmp_path / "d.png", scale=0.001)
         expected = optics(scene.image, scene.depth).detach().numpy()[::-1].transpose(1, 2, 0)
         read = cv2.imread(str(tmp_path / "a.png")), cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
-        found = kornia_tidy.simulate(*read, depth_scale=0.001, optics=optics)
+        found = kornia_tidy.simulate(*read, depth_scale=0.001, optics=optics, holes="fill")
         assert np.abs(found / 255 - expected).max() <= 0.5 / 255 + 1e-5
 
     def test_feature_the_same_masks_in_every_call_and_noise_by_seed(self):
@@ -119,8 +118,9 @@ class TestSimulate(BaseTester):
             ({"image": np.full((4, 5, 3), np.nan, np.float32)}, ValueError, r"in \[0, 1\], found nan"),
             ({"depth": np.ones((4, 5), np.uint16)}, ValueError, "depth of uint16 needs depth_scale, .* such as 0.001"),
             ({"depth": np.ones((4, 5), bool)}, TypeError, "depth must be an array of integers or floats, got bool"),
-            ({"depth": -np.ones((4, 5))}, ValueError, "depth must not be negative, got -1.0"),
-            ({"depth": np.zeros((4, 5))}, ValueError, "must be known at one pixel or more"),
+            ({"depth": -np.ones((4, 5))}, ValueError, "depth must be positive metres, got -1.0: fill holes with"),
+            ({"depth": np.zeros((4, 5)), "holes": "fill"}, ValueError, "must be known at one pixel or more"),
+            ({"depth": np.zeros((4, 5))}, ValueError, r"depth must be positive metres, got 0\.0: fill holes with"),
             ({"depth": np.ones((5, 4))}, ValueError, r"rows, columns and batch of the image \(4, 5, 3\), got \(5, 4\)"),
             ({"depth": np.ones((2, 4, 5))}, ValueError, "rows, columns and batch"),
             ({"depth": np.ones((4, 5, 2, 2))}, ValueError, r"depth must have shape .*, got \(4, 5, 2, 2\)"),
@@ -183,16 +183,6 @@ class TestConversion(BaseTester):
         numbers = np.arange(MOST[kind] + 1, dtype=kind).reshape(2, -1)
         assert (to_array(to_tensor(numbers), numbers.dtype, "bgr", 2) == numbers).all()
 
-    def test_feature_holes_get_the_nearest_depth(self, tmp_path):
-        depth = torch.rand(1, 9, 11) + 0.5
-        write_depth(tmp_path / "a.npy", depth)
-        holes = depth[0].numpy().copy()
-        holes[2:5, 3:4], holes[0, 0] = np.nan, 0
-        found = depth_to_tensor(holes)[0, 0]
-        assert torch.equal(found[holes > 0], depth[0][holes > 0])
-        assert found[3, 3] in depth[0, 2:5, 2:5]
-        assert found[0, 0] in depth[0, :2, :2]
-
     @pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float32, np.float64])
     @pytest.mark.parametrize("beneath", [0, 9, 65000, np.nan, -1, 1e20])
     def test_feature_masked_depth_is_a_hole_whatever_lies_beneath_the_mask(self, kind, beneath):
@@ -202,11 +192,9 @@ class TestConversion(BaseTester):
         values = np.array([[500, 0, 2000], [500, 500, 2000]], np.float64)
         values[0, 1] = beneath
         depth = np.ma.masked_array(values.astype(kind), mask=[[0, 1, 0], [0, 0, 0]], fill_value=777)
-        expected = torch.tensor([[[[0.5, 0.5, 2.0], [0.5, 0.5, 2.0]]]])
+        expected = torch.tensor([[[[0.5, 0.0, 2.0], [0.5, 0.5, 2.0]]]])
         self.assert_close(depth_to_tensor(depth, 0.001), expected)
         self.assert_close(depth_to_tensor(np.ma.masked_array(expected[0, 0].numpy())), expected)  # nothing is masked
-        with pytest.raises(ValueError, match="map 0 of 1 holds 0, NaN or masked pixels alone"):
-            depth_to_tensor(np.ma.masked_all((2, 3), kind), 0.001)
 
     def test_feature_masked_images_are_divided_whole_or_refused(self):
         image = np.ma.masked_array(picture("uint8", 4, 5, 3))

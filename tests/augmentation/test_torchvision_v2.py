@@ -17,7 +17,8 @@ from torchvision import tv_tensors  # noqa: E402
 from torchvision.transforms import v2  # noqa: E402
 
 from kornia_tidy.augmentation import RandomTiDyOptics  # noqa: E402
-from kornia_tidy.augmentation.torchvision_v2 import Depth, OpticsTransform  # noqa: E402
+from kornia_tidy.augmentation.torchvision_v2 import Depth, OpticsTransform, Valid  # noqa: E402
+from kornia_tidy.data import Scene  # noqa: E402
 from tests.base import BaseTester  # noqa: E402
 from tests.camera.pipeline_samples import camera, scene  # noqa: E402
 
@@ -157,9 +158,33 @@ class TestOpticsTransform(BaseTester):
 
     def test_feature_holes_of_a_rotation_are_filled_for_the_capture(self):
         given = sample()
-        out = v2.Compose([v2.RandomRotation((30, 30)), OpticsTransform(camera())])(given)
-        assert (plain(out["depth"]) == 0).any()
+        out = v2.Compose([v2.RandomRotation((30, 30)), OpticsTransform(camera(), holes="fill")])(given)
+        assert (plain(out["depth"]) > 0).all()
+        assert 0 < plain(out["valid"]).float().mean() < 1
         assert plain(out["image"]).isfinite().all()
+
+    def test_feature_the_mask_of_holes_is_false_beyond_the_image_whatever_the_fill(self):
+        given = sample()
+        given["depth"][:, 8:14, 20:30] = 0
+        chain = [
+            OpticsTransform(camera(), holes="fill"),
+            v2.RandomHorizontalFlip(1.0),
+            v2.RandomRotation((30, 30), fill=1),
+        ]
+        out = v2.Compose(chain)(given)
+        assert isinstance(out["valid"], Valid)
+        assert torch.equal(plain(out["valid"]), plain(v2.Compose(chain[1:])(given)["depth"]) > 0)
+
+    def test_feature_the_mask_comes_beside_the_depth_wherever_that_stands(self):
+        image, depth = scene(1)
+        depth[..., 3:9, 3:9] = torch.nan
+        transform, known = OpticsTransform(camera(), holes="fill"), depth > 0
+        _, target = transform(tv_tensors.Image(image), {"depth": Depth(depth), "label": 3})
+        assert torch.equal(plain(target["valid"]), known)
+        out = transform(Scene(tv_tensors.Image(image), Depth(depth), None))
+        assert torch.equal(plain(out.valid), known)
+        assert isinstance(out.depth, Depth)
+        assert len(transform(tv_tensors.Image(image), Depth(depth))) == 2
 
     def test_feature_a_random_camera(self):
         given = sample()

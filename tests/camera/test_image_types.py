@@ -157,4 +157,4 @@ class TestAsTransform(BaseTester):
         with pytest.raises(ValueError, match="depth_scale must be positive"):
             camera().as_transform(depth_scale=-1.0)
         with pytest.raises(ValueError, match="depth must be positive metres, got 0"):
-            camera().as_transform()({"image": image, "depth": depth * 0})
+            camera().as_transform(depth_scale=0.001)({"image": image, "depth": depth * 0})

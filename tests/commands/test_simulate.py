@@ -12,6 +12,7 @@ import torch
 from kornia_tidy import PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.commands.options import middle_depths
+from kornia_tidy.data import fill_holes
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
@@ -63,6 +64,19 @@ class TestSimulate(BaseTester):
         assert main(["simulate", "image.png", "--depth", "near.pfm", "-o", "out.png"]) == 0
         assert "(100 %) lie beyond the camera's range" in capsys.readouterr().out
 
+    def test_feature_holes_are_filled_where_it_is_asked_for(self, scene, capsys):
+        depth = read_rgbd("image.png", "depth.pfm").depth
+        depth[0, 20:30, 40:50] = 0
+        np.save("holes.npy", depth[0].numpy())
+        write_depth("filled.pfm", fill_holes(depth)[0])
+        assert main(["simulate", "image.png", "--depth", "holes.npy", "-o", "refused.png"]) == 2
+        assert "holes.npy has no depth at 100 of its 5760 pixels: take it from the nearest" in capsys.readouterr().err
+        assert not (scene / "refused.png").exists()
+        assert main(["simulate", "image.png", "--depth", "holes.npy", "--holes", "fill", "-o", "a.png"]) == 0
+        assert "1.7 % of it unknown and taken from the nearest known pixel" in capsys.readouterr().out
+        assert main(["simulate", "image.png", "--depth", "filled.pfm", "-o", "b.png"]) == 0
+        assert torch.equal(read_image("a.png"), read_image("b.png"))
+
     @pytest.mark.filterwarnings("always")
     @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
     def test_feature_every_option_reaches_the_camera(self, scene, capsys, compositing):
@@ -93,7 +107,7 @@ class TestSimulate(BaseTester):
         image_path, depth_path = (str(shared(f"data/{entry[kind]}")) for kind in ("image", "depth"))
         invalid = [float(v) for v in str(entry["invalid"]).split(",") if v and v != "None"]
         calibration = {k: entry[k] for k in ("focal_px", "baseline_m", "doffs_px") if k in entry}
-        options = [f"--depth-kind={entry['kind']}", f"--depth-scale={entry['scale']}"]
+        options = [f"--depth-kind={entry['kind']}", f"--depth-scale={entry['scale']}", "--holes=fill"]
         options += [f"--invalid={v}" for v in invalid]
         options += [f"--{k.replace('_', '-')}={v}" for k, v in calibration.items()]
         out = str(tmp_path / "out.png")

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import cv2
-import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
 
-from kornia_tidy.data.depth_files import fill_holes, read_depth, write_depth
+from kornia_tidy.data.depth_files import read_depth, write_depth
 from tests.base import BaseTester
 
 STEREO = {"kind": "disparity", "focal_px": 1000.0, "baseline_m": 0.1}
@@ -130,34 +128,6 @@ class TestReadDepth(BaseTester):
             (tmp_path / name).write_bytes(content)
             with pytest.raises(ValueError, match=name):
                 read_depth(tmp_path / name)
-
-
-class TestFillHoles(BaseTester):
-    @settings(max_examples=40)
-    @given(st.integers(0, 2**31), st.floats(0.002, 0.9), st.integers(1, 40), st.integers(1, 40))
-    def test_property_a_hole_takes_the_value_of_its_nearest_neighbour(self, seed, share, height, width):
-        """Against brute force: the pixel it takes its value from is at most 3.8 % farther than the nearest.
-
-        OpenCV measures by steps of 1, 1.4 and 2.1969, which are 0.9825 to 1.0192 times the distance.
-        """
-        rng = np.random.default_rng(seed)
-        known = rng.random((height, width)) < share
-        known[rng.integers(height), rng.integers(width)] = True
-        values = rng.permutation(height * width).reshape(height, width).astype(np.float32) + 1  # tells its pixel
-        filled = fill_holes(np.where(known, values, np.float32(np.nan)), known)
-        assert np.array_equal(filled[known], values[known])
-        place = np.empty((height * width, 2))
-        place[values.astype(int).ravel() - 1] = np.indices((height, width)).reshape(2, -1).T
-        here = np.indices((height, width)).reshape(2, -1).T.astype(float)
-        taken = np.linalg.norm(here - place[filled.astype(int).ravel() - 1], axis=1)
-        nearest = np.linalg.norm(here[:, None] - here[known.ravel()][None], axis=2).min(1)
-        assert np.isin(filled, values[known]).all()
-        assert (taken <= 1.0192 / 0.9824 * nearest + 1e-9).all()
-
-    def test_feature_infinity_fills_too(self):
-        known = np.array([[True, False, False, True]])
-        filled = fill_holes(np.array([[1, 0, 0, np.inf]], np.float32), known)
-        assert filled.tolist() == [[1, 1, INF, INF]]
 
 
 class TestWriteDepth(BaseTester):

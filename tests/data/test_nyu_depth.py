@@ -99,12 +99,6 @@ class TestNYUDepthV2(BaseTester):
         with pytest.raises(FileNotFoundError, match=r"split must be 'train', 'test', 'all' or a text file.*tset"):
             NYUDepthV2(copy, "tset")
 
-    def test_exception_without_scipy_names_the_way_out(self, published, monkeypatch):
-        monkeypatch.setitem(sys.modules, "scipy.io", None)
-        with pytest.raises(ImportError, match=r"pip install 'kornia-tidy\[data\]', or give split= a text file"):
-            NYUDepthV2(published[0], "train")
-        assert len(NYUDepthV2(published[0], "all")) == 5
-
     def test_exception_without_h5py_names_the_extra(self, published, monkeypatch):
         monkeypatch.setitem(sys.modules, "h5py", None)
         with pytest.raises(ImportError, match=r"needs h5py: pip install 'kornia-tidy\[data\]'"):

@@ -93,7 +93,7 @@ def _pictures(folder: Path) -> list[Case]:
         kind, out = kinds.get(path.suffix, path.suffix[1:]), ("-o", "out.png", *CAMERA)
         if path.stem == "depth":
             scale = ("--depth-scale", "0.001") if kind == "png" else ()
-            argv = ("simulate", str(folder / "image.png"), "--depth", "IN", *scale, *out)
+            argv = ("simulate", str(folder / "image.png"), "--depth", "IN", "--holes", "fill", *scale, *out)
         else:
             argv = ("simulate", "IN", "--depth", str(folder / "depth.pfm"), *out)
         cases.append(Case(kind, kind, path, argv, ("out.png",)))

@@ -23,6 +23,8 @@ class Scenes(Dataset):
 
 
 steps = [A.Affine(rotate=(-10, 10), p=1.0), A.Normalize(), ToTensorV2()]
-steps.insert(1, OpticsTransform())  # new
-batch = next(iter(DataLoader(Scenes(A.Compose(steps, additional_targets={"depth": "mask"}, seed=1)))))
+steps.insert(1, OpticsTransform(holes="fill"))  # new
+targets = {"depth": "mask"}
+targets["valid"] = "mask"  # new
+batch = next(iter(DataLoader(Scenes(A.Compose(steps, additional_targets=targets, seed=1)))))
 image, depth = batch["image"], batch["depth"][:, None]

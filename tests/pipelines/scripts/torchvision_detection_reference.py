@@ -13,6 +13,6 @@ boxes = tv_tensors.BoundingBoxes([[4, 4, 30, 40]], format="XYXY", canvas_size=im
 target = {"boxes": boxes, "labels": torch.tensor([1]), "depth": Depth(depths[0])}
 transforms = [v2.ToImage(), v2.RandomZoomOut(p=1.0, side_range=(1.1, 1.3)), v2.RandomHorizontalFlip(0.5)]
 transforms += [v2.SanitizeBoundingBoxes(), v2.ToDtype(torch.float32, scale=True)]
-transforms += [OpticsTransform()]  # new
+transforms += [OpticsTransform(holes="fill")]  # new
 image, target = v2.Compose(transforms)(tv_tensors.Image(images[0]), target)
 depth = target["depth"]

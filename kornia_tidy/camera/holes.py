@@ -1,0 +1,108 @@
+"""Holes of the depth that a camera or an adapter takes: who fills them, and how the mask of known pixels comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
+
+from kornia_tidy.optics.thin_lens import DefocusRange
+
+DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
+
+
+def fills_holes(optics: Any, holes: str = "error") -> bool:
+    """Return whether holes of the depth are filled, by an adapter or by the optics that it calls.
+
+    Args:
+        optics: a :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth.
+        holes: setting of the adapter, ``"error"`` or ``"fill"``.
+
+    Raises:
+        ValueError: if they would be, and the camera takes disparity, in which 0 is a value.
+
+    Example:
+        >>> from kornia_tidy import TiDyOptics
+        >>> fills_holes(TiDyOptics()), fills_holes(TiDyOptics(), "fill"), fills_holes(TiDyOptics(holes="fill"))
+        (False, True, True)
+    """
+    camera = getattr(optics, "optics", optics)  # of an augmentation
+    filled = "fill" in {holes, *(getattr(part, "holes", "error") for part in (optics, camera))}
+    if filled and isinstance(getattr(camera, "camera", None), DefocusRange):
+        raise ValueError(
+            "holes='fill' takes a depth of 0 as unknown, and to a DefocusRange 0 is the far end: fill the holes of "
+            "its disparity before the call, and leave holes='error'"
+        )
+    return filled
+
+
+def with_filled(sample: Any, depth: Any, valid: Any, names: Sequence[str] = DEPTH_KEYS) -> Any:
+    """Return a sample with its depth filled, and the mask of known pixels where it has a place for one.
+
+    Args:
+        sample: a mapping, which gets the mask under ``"valid"``; a named tuple, whose field ``valid``, if it has one,
+            gets it; or another tuple or list ``(image, depth, ...)``, which has no place.
+        depth: without holes.
+        valid: where the depth was known. What comes back is False where the sample says so, too.
+        names: under which a mapping may have the depth.
+
+    Example:
+        >>> import torch
+        >>> valid = torch.tensor([[True, False]])
+        >>> with_filled({"image": None, "depth": None, "mask": ~valid}, torch.ones(1, 2), valid)["valid"]
+        tensor([[False, False]])
+    """
+    if isinstance(sample, Mapping):
+        name = next(name for name in names if name in sample)
+        return {**sample, name: depth, "valid": known_in(sample, valid)}
+    parts, make = [sample[0], depth, *sample[2:]], cast("Any", type(sample))
+    if not hasattr(sample, "_fields"):
+        return make(parts)
+    if "valid" in sample._fields:
+        parts[sample._fields.index("valid")] = valid if sample.valid is None else both_valid(valid, sample.valid)
+    return make(*parts)
+
+
+def both_valid(valid: Any, earlier: Any) -> Any:
+    """Return where two masks of valid pixels are both true.
+
+    Args:
+        valid: bool.
+        earlier: of any type, true where it is positive.
+
+    Raises:
+        ValueError: if their shapes differ.
+    """
+    shape, found = tuple(valid.shape), tuple(getattr(earlier, "shape", ()))
+    if shape != found:
+        raise ValueError(f"valid must have the depth's shape {shape}, got {found}")
+    return valid & (earlier > 0)
+
+
+def with_cropped_valid(sample: Any, margin: int, crop: Callable[[Any, int], Any]) -> Any:
+    """Return a sample whose mask of valid pixels, if it has one, is without so many pixels on each side.
+
+    Args:
+        sample: a mapping with an entry ``"valid"``, a named tuple with such a field, or another one.
+        margin: pixels.
+        crop: crops a map.
+    """
+    named = isinstance(sample, Mapping)
+    valid = sample.get("valid") if named else getattr(sample, "valid", None)
+    if not margin or len(getattr(valid, "shape", ())) < 2:
+        return sample
+    return {**sample, "valid": crop(valid, margin)} if named else sample._replace(valid=crop(valid, margin))
+
+
+def known_in(sample: Mapping[str, Any], valid: Any) -> Any:
+    """Return where a depth was known, less the pixels that the mapping says are not valid.
+
+    Args:
+        sample: may say so by an entry ``"valid"``, or a ``"mask"`` of bool in the shape of ``valid``.
+        valid: where the depth has no hole, bool.
+    """
+    if (earlier := sample.get("valid")) is not None:
+        valid = both_valid(valid, earlier)
+    mask = sample.get("mask")
+    if isinstance(mask, type(valid)) and mask.dtype == valid.dtype and mask.shape == valid.shape:
+        valid = valid & mask
+    return valid
