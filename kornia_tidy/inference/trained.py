@@ -20,6 +20,7 @@ from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.head import ReconstructionHead
@@ -121,16 +122,28 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
     They are evenly spaced over the range of defocus: those of green light for
     :class:`~kornia_tidy.reconstruction.Refocused`, of all colours for
     :class:`~kornia_tidy.reconstruction.LayeredJointHead` and :class:`~kornia_tidy.reconstruction.ClosedForm`, which
-    takes the noise of the sensor too. Other networks are not changed.
+    takes the noise of the sensor too. Other networks are not changed. PSFs that were measured behind no colour filters
+    are those of all colours.
+
+    Raises:
+        ValueError: if the camera has PSFs that were measured in other than one or three colours.
     """
     for module in head.modules():
         if isinstance(module, Refocused):
-            module.set_psfs(optics.psf_bank(1, defocus=_nodes(optics, module.layers)))
+            module.set_psfs(_psf_bank(optics, 1, _nodes(optics, module.layers)))
         elif isinstance(module, ClosedForm | LayeredJointHead):
-            bank = optics.psf_bank(3, defocus=_nodes(optics, module.layers or NODES))
+            bank = _psf_bank(optics, 3, _nodes(optics, module.layers or NODES))
             module.set_psfs(bank, correlate=optics.fidelity.correlate)
             if isinstance(module, ClosedForm) and isinstance(optics.sensor, SensorNoise):
                 module.set_noise(optics.sensor)
+
+
+def _psf_bank(optics: TiDyOptics, channels: int, nodes: list[float]) -> PSFBank:
+    """Return a camera's PSFs for 1 channel, green, or 3; measured ones of the one number serve for the other."""
+    measured = optics.psf_model.measured
+    if measured is None or measured.psfs.shape[1] == channels:
+        return optics.psf_bank(channels, defocus=nodes)
+    return optics.psf_bank(measured.psfs.shape[1], defocus=nodes).with_channels(channels)
 
 
 def _nodes(optics: TiDyOptics, count: int) -> list[float]:

@@ -75,7 +75,8 @@ class PSFModel(ScenePSFs):
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
-        Without gradients, PSFs are remembered while masks and camera stay as they are.
+        Without gradients, PSFs are remembered while masks and camera stay as they are. PSFs that were measured are mixed
+        linearly between their nodes, as a capture mixes them.
 
         Args:
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
@@ -86,9 +87,10 @@ class PSFModel(ScenePSFs):
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = self.bank_dtype(dtype)
         if self.measured is not None:
-            if states or defocus is not None:
-                raise ValueError("PSFs that were measured are known at their own defocus and for the whole exposure")
-            return self._measured_bank(spectrum, dtype)
+            if states:
+                raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
+            bank = self._measured_bank(spectrum, dtype)
+            return bank if defocus is None else bank.at_defocus(defocus)
         now = self.snapshot(dtype)
         nodes, stray_light = now.defocus_nodes if defocus is None else tuple(defocus), now.fidelity.stray_light
         if not states:
