@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_finite
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.heads import CLOSED_FORMS, check_imported, make_head
 from kornia_tidy.inference.settings import SystemSettings
@@ -48,25 +49,37 @@ class TrainedSystem(NamedTuple):
     """Record of the training, such as scores, from a folder of :func:`kornia_tidy.inference.hub.save_pretrained`."""
 
 
-def build_optics(settings: SystemSettings) -> TiDyOptics:
+def build_optics(settings: SystemSettings, psfs: PSFBank | None = None) -> TiDyOptics:
     """Return the camera that settings describe, with the initial masks and a fixed PSF window.
+
+    Args:
+        settings: of a system.
+        psfs: measured ones, for settings that say so.
+
+    Raises:
+        ValueError: if measured PSFs are missing, or given where the settings do not say so.
 
     Example:
         >>> build_optics(SystemSettings(masks=2, window=23)).window
         23
     """
+    if settings.measured != (psfs is not None):
+        raise ValueError(f"settings with measured={settings.measured} {'need' if psfs is None else 'have no'} PSFs")
     fidelity = Fidelity.preset(settings.fidelity).replace(window=settings.window)
     if settings.stray_light is not None:
         fidelity = fidelity.replace(stray_light=settings.stray_light)
     optics = TiDyOptics(
         _masks(settings),
-        settings.camera(),
-        sensor=SensorNoise(settings.sigma),
+        None if settings.measured else settings.camera(),
+        sensor=settings.sensor(),
         fidelity=fidelity,
         compositing=settings.compositing,
         color_space=settings.color_space,
         border=settings.border,
     )
+    if psfs is not None:
+        optics = optics.with_bank(psfs)
+        optics.camera = settings.camera()  # not before: its PSFs without masks may be too wide to be computed
     return fix_window(optics)
 
 
@@ -185,11 +198,42 @@ def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> T
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     _check_sizes(state, settings, str(path))
-    optics, head = build_optics(settings), build_head(settings)
+    try:
+        optics = build_optics(settings, stored_psfs(state))
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    head = build_head(settings)
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
         update_psfs(head, optics)
     return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]), run)
+
+
+def psfs_to_store(optics: TiDyOptics) -> dict[str, Tensor]:
+    """Return the measured PSFs of a camera as tensors by name, for a checkpoint; none if they are computed."""
+    bank = optics.psf_model.measured
+    fields = {} if bank is None else vars(bank)
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def stored_psfs(state: Mapping[str, Any]) -> PSFBank | None:
+    """Return the measured PSFs of a state that was read; None if it has none.
+
+    Raises:
+        ValueError: if they are no PSFs, or a value is not finite.
+    """
+    tensors = state.get("psfs", {})
+    if not isinstance(tensors, Mapping) or not all(isinstance(value, Tensor) for value in tensors.values()):
+        raise ValueError(f"measured PSFs must be tensors by name, got {tensors!r:.80}")
+    if not tensors:
+        return None
+    try:
+        bank = PSFBank(**tensors)
+    except TypeError:
+        raise ValueError(f"measured PSFs must have psfs, defocus and energy, got {sorted(tensors)!r:.80}") from None
+    for name, value in tensors.items():
+        check_finite(f"{name} of the measured PSFs", value)
+    return bank
 
 
 def weights_of(state: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Tensor]:

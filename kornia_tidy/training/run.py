@@ -22,7 +22,16 @@ from torch.utils.data import Dataset
 from kornia_tidy.files import only_here
 from kornia_tidy.inference.heads import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.inference.trained import below, fix_window, head_prefix, load_masks, load_weights, weights_of
+from kornia_tidy.inference.trained import (
+    below,
+    fix_window,
+    head_prefix,
+    load_masks,
+    load_weights,
+    stored_psfs,
+    weights_of,
+)
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.nafnet import deepened
@@ -50,6 +59,7 @@ def train(
     head_from: str | os.PathLike[str] | None = None,
     refiner_from: str | os.PathLike[str] | None = None,
     masks_from: str | os.PathLike[str] | None = None,
+    psfs: PSFBank | None = None,
     captures: str | os.PathLike[str] | None = None,
     save_every: int = 100,
     workers: int = 0,
@@ -70,6 +80,8 @@ def train(
         refiner_from: checkpoint with a network for the image, with whose weights the refiner of ``refined`` begins.
         masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
             as ``camera.safetensors`` of ``kornia-tidy design``.
+        psfs: measured ones, for settings of :func:`~kornia_tidy.inference.measured.measured_settings`. A run that
+            resumes has them in its checkpoint.
         captures: folder of the noise-free captures, for fixed optics. Runs with the same camera and scenes may
             share it. Default: ``captures/`` in the folder of the run.
         save_every: steps between checkpoints within an epoch.
@@ -100,8 +112,8 @@ def train(
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
         stored = folder / "captures" if captures is None else Path(captures)
         return _train(
-            settings, folder, scenes, validation, resume, head_from, refiner_from, masks_from, stored, save_every,
-            workers, progress, trainer_options,
+            settings, folder, scenes, validation, resume, head_from, refiner_from, masks_from, psfs, stored,
+            save_every, workers, progress, trainer_options,
         )  # fmt: skip
 
 
@@ -114,6 +126,7 @@ def _train(
     head_from: str | os.PathLike[str] | None,
     refiner_from: str | os.PathLike[str] | None,
     masks_from: str | os.PathLike[str] | None,
+    psfs: PSFBank | None,
     captures: Path,
     save_every: int,
     workers: int,
@@ -128,6 +141,7 @@ def _train(
         stage: dict[str, Any] = {
             "head_from": head_from,
             "refiner_from": refiner_from,
+            "psfs": psfs,
             "save_every": save_every,
             "workers": workers,
             "progress": progress,
@@ -137,7 +151,10 @@ def _train(
     if checkpoint is not None:  # the window was measured on the masks before training
         settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
-    module = TidyTraining.from_settings(settings, design=checkpoint is None and masks_from is None, progress=progress)
+    psfs = psfs if stored is None else stored_psfs(stored)
+    module = TidyTraining.from_settings(
+        settings, psfs=psfs, design=checkpoint is None and masks_from is None, progress=progress
+    )
     assert module.settings is not None
     if settings.data in PAINTED:
         module.optics.notes.first_time("depth")  # painted in metres: a far scene is no sign of another unit
