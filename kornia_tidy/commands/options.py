@@ -216,7 +216,7 @@ def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTra
 
     if given is None:
         return None, None
-    if isinstance(given, float):
+    if not isinstance(given, str):
         return SensorNoise(given), None
     if not Path(given).exists():
         raise FileNotFoundError(
@@ -255,7 +255,7 @@ def make_optics(args: argparse.Namespace, scene: Scene | None, **options: Any) -
 def refuse_with_psfs(args: argparse.Namespace, names: Sequence[str]) -> None:
     """Raise ``ValueError`` if an option was given for what ``--psfs`` says: lens, masks and distances."""
     for name in names:
-        if (value := getattr(args, name)) is not None and value is not False:
+        if (value := getattr(args, name, None)) is not None and value is not False:
             raise ValueError(f"--psfs has a lens, masks and distances of its own: leave out --{name.replace('_', '-')}")
 
 

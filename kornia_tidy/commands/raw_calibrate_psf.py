@@ -44,7 +44,8 @@ examples:
   Two exposures at each position; the same positions with a flat modulator, which give
   the position of the chief ray; and retrieval of the mask behind these PSFs:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
-        --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors --picture bank.png --fit-mask mask.npy
+        --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors \\
+        --picture bank.png --fit-mask mask.npy
 
 The printed numbers show the accuracy of the bank. "noise" is the expected error, as the
 sum of its moduli relative to the PSF's light. "residuals" of about 1 mean that the
@@ -212,9 +213,7 @@ def _sensor(args: argparse.Namespace) -> tuple[SensorNoise, PhotonTransfer | Non
     return sensor, calibration
 
 
-def _read(
-    path: str, args: argparse.Namespace, calibration: PhotonTransfer | None = None
-) -> tuple[Tensor, Tile | None]:
+def _read(path: str, args: argparse.Namespace, calibration: PhotonTransfer | None = None) -> tuple[Tensor, Tile | None]:
     """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
     if Path(path).suffix.lower() in SUFFIXES:
         return read_image(path), None

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Reconstruct captures of any size with a trained network, or with the closed form of a
-camera that was measured, tile by tile within a memory budget and without visible seams. FILES are camera raw files or pictures (PNG, TIFF,
-JPEG, NPY). For each FILE, FOLDER gets
+camera that was measured, tile by tile within a memory budget and without visible seams.
+FILES are camera raw files or pictures (PNG, TIFF, JPEG, NPY). For each FILE, FOLDER gets
   FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
   FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
   FILE_depth.pfm, .npy    depth in metres, float32, infinity kept

@@ -250,7 +250,7 @@ def _check_arguments(output: Path, args: argparse.Namespace) -> None:
     needs = {"--depth": ("image", args.depth), "--distance": ("points", args.distance)}
     for option, (target, value) in needs.items():
         if (value is None) != (getattr(args, target) is None):
-            raise ValueError(f"--{target} and {option} go together: {'give' if value is None else 'leave out'} {option}")
+            raise ValueError(f"--{target} and {option} go together, got only one of them")
     if args.image is not None and args.size is not None:
         raise ValueError("--size is of --flat and --points: a picture has its own")
     if args.flat is not None and not 0 <= args.flat <= 1:

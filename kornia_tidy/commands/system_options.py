@@ -1,4 +1,4 @@
-"""The system that restores captures, of commands that take one: a name, a checkpoint, or a closed form of measured PSFs."""
+"""The system that restores captures, where a command takes one: shipped, trained, or in closed form."""
 
 from __future__ import annotations
 
@@ -62,11 +62,6 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
 
 def digests(head: str | None, *files: str | float | None) -> dict[str, Any]:
     """Return what a system was made of, to recognise results of the same one: digests of files, and numbers."""
-    paths = [None if head is None or head in CLOSED_FORMS else head_file(head), *files]
-    return {
-        "head": head,
-        "files": [
-            path if path is None or isinstance(path, float) else hashlib.sha256(read_bytes(path)).hexdigest()
-            for path in paths
-        ],
-    }
+    named = () if head is None or head in CLOSED_FORMS else (str(head_file(head)),)
+    read = [hashlib.sha256(read_bytes(f)).hexdigest() if isinstance(f, str) else f for f in (*named, *files)]
+    return {"head": head, "files": read}

@@ -122,9 +122,10 @@ def with_measurements(
     """
     optics, settings = system.optics.with_fidelity(system.optics.fidelity), system.settings  # with the same parts
     if psfs is not None:
-        check_part("the system's camera", optics.camera, ThinLensCamera, "a ThinLensCamera, whose depths are in metres")
-        _check_lens(lens_of(psfs), optics.camera)
-        _check_range(psfs, optics.camera)
+        lens: Any = optics.camera
+        check_part("the system's camera", lens, ThinLensCamera, "a ThinLensCamera, whose depths are in metres")
+        _check_lens(lens_of(psfs), lens)
+        _check_range(psfs, lens)
         optics = fix_window(optics.with_bank(psfs.bank))
         settings = settings.replace(measured=True, window=psfs.bank.window)
     if sensor is not None:

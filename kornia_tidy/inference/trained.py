@@ -64,7 +64,8 @@ def build_optics(settings: SystemSettings, psfs: PSFBank | None = None) -> TiDyO
         23
     """
     if settings.measured != (psfs is not None):
-        raise ValueError(f"settings with measured={settings.measured} {'need' if psfs is None else 'have no'} PSFs")
+        told = "need them" if psfs is None else "are needed where they are given"
+        raise ValueError(f"settings of measured PSFs {told}, got measured={settings.measured}")
     fidelity = Fidelity.preset(settings.fidelity).replace(window=settings.window)
     if settings.stray_light is not None:
         fidelity = fidelity.replace(stray_light=settings.stray_light)

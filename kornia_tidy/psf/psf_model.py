@@ -75,8 +75,8 @@ class PSFModel(ScenePSFs):
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
-        Without gradients, PSFs are remembered while masks and camera stay as they are. PSFs that were measured are mixed
-        linearly between their nodes, as a capture mixes them.
+        Without gradients, PSFs are remembered while masks and camera stay as they are. Measured PSFs are mixed linearly
+        between their nodes, as a capture mixes them.
 
         Args:
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.

@@ -24,8 +24,8 @@ from kornia_tidy.inference.trained import (
     psfs_to_store,
     update_psfs,
 )
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead

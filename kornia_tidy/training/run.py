@@ -151,7 +151,7 @@ def _train(
     if checkpoint is not None:  # the window was measured on the masks before training
         settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
-    psfs = psfs if stored is None else stored_psfs(stored)
+    psfs = psfs if stored is None else _same_psfs(psfs, stored_psfs(stored), checkpoint)
     module = TidyTraining.from_settings(
         settings, psfs=psfs, design=checkpoint is None and masks_from is None, progress=progress
     )
@@ -216,6 +216,13 @@ def _read_run(path: Path) -> dict[str, Any]:
     state = read_state(path)
     weights_of(state, path)
     return state
+
+
+def _same_psfs(given: PSFBank | None, stored: PSFBank | None, path: Path | None) -> PSFBank | None:
+    """Return the measured PSFs of a run, or raise ``ValueError`` if others are given for going on with it."""
+    if given is not None and (stored is None or not torch.equal(given.psfs, stored.psfs)):
+        raise ValueError(f"cannot resume from {path}: its PSFs are not those that are given")
+    return stored
 
 
 def _check_run(

@@ -303,7 +303,10 @@ class TestRawReconstruct(BaseTester):
             ([[*files, twin], weights, folder], "would both become"),
             ([files, weights, folder.parent], "it is an input"),
             ([files, files[0], folder], "is no checkpoint of kornia_tidy"),
-            ([files, "edof-7", folder], f"a system is {', '.join(PRETRAINED)}, or a checkpoint: there is no file edof-7"),
+            (
+                [files, "edof-7", folder],
+                f"a system is {', '.join(PRETRAINED)}, or a checkpoint: there is no file edof-7",
+            ),
             ([files, wide, folder, "--memory", "1"], "the smallest tile of this head"),
         ):
             assert reconstruct(*words) == 2

@@ -110,12 +110,11 @@ class PhotonTransfer:
             raw: the capture.
             name: of its file, for the message.
         """
-        told = [("by", self.camera, raw.info.camera), ("at ISO", self.iso, raw.info.iso)]
+        told = [("by", self.camera, raw.info.camera), ("at ISO", _in_words(self.iso), _in_words(raw.info.iso))]
         if abs(self.white - raw.white) > SAME_WHITE * raw.white:
-            told.append(("with a saturation count of", self.white, raw.white))
+            told.append(("with a saturation count of", _in_words(self.white), _in_words(raw.white)))
         for what, here, there in told:
             if here and there and here != there:
-                here, there = (f"{value:g}" if isinstance(value, float) else value for value in (here, there))
                 raise ValueError(f"the noise was measured {what} {here}, and {name} was taken {what} {there}")
 
     def sensor_noise(self) -> SensorNoise:
@@ -272,6 +271,10 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON's are ValueErrors
         raise ValueError(f"{path} is not a readable noise calibration: {error!s:.200}") from None
     return result
+
+
+def _in_words(value: float | None) -> str:
+    return "" if value is None else f"{value:g}"
 
 
 # ---------------------------------------------------------------------- the fit

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -109,7 +110,7 @@ class MeasuredPSFs:
         bank = PSFBank.load(path, device)
         found, notes = read_tensors(path, "PSF bank", device)
         names = [name for name in ("measured.uncertainty", "measured.distances") if name in found]
-        tensors = {name.removeprefix("measured."): found[name] for name in names}
+        tensors: dict[str, Any] = {name.removeprefix("measured."): found[name] for name in names}
         try:
             reports = tuple(PointReport(**report) for report in parse_json(notes.get("reports", "")))
             measured = cls(bank, reports=reports, **tensors)
@@ -135,7 +136,8 @@ def _over(camera: ThinLensCamera, distances: Tensor) -> ThinLensCamera:
     near, far = float(distances.min()), float(distances.max())
     if near == far:
         near, far = near * (1 - ONE_DISTANCE), far * (1 + ONE_DISTANCE)
-    return ThinLensCamera(**{name: float(getattr(camera, name)) for name in LENS}, depth_range=(near, far))
+    lens: dict[str, Any] = {name: float(getattr(camera, name)) for name in LENS}
+    return ThinLensCamera(depth_range=(near, far), **lens)
 
 
 def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil | None = None) -> float:
