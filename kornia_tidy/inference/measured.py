@@ -20,6 +20,7 @@ from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
+from kornia_tidy.reconstruction.tiled import shared_copy
 from kornia_tidy.sensor.noise import SensorNoise
 
 DEFOCUS_BEYOND = 2.0  # rad; a network may be for depths that the measured PSFs miss by so little
@@ -113,7 +114,7 @@ def with_measurements(
     """Return a trained system for the camera that was measured: its network is told the PSFs and the noise.
 
     Args:
-        system: camera and network. Its network is changed in place, if it deconvolves captures.
+        system: camera and network, which are not changed; masks and weights are shared.
         psfs: that replace those of the system's masks. None: they stay.
         sensor: that replaces the system's. None: it stays.
 
@@ -131,8 +132,9 @@ def with_measurements(
     if sensor is not None:
         optics.sensor = sensor
         settings = settings.replace(**noise_settings(sensor))
-    update_psfs(system.head, optics)
-    return system._replace(optics=optics, settings=settings)
+    head = shared_copy(system.head)
+    update_psfs(head, optics)
+    return system._replace(optics=optics, head=head, settings=settings)
 
 
 def takes_psfs(head: nn.Module) -> bool:

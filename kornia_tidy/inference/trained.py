@@ -155,9 +155,9 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
 def _psf_bank(optics: TiDyOptics, channels: int, nodes: list[float]) -> PSFBank:
     """Return a camera's PSFs for 1 channel, green, or 3; measured ones of the one number serve for the other."""
     measured = optics.psf_model.measured
-    if measured is None or measured.psfs.shape[1] == channels:
+    if measured is None:
         return optics.psf_bank(channels, defocus=nodes)
-    return optics.psf_bank(measured.psfs.shape[1], defocus=nodes).with_channels(channels)
+    return measured.to(optics.masks.phase.device).at_defocus(nodes).with_channels(channels)
 
 
 def _nodes(optics: TiDyOptics, count: int) -> list[float]:

@@ -91,6 +91,11 @@ class PSFBank:
         psfs = psfs + missing * psfs.sum(2, keepdim=True)
         return PSFBank(psfs.flatten(1, 2), self.defocus, self.energy)
 
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> PSFBank:
+        """Return the bank on a device and in a data type; None: as it is."""
+        present = {name: value for name in _FIELDS if (value := getattr(self, name)) is not None}
+        return PSFBank(**{name: value.to(device, dtype or value.dtype) for name, value in present.items()})
+
     def at_defocus(self, defocus: Sequence[float]) -> PSFBank:
         """Return the PSFs at other defocus, as a capture through linear layers has them.
 

@@ -89,7 +89,7 @@ class PSFModel(ScenePSFs):
         if self.measured is not None:
             if states:
                 raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
-            bank = self._measured_bank(spectrum, dtype)
+            bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
         now = self.snapshot(dtype)
         nodes, stray_light = now.defocus_nodes if defocus is None else tuple(defocus), now.fidelity.stray_light

@@ -258,8 +258,7 @@ class ScenePSFs(WidePSFs):
         bank = cast("PSFBank", self.measured)
         if bank.psfs.shape[1] != len(spectrum.weights):
             raise ValueError(f"the measured PSFs have {bank.psfs.shape[1]} channels, not {len(spectrum.weights)}")
-        veil = None if bank.veil is None else bank.veil.to(device, dtype)
-        return PSFBank(*(x.to(device, dtype) for x in (bank.psfs, bank.defocus, bank.energy)), veil)
+        return bank.to(device, dtype)
 
     # ------------------------------------------------------------------ the exposure
 

@@ -26,6 +26,7 @@ from kornia_tidy.calibration.noise.transfer_curve import (
     temporal_points,
     tile_of,
 )
+from kornia_tidy.checks import check_number
 from kornia_tidy.files import parse_json, read_bytes, write_bytes
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.sensor.noise import SensorNoise
@@ -267,6 +268,8 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         points = tuple(_numbers(CurvePoint, point) for point in document.pop("points"))
         line = _numbers(TransferLine, document.pop("line"))
         result = PhotonTransfer(line=line, channels=channels, points=points, **document)
+        if result.iso is not None:
+            check_number("iso", result.iso)
         result.sensor_noise()
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON's are ValueErrors
         raise ValueError(f"{path} is not a readable noise calibration: {error!s:.200}") from None
