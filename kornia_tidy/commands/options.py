@@ -212,12 +212,12 @@ def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTra
         FileNotFoundError: if there is no such file.
         ValueError: if the file holds no calibration of the noise.
     """
-    from kornia_tidy.calibration.noise.photon_transfer import read_json  # noqa: PLC0415 (takes a second)
-
     if given is None:
         return None, None
     if not isinstance(given, str):
         return SensorNoise(given), None
+    from kornia_tidy.calibration.noise.photon_transfer import read_json  # noqa: PLC0415 (takes a second)
+
     if not Path(given).exists():
         raise FileNotFoundError(
             f"--noise is a number, of full scale, or a file of raw calibrate-noise: there is no file {given:.80}"

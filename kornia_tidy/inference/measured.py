@@ -40,7 +40,7 @@ def measured_settings(psfs: MeasuredPSFs) -> dict[str, Any]:
     Raises:
         ValueError: if the lens is unknown.
     """
-    camera = lens_of(psfs)
+    camera = psfs.known_camera()
     return {
         "measured": True,
         "masks": 0,
@@ -61,20 +61,6 @@ def noise_settings(sensor: SensorNoise) -> dict[str, Any]:
         {'sigma': 0.01, 'full_well': None, 'bits': None}
     """
     return {name: getattr(sensor, name) for name in ("sigma", "full_well", "bits")}
-
-
-def lens_of(psfs: MeasuredPSFs) -> ThinLensCamera:
-    """Return the lens of measured PSFs.
-
-    Raises:
-        ValueError: if it is unknown.
-    """
-    if psfs.camera is None:
-        raise ValueError(
-            "the measured PSFs come without the lens that turns distance into defocus: measure them again with "
-            "kornia-tidy raw calibrate-psf"
-        )
-    return psfs.camera
 
 
 @torch.no_grad()
@@ -125,7 +111,7 @@ def with_measurements(
     if psfs is not None:
         lens: Any = optics.camera
         check_part("the system's camera", lens, ThinLensCamera, "a ThinLensCamera, whose depths are in metres")
-        _check_lens(lens_of(psfs), lens)
+        _check_lens(psfs.known_camera(), lens)
         _check_range(psfs, lens)
         optics = fix_window(optics.with_bank(psfs.bank))
         settings = settings.replace(measured=True, window=psfs.bank.window)

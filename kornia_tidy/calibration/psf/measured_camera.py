@@ -35,13 +35,8 @@ def measured_camera(psfs: MeasuredPSFs | str | os.PathLike[str], **options: Any)
         >>> optics.window, optics.camera.depth_range
         (5, (0.5, 0.8))
     """
-    source = "the measured PSFs" if isinstance(psfs, MeasuredPSFs) else f"the PSFs of {psfs}"
     measured = psfs if isinstance(psfs, MeasuredPSFs) else MeasuredPSFs.load(psfs)
-    if measured.camera is None:
-        raise ValueError(
-            f"{source} come without the lens that turns distance into defocus: measure them again with raw "
-            f"calibrate-psf, or take TiDyOptics(camera=...).with_bank(bank)"
-        )
+    camera = measured.known_camera()
     optics = TiDyOptics(FresnelLens(), **options).with_bank(measured.bank)
-    optics.camera = measured.camera  # not before: PSFs of this lens without its masks may be too wide to be computed
+    optics.camera = camera  # not before: PSFs of this lens without its masks may be too wide to be computed
     return optics

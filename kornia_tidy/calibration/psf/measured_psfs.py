@@ -80,6 +80,19 @@ class MeasuredPSFs:
         if tuple(self.distances.shape) != shape[:1]:
             raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
 
+    def known_camera(self) -> ThinLensCamera:
+        """Return the lens.
+
+        Raises:
+            ValueError: if it is unknown.
+        """
+        if self.camera is None:
+            raise ValueError(
+                "the measured PSFs come without the lens that turns distance into defocus: measure them again with "
+                "kornia-tidy raw calibrate-psf, or take TiDyOptics(camera=...).with_bank(bank)"
+            )
+        return self.camera
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the measurement as a safetensors file, whose bank :meth:`PSFBank.load` reads.
 

@@ -102,7 +102,7 @@ class TestMeasuredCamera(BaseTester):
         path = tmp_path / "bank.safetensors"
         replace(psfs, camera=None).save(path)
         assert MeasuredPSFs.load(path).camera is None
-        with pytest.raises(ValueError, match=r"bank\.safetensors come without the lens"):
+        with pytest.raises(ValueError, match="come without the lens"):
             measured_camera(path)
 
     @pytest.mark.parametrize(
