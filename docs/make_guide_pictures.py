@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import glob
 import re
 import shlex
 import tempfile
@@ -50,8 +51,11 @@ def draw(page: Path, path: Path) -> Path:
             if language == "python":
                 exec(compile(text, str(page), "exec"), names)  # noqa: S102 (a page of this repository)
             elif not slow:
-                for line in text.splitlines():
-                    kornia_tidy(shlex.split(line, comments=True)[1:])
+                for line in text.replace("\\\n", " ").splitlines():
+                    words = shlex.split(line, comments=True)
+                    words = [found for word in words for found in sorted(glob.glob(word)) or [word]]
+                    if status := kornia_tidy(words[1:]):
+                        raise RuntimeError(f"{page.name}: {line} ends with {status}")
             if Path("guide.png").exists():
                 break
         cv2.imwrite(str(path), cv2.imread("guide.png"), [cv2.IMWRITE_JPEG_QUALITY, 88])

@@ -48,7 +48,11 @@ PUBLISHED_NETWORKS = {
     "zoedepth": "Intel/zoedepth-nyu",
 }  # made small in the folder, so that nothing is downloaded
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
-SLOW: set[str] = {"docs/guides/raw_files.md", "docs/raw.md"}  # pages that take more than about ten seconds
+SLOW: set[str] = {
+    "docs/guides/laboratory.md",
+    "docs/guides/raw_files.md",
+    "docs/raw.md",
+}  # pages that take more than about ten seconds
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 MARKS = re.compile(r"(?:<!-- (?:needs|slow|run with): (?:(?!-->).)+ -->\n)+\Z", re.DOTALL)

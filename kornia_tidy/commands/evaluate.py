@@ -10,17 +10,21 @@ from typing import Any
 
 from tqdm import tqdm
 
-from kornia_tidy.commands.options import seed
+from kornia_tidy.commands.options import add_noise_option, add_psfs_option, read_noise, seed
 from kornia_tidy.commands.report import tell
+from kornia_tidy.commands.system_options import load_system
 from kornia_tidy.commands.training_options import add_scene_options, given_settings
+from kornia_tidy.inference.heads import CLOSED_FORMS
+from kornia_tidy.inference.pretrained import PRETRAINED
 from kornia_tidy.inference.tasks import MAPS
-from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.evaluation import SceneResult, draw_scene, evaluate, metric_range, table, write_table
 from kornia_tidy.training.settings import TrainingSettings
 
 DESCRIPTION = """\
-Evaluate a trained camera and network on scenes that were not used for training. FOLDER
+Evaluate a trained camera and network, or the closed form of a camera that was measured,
+on scenes that were not used for training. With --psfs and --noise the captures are those
+of the measured camera, and a network that deconvolves them is told its PSFs. FOLDER
 gets results.csv (one line per scene), summary.json (means and settings), and pictures of
 the first scenes: capture, estimates, ground truth, and errors times 3.
 
@@ -43,8 +47,15 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run)
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="best.safetensors or last.safetensors of a run")
+    parser.add_argument(
+        "checkpoint",
+        metavar="SYSTEM",
+        help=f"best.safetensors or last.safetensors of a run; {', '.join(PRETRAINED)}; or with --psfs "
+        f"{', '.join(CLOSED_FORMS)}, which need no training",
+    )
     parser.add_argument("-o", "--output", metavar="FOLDER", help="made if missing (default: evaluation, beside it)")
+    add_psfs_option(parser, ", which takes the captures")
+    add_noise_option(parser, "that of the training")
     parser.add_argument(
         "--scenes", type=int, metavar="N", help="number (default: the whole test split; 32 of generated scenes)"
     )
@@ -64,7 +75,8 @@ def run(args: argparse.Namespace) -> None:
     folder = Path(args.output) if args.output else Path(args.checkpoint).parent / "evaluation"
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write into {folder}: it is not a folder")
-    system = load_trained(args.checkpoint)
+    sensor, _ = read_noise(args.noise)
+    system = load_system(args.checkpoint, args.psfs, sensor)
     trained = TrainingSettings.of(system)
     settings = trained.replace(**{name: value for name, value in given_settings(args).items() if name != "scenes"})
     if settings.data != trained.data and "root" not in args:
@@ -84,6 +96,7 @@ def run(args: argparse.Namespace) -> None:
 
         rows = evaluate(system, scenes, args.noise_seed, each)
     about = {"checkpoint": str(args.checkpoint), "step": system.step, "noise_seed": args.noise_seed, "split": split}
+    about |= {"psfs": args.psfs, "noise": args.noise}
     near, far = metric_range(settings.camera())
     write_table(folder, rows, {**about, "metres_counted": [near, far], "settings": settings.as_dict()})
     for line in table(rows):

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.image_files import SUFFIXES
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.files import check_writable
+from kornia_tidy.mask_export.mask_files import read_heights
+from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.sensor.noise import SensorNoise
 
+if TYPE_CHECKING:
+    from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
+
+LENS_OPTIONS = ("focal_length", "aperture_diameter", "focus_distance", "pixel_pitch")
+MASKS = 5  # in one exposure
 MOST_PROCESSES = 1024  # more would exhaust a machine
 MOST_MASKS = 1024  # PSFs of more masks take days
 
@@ -81,20 +93,76 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
 
 def add_lens_options(group: argparse._ArgumentGroup) -> None:
     """Add options for lens and pixel pitch in SI units; missing defaults are those of the camera."""
-    group.add_argument(
-        "--focal-length", type=float, default=50e-3, metavar="M", help="longer enlarges the PSF (default: 0.05)"
-    )
+    group.add_argument("--focal-length", type=float, metavar="M", help="longer enlarges the PSF (default: 0.05)")
     group.add_argument(
         "--aperture-diameter", type=float, metavar="M", help="wider blurs more out of focus (default: 0.002835, f/17.6)"
     )
     group.add_argument("--focus-distance", type=float, metavar="M", help="depth seen sharply (default: 0.595)")
     group.add_argument(
-        "--pixel-pitch",
-        type=float,
-        default=8e-6,
-        metavar="M",
-        help="smaller enlarges the PSF in pixels (default: 8e-6)",
+        "--pixel-pitch", type=float, metavar="M", help="smaller enlarges the PSF in pixels (default: 8e-6)"
     )
+
+
+def add_mask_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options of the masks that are shown in one exposure."""
+    group.add_argument(
+        "--masks",
+        type=masks,
+        metavar="K|FILE",
+        help=f"their number, of random height, or a file of their heights (default: {MASKS})",
+    )
+    group.add_argument("--mask-seed", type=seed, metavar="N", help="seed of random heights (default: 0)")
+
+
+def add_noise_option(parser: Any, default: str) -> None:
+    """Add the option of the sensor's noise, as a number or as it was measured.
+
+    Args:
+        parser: or a group of one.
+        default: what is taken without it, in words.
+    """
+    parser.add_argument(
+        "--noise",
+        type=noise,
+        metavar="S|FILE",
+        help="standard deviation of the read noise in linear light, of full scale; or the file that 'kornia-tidy raw "
+        f"calibrate-noise' wrote (default: {default})",
+    )
+
+
+def add_psfs_option(parser: Any, more: str = "") -> None:
+    """Add the option of measured PSFs.
+
+    Args:
+        parser: or a group of one.
+        more: to be added to the help.
+    """
+    parser.add_argument(
+        "--psfs",
+        metavar="FILE",
+        help=f"the camera whose PSFs 'kornia-tidy raw calibrate-psf' measured: lens, masks and distances{more}",
+    )
+
+
+def noise(text: str) -> float | str:
+    """Parse a noise: a number, or the file of a calibration.
+
+    Example:
+        >>> noise("0.01"), noise("iso800.json")
+        (0.01, 'iso800.json')
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        return text
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"a noise must be zero or positive and finite, of full scale, got {text}")
+    return value
+
+
+def masks(text: str) -> int | str:
+    """Parse the number of masks, or the file of their heights."""
+    return mask_count(text) if text.lstrip("+-").isdigit() else text
 
 
 def seed(text: str) -> int:
@@ -137,7 +205,61 @@ def read_scene(args: argparse.Namespace) -> Scene:
     )
 
 
-def make_camera(args: argparse.Namespace, scene: Scene) -> ThinLensCamera:
+def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTransfer | None]:
+    """Return the sensor of ``--noise``, and the calibration if it was measured; None for what was not given.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file holds no calibration of the noise.
+    """
+    if given is None:
+        return None, None
+    if not isinstance(given, str):
+        return SensorNoise(given), None
+    from kornia_tidy.calibration.noise.photon_transfer import read_json  # noqa: PLC0415 (takes a second)
+
+    if not Path(given).exists():
+        raise FileNotFoundError(
+            f"--noise is a number, of full scale, or a file of raw calibrate-noise: there is no file {given:.80}"
+        )
+    measured = read_json(given)
+    return measured.sensor_noise(), measured
+
+
+def make_optics(args: argparse.Namespace, scene: Scene | None, **options: Any) -> TiDyOptics:
+    """Return the camera of the arguments: that which was measured, or one of lens and masks.
+
+    Args:
+        args: with the options of :func:`add_camera_options`, :func:`add_mask_options` and :func:`add_psfs_option`.
+        scene: for ``--fit-depth``, if there is one.
+        options: further ones of :class:`~kornia_tidy.TiDyOptics`.
+
+    Raises:
+        ValueError: if ``--psfs`` comes with an option for what was measured with them.
+    """
+    if args.psfs is not None:
+        from kornia_tidy.calibration.psf.measured_camera import measured_camera  # noqa: PLC0415 (takes a second)
+
+        refuse_with_psfs(args, (*LENS_OPTIONS, "depth_range", "fit_depth", "masks", "mask_seed"))
+        return measured_camera(args.psfs, **options)
+    if isinstance(args.masks, str):
+        if args.mask_seed is not None:
+            raise ValueError("--mask-seed is of masks of random height, and --masks is a file: leave one of them out")
+        shown = PixelwiseMask(initial=read_heights(args.masks))
+    else:
+        generator = torch.Generator().manual_seed(args.mask_seed or 0)
+        shown = PixelwiseMask(MASKS if args.masks is None else args.masks, generator=generator)
+    return TiDyOptics(shown, camera=make_camera(args, scene), **options)
+
+
+def refuse_with_psfs(args: argparse.Namespace, names: Sequence[str]) -> None:
+    """Raise ``ValueError`` if an option was given for what ``--psfs`` says: lens, masks and distances."""
+    for name in names:
+        if (value := getattr(args, name, None)) is not None and value is not False:
+            raise ValueError(f"--psfs has a lens, masks and distances of its own: leave out --{name.replace('_', '-')}")
+
+
+def make_camera(args: argparse.Namespace, scene: Scene | None) -> ThinLensCamera:
     """Return the camera named by the arguments, or the one that fits the scene.
 
     Raises:
@@ -148,20 +270,16 @@ def make_camera(args: argparse.Namespace, scene: Scene) -> ThinLensCamera:
     for name in ("aperture_diameter", "focus_distance", "depth_range"):
         if getattr(args, name) is not None:
             raise ValueError(f"--fit-depth chooses --{name.replace('_', '-')}: give one of the two")
-    return ThinLensCamera.for_scene(
-        middle_depths(scene.depth, scene.valid), focal_length=args.focal_length, pixel_pitch=args.pixel_pitch
-    )
+    if scene is None:
+        raise ValueError("--fit-depth needs a scene with a range of depths")
+    given = {name: value for name in ("focal_length", "pixel_pitch") if (value := getattr(args, name)) is not None}
+    return ThinLensCamera.for_scene(middle_depths(scene.depth, scene.valid), **given)
 
 
 def make_lens(args: argparse.Namespace, depth_range: tuple[float, float] | None) -> ThinLensCamera:
     """Return the camera named by the arguments of :func:`add_lens_options`, for a range of depths."""
-    given = {"aperture_diameter": args.aperture_diameter, "focus_distance": args.focus_distance}
-    return ThinLensCamera(
-        focal_length=args.focal_length,
-        pixel_pitch=args.pixel_pitch,
-        depth_range=depth_range,
-        **{name: value for name, value in given.items() if value is not None},
-    )
+    given = {name: value for name in LENS_OPTIONS if (value := getattr(args, name)) is not None}
+    return ThinLensCamera(depth_range=depth_range, **given)
 
 
 def middle_depths(depth: Tensor, valid: Tensor) -> tuple[float, float]:

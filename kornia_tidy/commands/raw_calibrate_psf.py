@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.commands.options import add_lens_options, make_lens
+from kornia_tidy.commands.options import add_lens_options, add_noise_option, make_lens, read_noise
 from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, open_raw
 from kornia_tidy.commands.report import Stages, tell
 from kornia_tidy.data.image_files import SUFFIXES, read_image
@@ -20,6 +20,7 @@ from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.sensor.noise import SensorNoise
 
 if TYPE_CHECKING:
+    from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.calibration.psf.point_images import Tile
 
 DESCRIPTION = """\
@@ -38,12 +39,13 @@ EXAMPLES = """\
 examples:
   Three distances, 8 places of the point at each:
     kornia-tidy raw calibrate-psf d1_*.dng d2_*.dng d3_*.dng \\
-        --distances 0.35 0.6 1.5 --full-well 10500 --read-noise 2.4 -o bank.safetensors
+        --distances 0.35 0.6 1.5 --noise iso800.json -o bank.safetensors
 
   Two exposures at each position; the same positions with a flat modulator, which give
   the position of the chief ray; and retrieval of the mask behind these PSFs:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
-        --reference flat*.tif -o bank.safetensors --picture bank.png --fit-mask mask.npy
+        --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors \\
+        --picture bank.png --fit-mask mask.npy
 
 The printed numbers show the accuracy of the bank. "noise" is the expected error, as the
 sum of its moduli relative to the PSF's light. "residuals" of about 1 mean that the
@@ -88,8 +90,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--fit-mask", metavar="NPY", help="find the mask behind the PSFs and write its heights, metres")
     parser.add_argument("--mask-size", type=int, default=23, metavar="N", help="its pixels along a side (default: 23)")
     noise = parser.add_argument_group("noise of the sensor")
-    noise.add_argument("--full-well", type=float, required=True, metavar="E", help="electrons from black to white")
-    noise.add_argument("--read-noise", type=float, required=True, metavar="E", help="electrons")
+    noise.add_argument("--full-well", type=float, metavar="E", help="electrons from black to white")
+    noise.add_argument("--read-noise", type=float, metavar="E", help="electrons")
+    add_noise_option(noise, "by --full-well and --read-noise")
     add_lens_options(parser.add_argument_group("camera", "Lengths in metres."))
     add_dump_options(parser)
     parser.set_defaults(run=run)
@@ -178,7 +181,7 @@ def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
     """Read the pictures of one position after another, and keep only crops around the points."""
     from kornia_tidy.calibration.psf.point_images import point_images  # noqa: PLC0415
 
-    sensor = SensorNoise.physical(args.full_well, args.read_noise)
+    sensor, calibration = _sensor(args)
     exposures = torch.tensor(args.exposures)
     files = iter(args.files)
     references = iter(args.reference or [])
@@ -186,7 +189,7 @@ def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
     for distance in args.distances:
         images[distance] = []
         for _ in range(places):
-            frames, tiles = zip(*[_read(next(files), args) for _ in args.exposures], strict=True)
+            frames, tiles = zip(*[_read(next(files), args, calibration) for _ in args.exposures], strict=True)
             if len({frame.shape for frame in frames}) > 1:
                 raise ValueError(f"the exposures of one place differ in size: {[tuple(f.shape) for f in frames]}")
             reference = _read(next(references), args)[0] if args.reference else None
@@ -196,11 +199,27 @@ def _images(args: argparse.Namespace, places: int) -> dict[float, list[Any]]:
     return images
 
 
-def _read(path: str, args: argparse.Namespace) -> tuple[Tensor, Tile | None]:
+def _sensor(args: argparse.Namespace) -> tuple[SensorNoise, PhotonTransfer | None]:
+    """Return the noise of the arguments, and its calibration if it was measured."""
+    given = args.full_well, args.read_noise
+    if args.noise is None:
+        if None in given:
+            raise ValueError("the noise of the sensor is needed: --noise, or --full-well and --read-noise")
+        return SensorNoise.physical(*given), None
+    if given != (None, None):
+        raise ValueError("--noise says full well and read noise: leave out --full-well and --read-noise")
+    sensor, calibration = read_noise(args.noise)
+    assert sensor is not None
+    return sensor, calibration
+
+
+def _read(path: str, args: argparse.Namespace, calibration: PhotonTransfer | None = None) -> tuple[Tensor, Tile | None]:
     """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
     if Path(path).suffix.lower() in SUFFIXES:
         return read_image(path), None
     raw = open_raw(path, args)
+    if calibration is not None:
+        calibration.check_taken_alike(raw, path)
     rows, columns = raw.tile
     if (rows, columns) not in {(1, 1), (2, 2)}:
         raise ValueError(f"cannot measure PSFs on {path}: its tile is {rows}x{columns}, 2x2 or none is needed")

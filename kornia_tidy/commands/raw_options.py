@@ -21,7 +21,7 @@ def add_dump_options(parser: argparse.ArgumentParser) -> None:
         "A headerless file needs a description: give --size, --pattern, --black\n"
         "and --white, and all FILES are read as such dumps, row by row.",
     )
-    group.add_argument("--size", type=_size, metavar="WxH", help="columns x rows, such as 768x512")
+    group.add_argument("--size", type=size, metavar="WxH", help="columns x rows, such as 768x512")
     group.add_argument(
         "--pattern",
         type=str.upper,
@@ -96,7 +96,7 @@ def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
         raise ValueError(f"{failed} of {len(paths)} files failed")
 
 
-def _size(text: str) -> tuple[int, int]:
+def size(text: str) -> tuple[int, int]:
     """Return rows and columns of WIDTHxHEIGHT."""
     match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
     if match is None:

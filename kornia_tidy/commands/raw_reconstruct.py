@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import time
 from collections.abc import Callable
@@ -18,15 +17,18 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.commands.file_jobs import Row, table, work_on_all
+from kornia_tidy.commands.options import add_noise_option, add_psfs_option, read_noise
 from kornia_tidy.commands.raw_develop import SUFFIXES, add_white_balance_option, output_paths, parse_white_balance
 from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, open_raw
 from kornia_tidy.commands.report import tell
+from kornia_tidy.commands.system_options import CLOSED_FORM, digests, load_system
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.figures.depth import draw_depth
 from kornia_tidy.figures.style import require_matplotlib
-from kornia_tidy.files import parse_json, read_bytes, remove_leftovers, write_bytes
-from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED
+from kornia_tidy.files import parse_json, remove_leftovers, write_bytes
+from kornia_tidy.inference.heads import CLOSED_FORMS
+from kornia_tidy.inference.pretrained import PRETRAINED
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
@@ -37,12 +39,14 @@ from kornia_tidy.reconstruction.tiled import OVERLAP
 from kornia_tidy.sensor.noise import SensorNoise
 
 if TYPE_CHECKING:
+    from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
+    from kornia_tidy.inference.trained import TrainedSystem
 
 DESCRIPTION = """\
-Reconstruct captures of any size with a trained network, tile by tile within a memory
-budget and without visible seams. FILES are camera raw files or pictures (PNG, TIFF,
-JPEG, NPY). For each FILE, FOLDER gets
+Reconstruct captures of any size with a trained network, or with the closed form of a
+camera that was measured, tile by tile within a memory budget and without visible seams.
+FILES are camera raw files or pictures (PNG, TIFF, JPEG, NPY). For each FILE, FOLDER gets
   FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
   FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
   FILE_depth.pfm, .npy    depth in metres, float32, infinity kept
@@ -62,8 +66,8 @@ masks and lens of the captures. The library includes, for a 50 mm lens and pixel
   edof-flat                   picture: no masks; f/48, at 0.74 m
   joint-uncertain             picture, depth and its uncertainty: five masks; f/28.5, at 0.6 m
   joint-5, joint-1, joint-0   picture and depth, by small networks; f/17.6, at 0.6 m
-A network that begins with the closed form takes the noise of each pixel: of raw files
-with a noise profile (DNG) from it, else as --noise says.
+A network that begins with the closed form, and the closed form itself, take the noise of
+each pixel: as --noise says, or of raw files with a noise profile (DNG) from it.
 """
 
 EXAMPLES = """\
@@ -81,6 +85,9 @@ examples:
 
   A better picture, in seven times the time:
     kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o best --orientations 8
+
+  A camera that was measured, without a network:
+    kornia-tidy raw reconstruct shots/*.dng --psfs bank.safetensors --noise iso800.json -o sharp
 
   A network of one's own; of two files, one is read and written while the other is computed:
     kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths --jobs 2
@@ -105,8 +112,11 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files, or pictures")
     parser.add_argument(
-        "--head", required=True, help=f"{', '.join(PRETRAINED)}, or a checkpoint of a training (best.safetensors)"
+        "--head",
+        help=f"{', '.join(PRETRAINED)}, or a checkpoint of a training (best.safetensors); with --psfs also "
+        f"{', '.join(CLOSED_FORMS)} (default with --psfs: {CLOSED_FORM})",
     )
+    add_psfs_option(parser, ", by which captures are deconvolved")
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="where to; made if it is not there")
     parser.add_argument("--format", choices=tuple(SUFFIXES), default="png", help="of the 16-bit picture (default: png)")
     parser.add_argument(
@@ -114,13 +124,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--linear", action="store_true", help="FILES that are pictures hold linear light, not sRGB")
     add_white_balance_option(parser)
-    parser.add_argument(
-        "--noise",
-        type=float,
-        metavar="S",
-        help="standard deviation in linear light, of full scale, for a network that takes it (default: by the noise "
-        "profile of the raw file, else that of the simulated sensor)",
-    )
+    add_noise_option(parser, "by the noise profile of the raw file, else that of the network's simulated sensor")
     parser.add_argument("--resume", action="store_true", help="skip files whose results are there and still right")
     parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)")
     parser.add_argument(
@@ -150,26 +154,27 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> None:
     """Reconstruct captures."""
     from kornia_tidy.inference.light_head import LightHead, reconstruct_light, with_noise_of  # noqa: PLC0415
-    from kornia_tidy.inference.trained import load_trained  # noqa: PLC0415
+    from kornia_tidy.inference.measured import takes_psfs  # noqa: PLC0415
 
     parse_white_balance(args.white_balance)
-    if args.noise is not None:
+    if isinstance(args.noise, float):
         check_positive("noise", args.noise, "in units of full scale")
-    weights = head_file(args.head)
-    system = load_trained(weights)
-    head = LightHead(system, orientations=args.orientations).to(torch.device(args.device))
+    sensor, calibration = read_noise(args.noise)
+    system = load_system(args.head, args.psfs, sensor)
     if args.noise is not None and not takes_noise(system.head):
         raise ValueError(f"--noise is for a network that takes it, and that of {args.head} does not")
+    if args.psfs is not None and not takes_psfs(system.head):
+        raise ValueError(f"--psfs is for a network that deconvolves captures, and that of {args.head} does not")
+    head = LightHead(system, orientations=args.orientations).to(torch.device(args.device))
     suffixes = result_suffixes(system.settings.task, args.format, uncertain=head.uncertain)
     if "_depth_colors.png" in suffixes:
         require_matplotlib()
     folder = Path(args.output)
     outputs = output_paths(args.files, folder, suffixes)
     made_by = {
-        "weights": hashlib.sha256(read_bytes(weights)).hexdigest(),
+        "system": digests(args.head, args.psfs, args.noise),
         "depth_unit": args.depth_unit,
         "linear": args.linear,
-        "noise": args.noise,
         "overlap": args.overlap,
         "orientations": args.orientations,
         "white_balance": args.white_balance,
@@ -179,7 +184,8 @@ def run(args: argparse.Namespace) -> None:
     if args.resume:
         remove_leftovers(folder)
     reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
-    tell("network", f"{args.head}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
+    name = args.head or args.psfs
+    tell("network", f"{name}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
 
     def work(path: str, progress: Callable[[int, int], None]) -> Row:
         start = time.perf_counter()
@@ -187,7 +193,9 @@ def run(args: argparse.Namespace) -> None:
         paths = outputs[path]
         if args.resume and is_finished(paths, said):
             return Row(path, "kept")
-        light, upright, info, noise = read_light(path, args)
+        light, upright, info, noise = read_light(path, args, sensor, calibration)
+        if args.psfs is not None:
+            _check_measured(path, len(light), noise, system)
         own = with_noise_of(head, noise)  # no other thread's
         budget = (args.memory << 20) // args.jobs
         result = reconstruct_light(own, light, memory_budget=budget, overlap=args.overlap, progress=progress)
@@ -204,20 +212,6 @@ def run(args: argparse.Namespace) -> None:
     tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
     if failed:
         raise ValueError(f"{failed} of {len(rows)} files failed")
-
-
-def head_file(head: str) -> Path:
-    """Return the file of a network, by the name of one that comes with the library or by its own.
-
-    Example:
-        >>> head_file("edof-5").name
-        'edof-5.safetensors'
-    """
-    if head in PRETRAINED:
-        return FOLDER / f"{head}.safetensors"
-    if not Path(head).exists():
-        raise FileNotFoundError(f"--head is {', '.join(PRETRAINED)}, or a checkpoint: there is no file {head}")
-    return Path(head)
 
 
 def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list[str]:
@@ -239,21 +233,28 @@ def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list
 
 
 def read_light(
-    path: str, args: argparse.Namespace
+    path: str, args: argparse.Namespace, sensor: SensorNoise | None = None, calibration: PhotonTransfer | None = None
 ) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any], SensorNoise | None]:
     """Read a capture as linear light, with its upright orientation, its camera and exposure data, and its noise.
 
-    The noise is that of --noise, or else of the noise profile of a raw file; None where there is neither.
+    Args:
+        path: of the file.
+        args: how it is to be read.
+        sensor: noise that was given. None: that of the noise profile of a raw file, if it has one.
+        calibration: measurement of the noise, whose sensor has the units of the raw file before it is developed.
     """
-    given = None if args.noise is None else SensorNoise(args.noise)
     if args.size is None and Path(path).suffix.lower() in PICTURES:
         picture = read_image(path)
-        return picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1)), _as_it_is, {}, given
+        light = picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1))[: len(picture)]
+        return light, _as_it_is, {}, sensor
     raw: RawCapture = open_raw(path, args)
     white_balance = parse_white_balance(args.white_balance)
     light = develop(raw, white_balance=white_balance, encoded=False, upright=False)
     bare = replace(raw, counts=torch.empty(0))  # keeps the orientation without the counts
-    return light, bare.upright, vars(raw.info), given or developed_noise(raw, white_balance)
+    if calibration is not None:
+        calibration.check_taken_alike(raw, path)
+    noise = sensor if sensor is not None and calibration is None else developed_noise(raw, white_balance, sensor)
+    return light, bare.upright, vars(raw.info), noise
 
 
 def write_results(
@@ -311,10 +312,22 @@ def _identity(path: str) -> dict[str, Any]:
     return {"file": Path(path).name, "bytes": state.st_size, "modified": state.st_mtime_ns}
 
 
+def _check_measured(path: str, colors: int, noise: SensorNoise | None, system: TrainedSystem) -> None:
+    """Raise ``ValueError`` if a capture has other colours than the measured PSFs, or a closed form lacks its noise."""
+    measured = system.optics.psf_model.measured
+    assert measured is not None
+    if colors != (channels := measured.psfs.shape[1]):
+        raise ValueError(f"the PSFs were measured in {channels} colours, and {path} has {colors}")
+    if noise is None and not system.step:
+        raise ValueError(f"the noise of {path} is not known: give --noise")
+
+
 def _in_words(head: LightHead, args: argparse.Namespace) -> dict[str, str]:
     """Describe the results of a file for the summary."""
     unit, (near, far) = args.depth_unit, head.camera.depth_range
-    words = {"head": args.head}
+    words = {"head": args.head or CLOSED_FORM}
+    if args.psfs is not None:
+        words["psfs"] = f"measured: {args.psfs}"
     if "image" in MAPS[head.task]:
         words["image"] = "all in focus, 16 bits, encoded as sRGB"
     if "depth" in MAPS[head.task]:

@@ -18,10 +18,14 @@ from kornia_tidy.coded_datasets.layout import BESIDE, Layout
 from kornia_tidy.coded_datasets.render_scenes import render_scenes, shard_items_within
 from kornia_tidy.commands.options import processes, seed
 from kornia_tidy.commands.report import tell
-from kornia_tidy.commands.training_options import add_camera_settings, add_scene_options, given_settings
+from kornia_tidy.commands.training_options import (
+    add_camera_settings,
+    add_scene_options,
+    given_settings,
+    measured_camera_settings,
+)
 from kornia_tidy.files import read_bytes
 from kornia_tidy.inference.trained import build_optics, load_trained
-from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.systems.presets import SYSTEMS
 from kornia_tidy.training.data_sets import SPLITS, make_scenes
 from kornia_tidy.training.settings import TrainingSettings
@@ -30,7 +34,8 @@ OF_SCENES = ("data", "root", "size", "scenes", "validation_scenes", "depth_range
 OF_CAMERA = (
     "masks", "focal_length", "pixel_pitch", "depth_range", "sigma", "fidelity", "compositing", "border",
 )  # fmt: skip
-OF_PRESET = ("sigma", "fidelity", "compositing", "border")  # options that replace a part of a published system
+OF_MEASURED = ("full_well", "bits")  # known of a camera if its noise was measured
+OF_PRESET = ("noise", "fidelity", "compositing", "border")  # options that replace a part of a published system
 
 PLACES = (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS"))  # in the environment, by torchrun and by srun
 
@@ -178,12 +183,14 @@ def run(args: argparse.Namespace) -> None:
 
 def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dict[str, Any]]:
     """Return the camera, the settings of its scenes, and the origin of the camera."""
-    given = {name: value for name, value in given_settings(args).items() if name != "scenes"}
+    measured, psfs = measured_camera_settings(args)
+    given = {name: value for name, value in given_settings(args).items() if name != "scenes"} | measured
     if args.scenes is not None:
         given |= {"scenes": args.scenes, "validation_scenes": args.scenes}
     own = [name for name in OF_CAMERA if name in given]
+    asked = ["psfs"] * (psfs is not None) + ["noise" if name == "sigma" else name for name in own]
     allowed, source = (OF_PRESET, "--preset") if args.preset else ((), "--checkpoint")
-    if (args.preset or args.checkpoint) and (wrong := [name for name in own if name not in allowed]):
+    if (args.preset or args.checkpoint) and (wrong := [name for name in asked if name not in allowed]):
         raise ValueError(f"--{wrong[0].replace('_', '-')} does not go with {source}, which has its own")
     if args.checkpoint:
         system = load_trained(args.checkpoint)
@@ -194,10 +201,14 @@ def _camera(args: argparse.Namespace) -> tuple[TiDyOptics, TrainingSettings, dic
         return system.optics, trained.replace(**given), {"checkpoint": str(args.checkpoint), "sha256": digest}
     settings = TrainingSettings().replace(**given)
     if not args.preset:
-        return build_optics(settings), settings, {"options": {name: getattr(settings, name) for name in OF_CAMERA}}
+        options = {name: getattr(settings, name) for name in (*OF_CAMERA, *(n for n in OF_MEASURED if n in given))}
+        made_from: dict[str, Any] = {"options": options}
+        if psfs is not None:
+            made_from["psfs"] = hashlib.sha256(read_bytes(args.psfs)).hexdigest()
+        return build_optics(settings, psfs), settings, made_from
     overrides: dict[str, Any] = {name: given[name] for name in own if name != "sigma"}
-    if "sigma" in own:
-        overrides["sensor"] = SensorNoise(settings.sigma)
+    if args.noise is not None:
+        overrides["sensor"] = settings.sensor()
     noise = torch.Generator().manual_seed(settings.seed)
     optics = TiDyOptics.from_preset(args.preset, generator=noise, **overrides)
     seen = settings.replace(depth_range=getattr(optics.camera, "depth_range", None))

@@ -8,20 +8,29 @@ from typing import Any
 
 import torch
 
-from kornia_tidy.camera.tidy_optics import COLOR_SPACES, TiDyOptics
+from kornia_tidy.camera.tidy_optics import COLOR_SPACES
 from kornia_tidy.commands.options import (
     add_camera_options,
     add_depth_options,
+    add_mask_options,
+    add_noise_option,
+    add_psfs_option,
     check_output,
-    make_camera,
-    mask_count,
+    make_optics,
+    read_noise,
     read_scene,
     seed,
 )
-from kornia_tidy.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
+from kornia_tidy.commands.report import (
+    Stages,
+    clamped_in_words,
+    light_in_words,
+    masks_in_words,
+    scene_in_words,
+    tell,
+)
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.sensor.noise import SensorNoise
@@ -78,19 +87,12 @@ def add_parser(subparsers: Any) -> None:
     )
     add_camera_options(parser)
 
-    masks = parser.add_argument_group("masks", "23 x 23 pixels of random height, the start of training.")
-    masks.add_argument("--masks", type=mask_count, default=5, metavar="K", help="shown in one exposure (default: 5)")
-    masks.add_argument("--mask-seed", type=seed, default=0, metavar="N", help="seed of their heights (default: 0)")
+    add_psfs_option(parser)
+    add_mask_options(parser.add_argument_group("masks", "Random ones have 23 x 23 pixels: the start of training."))
 
     capture = parser.add_argument_group("capture")
     capture.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the sensor's noise (default: 0)")
-    capture.add_argument(
-        "--sigma",
-        type=float,
-        default=0.01,
-        metavar="S",
-        help="standard deviation of the read noise; 1 is full scale, in linear light (default: 0.01)",
-    )
+    add_noise_option(capture, "0.01")
     capture.add_argument(
         "--fidelity", choices=tuple(PRESETS), default="balanced", help="speed or accuracy (default: balanced)"
     )
@@ -118,7 +120,8 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> None:
     """Simulate the capture and write it."""
     output = args.output or f"{Path(args.image).stem}_coded.png"
-    check_output(output, args.image, args.depth, bits=args.bits)
+    check_output(output, args.image, args.depth, args.psfs, bits=args.bits)
+    sensor, _ = read_noise(args.noise)
     stages = Stages()
     with torch.no_grad():
         with stages("read"):
@@ -131,10 +134,10 @@ def run(args: argparse.Namespace) -> None:
         tell("scene", scene_in_words(scene))
 
         with stages("PSFs"):
-            optics = TiDyOptics(
-                PixelwiseMask(args.masks, generator=torch.Generator().manual_seed(args.mask_seed)),
-                camera=make_camera(args, scene),
-                sensor=SensorNoise(args.sigma),
+            optics = make_optics(
+                args,
+                scene,
+                sensor=sensor or SensorNoise(),
                 fidelity=args.fidelity,
                 compositing=args.compositing,
                 color_space=args.color_space,
@@ -142,7 +145,7 @@ def run(args: argparse.Namespace) -> None:
             )
             bank = optics.psf_bank(channels=scene.image.shape[0])
         tell("camera", optics.camera.extra_repr())
-        tell("masks", f"{optics.masks.extra_repr()}, noise of seed {args.mask_seed}")
+        tell("masks", masks_in_words(args, optics))
         tell("PSFs", light_in_words(bank, optics))
         tell("capture", f"{optics.compositing}, {optics.border} border, {optics.color_space} colour, {optics.sensor}")
 

@@ -9,7 +9,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from kornia_tidy.commands.options import processes, seed
+from kornia_tidy.commands.options import processes, refuse_with_psfs, seed
 from kornia_tidy.commands.report import tell
 from kornia_tidy.commands.training_options import (
     add_camera_settings,
@@ -18,6 +18,7 @@ from kornia_tidy.commands.training_options import (
     add_scene_options,
     add_setting,
     given_settings,
+    measured_camera_settings,
 )
 from kornia_tidy.figures.learning_curve import draw_learning_curve
 from kornia_tidy.inference.tasks import MAPS
@@ -88,6 +89,8 @@ examples:
       -o outputs/designed
     kornia-tidy train --learn network --masks 1 --start flat --f-number 48 --focus 0.74 \\
       --electrons 500 57000 -o outputs/flat
+  A network for a camera that was measured:
+    kornia-tidy train --learn network --psfs bank.safetensors --noise iso800.json -o outputs/mine
   Depth with its uncertainty, and the image, in some minutes on a CPU:
     kornia-tidy train --task joint --start "like fishers" --depth-classes 32 --refocus 11 --width 8 \\
       --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 -o outputs/uncertain
@@ -227,7 +230,10 @@ def run(args: argparse.Namespace) -> None:
             f"--devices must be the number of processes that torchrun started, WORLD_SIZE={started}, got {args.devices}"
         )
     folder = Path(args.output)
-    given = given_settings(args)
+    measured, psfs = measured_camera_settings(args)
+    if psfs is not None:
+        refuse_with_psfs(args, ("design_from", "masks_from"))
+    given = {**given_settings(args), **measured}
     if args.design_from is not None:
         given = {**designed_settings(args.design_from), **given}
     if args.resume and (folder / SETTINGS).exists():
@@ -253,6 +259,7 @@ def run(args: argparse.Namespace) -> None:
             head_from=args.head_from,
             refiner_from=args.refiner_from,
             masks_from=masks_from,
+            psfs=psfs,
             captures=args.captures,
             save_every=args.save_every,
             workers=args.workers,

@@ -6,13 +6,20 @@ import argparse
 from dataclasses import fields
 from typing import Any
 
+from kornia_tidy.commands.options import add_noise_option, add_psfs_option, read_noise, refuse_with_psfs
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.inference.heads import CLOSED_FORMS, HEADS
-from kornia_tidy.psf.psf_bank import STRAY_LIGHT
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
 from kornia_tidy.reconstruction.closed_form import INVERSES
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.training.data_sets import SCENES
 from kornia_tidy.training.settings import TrainingSettings
+
+OF_MEASURED = (
+    "masks", "start", "mask_size", "design", "focal_length", "pixel_pitch", "depth_range", "f_number", "focus",
+    "window", "stray_light",
+)  # fmt: skip
+"""Settings of a camera that are measured with its PSFs."""
 
 
 def add_setting(group: Any, name: str, help: str, **options: Any) -> None:  # noqa: A002 (argparse calls it so)
@@ -132,7 +139,8 @@ def add_camera_settings(group: Any) -> None:
     )
     add_setting(group, "focal_length", type=float, metavar="M", help="metres")
     add_setting(group, "pixel_pitch", type=float, metavar="M", help="metres")
-    add_setting(group, "sigma", type=float, metavar="S", help="read noise, of full scale")
+    add_psfs_option(group)
+    add_noise_option(group, "0.01")
     add_setting(group, "fidelity", choices=tuple(PRESETS), help="speed or accuracy")
     add_setting(group, "window", type=int, metavar="PX", help="side of the PSFs, odd; default: measured on the masks")
     add_setting(
@@ -145,3 +153,22 @@ def add_camera_settings(group: Any) -> None:
 def given_settings(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings given on the command line, without defaults."""
     return {field.name: getattr(args, field.name) for field in fields(TrainingSettings) if field.name in args}
+
+
+def measured_camera_settings(args: argparse.Namespace) -> tuple[dict[str, Any], PSFBank | None]:
+    """Return the settings of the camera that ``--psfs`` and ``--noise`` say, and the measured PSFs, if any.
+
+    Raises:
+        FileNotFoundError: if a file is not there.
+        ValueError: if a file is of another kind, or an option was given for what was measured with the PSFs.
+    """
+    from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs  # noqa: PLC0415 (takes a second)
+    from kornia_tidy.inference.measured import measured_settings, noise_settings  # noqa: PLC0415
+
+    sensor, _ = read_noise(args.noise)
+    settings = {} if sensor is None else noise_settings(sensor)
+    if args.psfs is None:
+        return settings, None
+    refuse_with_psfs(args, OF_MEASURED)
+    measured = MeasuredPSFs.load(args.psfs)
+    return {**settings, **measured_settings(measured)}, measured.bank

@@ -17,11 +17,12 @@ from torch import Tensor
 from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.inference.half_precision import halved
 from kornia_tidy.inference.model_card import check_license, model_card
-from kornia_tidy.inference.trained import TrainedSystem, system_of_state
+from kornia_tidy.inference.trained import TrainedSystem, below, psfs_to_store, system_of_state
 from kornia_tidy.runtime.search_path import import_installed
 from kornia_tidy.tensor_files import read_tensors
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"  # the names of huggingface_hub's mixins
+PSFS = "psfs."  # begins the names of measured PSFs
 LIBRARY, FORMAT = "kornia_tidy", "kornia_tidy system 1"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
 
@@ -60,7 +61,7 @@ def save_pretrained(
 
     Convention:
         - Names and layout are those of ``huggingface_hub.ModelHubMixin``. Weights have the names of the camera's and
-          the network's states after ``optics.`` and ``head.``.
+          the network's states after ``optics.`` and ``head.``, measured PSFs those of a bank after ``psfs.``.
         - ``config.json`` is standard JSON: infinity is written as the text ``"inf"``. The folder that the training data
           lay in (``root``) is left out.
 
@@ -165,7 +166,7 @@ def _weights(system: TrainedSystem) -> dict[str, Tensor]:
         f"{part}.{name}": value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for part, module in parts.items()
         for name, value in module.state_dict().items()
-    }
+    } | {f"{PSFS}{name}": value.detach().cpu() for name, value in psfs_to_store(system.optics).items()}
 
 
 def _state(config: Mapping[str, Any], weights: Mapping[str, Tensor], name: str) -> dict[str, Any]:
@@ -180,7 +181,8 @@ def _state(config: Mapping[str, Any], weights: Mapping[str, Tensor], name: str) 
         known["depth_range"] = [math.inf if end == "inf" else end for end in ends]
     if known.get("focus") == "inf":
         known["focus"] = math.inf
-    return {"settings": known, "global_step": config.get("global_step"), "state_dict": dict(weights)}
+    psfs, others = below(weights, PSFS), {k: v for k, v in weights.items() if not k.startswith(PSFS)}
+    return {"settings": known, "global_step": config.get("global_step"), "state_dict": others, "psfs": psfs}
 
 
 def _standard(value: Any) -> Any:

@@ -131,6 +131,8 @@ def _metadata(settings: SystemSettings, license: str | None) -> str:  # noqa: A0
 
 def _masks(system: TrainedSystem) -> str:
     settings = system.settings
+    if settings.measured:
+        return "a camera whose PSFs were measured"
     if not settings.masks:
         return "a fixed Fresnel lens"
     if system.optics.masks.is_flat():
@@ -142,15 +144,18 @@ def _camera(system: TrainedSystem) -> list[tuple[str, str]]:
     settings = system.settings
     camera = settings.camera()
     near, far = camera.depth_range
+    masks = "none" if system.optics.masks.is_flat() else str(settings.masks)
+    masks, psfs = ("as they were measured",) * 2 if settings.measured else (masks, f"fidelity {settings.fidelity!r}")
+    well = "" if settings.full_well is None else f", full well of {settings.full_well:.4g} electrons"
     return [
         ("task", settings.task),
-        ("phase masks", "none" if system.optics.masks.is_flat() else str(settings.masks)),
+        ("phase masks", masks),
         ("lens", f"{camera.focal_length * 1e3:.4g} mm, f/{camera.focal_length / camera.aperture_diameter:.3g}"),
         ("focused at", _distance(float(camera.focus_distance))),
         ("range of depth", f"{near:.4g} m to {_distance(far)}"),
         ("pixel pitch", f"{camera.pixel_pitch * 1e6:.4g} µm"),
-        ("read noise", f"{settings.sigma:.4g} of full scale"),
-        ("PSFs", f"fidelity {settings.fidelity!r}, window {settings.window} pixels"),
+        ("read noise", f"{settings.sigma:.4g} of full scale{well}"),
+        ("PSFs", f"{psfs}, window {settings.window} pixels"),
         ("compositing", settings.compositing),
         ("network", f"{settings.head}, width {settings.width or 'by default'}"),
         ("begins from", _beginning(settings)),

@@ -22,6 +22,7 @@ from kornia_tidy.reconstruction.closed_form import INVERSES
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
+from kornia_tidy.sensor.noise import SensorNoise
 
 Distance = float  # metres, may be infinite
 MOST = 1024  # masks, their pixels along a side, blocks, or depths to refocus to: more would take days
@@ -45,7 +46,11 @@ class SystemSettings:
             lens, from 0.298 m to infinity.
         f_number: focal length over the diameter of the aperture. None: f/17.6, or as chosen for ``depth_range``.
         focus: distance in focus in metres; may be ``inf``. None: the middle of the range of inverse depth.
+        measured: PSFs were measured, see :func:`~kornia_tidy.inference.measured.measured_settings`. Checkpoints hold
+            them, and ``masks`` take no part.
         sigma: read noise of the sensor, in units of full scale.
+        full_well: electrons at full scale, for shot noise. None: no shot noise.
+        bits: bits of the sensor's converter. None: no rounding.
         fidelity: name of the preset by which PSFs are computed.
         window: side of the PSFs in pixels. None: measured on the initial masks, then fixed.
         stray_light: what becomes of the light outside the window, see :class:`~kornia_tidy.fidelity.Fidelity`. None: as
@@ -93,7 +98,10 @@ class SystemSettings:
     depth_range: tuple[float, float] | None = None
     f_number: float | None = None
     focus: Distance | None = None
+    measured: bool = False
     sigma: float = 0.01
+    full_well: float | None = None
+    bits: int | None = None
     fidelity: str = "balanced"
     window: int | None = None
     stray_light: str | None = None
@@ -183,6 +191,10 @@ class SystemSettings:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some values changed."""
         return replace(self, **changes)
+
+    def sensor(self) -> SensorNoise:
+        """Return the sensor with its noise."""
+        return SensorNoise(self.sigma, full_well=self.full_well, bits=self.bits)
 
     def camera(self) -> ThinLensCamera:
         """Return the lens and the sensor's pixels."""

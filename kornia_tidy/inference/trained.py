@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.saved_camera import below, camera_of_state, masks_of_state
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_finite
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.inference.heads import CLOSED_FORMS, check_imported, make_head
 from kornia_tidy.inference.settings import SystemSettings
@@ -21,6 +22,7 @@ from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE, check_settings, settings_of
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.head import ReconstructionHead
@@ -48,25 +50,38 @@ class TrainedSystem(NamedTuple):
     """Record of the training, such as scores, from a folder of :func:`kornia_tidy.inference.hub.save_pretrained`."""
 
 
-def build_optics(settings: SystemSettings) -> TiDyOptics:
+def build_optics(settings: SystemSettings, psfs: PSFBank | None = None) -> TiDyOptics:
     """Return the camera that settings describe, with the initial masks and a fixed PSF window.
+
+    Args:
+        settings: of a system.
+        psfs: measured ones, for settings that say so.
+
+    Raises:
+        ValueError: if measured PSFs are missing, or given where the settings do not say so.
 
     Example:
         >>> build_optics(SystemSettings(masks=2, window=23)).window
         23
     """
+    if settings.measured != (psfs is not None):
+        told = "need them" if psfs is None else "are needed where they are given"
+        raise ValueError(f"settings of measured PSFs {told}, got measured={settings.measured}")
     fidelity = Fidelity.preset(settings.fidelity).replace(window=settings.window)
     if settings.stray_light is not None:
         fidelity = fidelity.replace(stray_light=settings.stray_light)
     optics = TiDyOptics(
         _masks(settings),
-        settings.camera(),
-        sensor=SensorNoise(settings.sigma),
+        None if settings.measured else settings.camera(),
+        sensor=settings.sensor(),
         fidelity=fidelity,
         compositing=settings.compositing,
         color_space=settings.color_space,
         border=settings.border,
     )
+    if psfs is not None:
+        optics = optics.with_bank(psfs)
+        optics.camera = settings.camera()  # not before: its PSFs without masks may be too wide to be computed
     return fix_window(optics)
 
 
@@ -122,16 +137,28 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
     They are evenly spaced over the range of defocus: those of green light for
     :class:`~kornia_tidy.reconstruction.Refocused`, of all colours for
     :class:`~kornia_tidy.reconstruction.LayeredJointHead` and :class:`~kornia_tidy.reconstruction.ClosedForm`, which
-    takes the noise of the sensor too. Other networks are not changed.
+    takes the noise of the sensor too. Other networks are not changed. PSFs that were measured behind no colour filters
+    are those of all colours.
+
+    Raises:
+        ValueError: if the camera has PSFs that were measured in other than one or three colours.
     """
     for module in head.modules():
         if isinstance(module, Refocused):
-            module.set_psfs(optics.psf_bank(1, defocus=_nodes(optics, module.layers)))
+            module.set_psfs(_psf_bank(optics, 1, _nodes(optics, module.layers)))
         elif isinstance(module, ClosedForm | LayeredJointHead):
-            bank = optics.psf_bank(3, defocus=_nodes(optics, module.layers or NODES))
+            bank = _psf_bank(optics, 3, _nodes(optics, module.layers or NODES))
             module.set_psfs(bank, correlate=optics.fidelity.correlate)
             if isinstance(module, ClosedForm) and isinstance(optics.sensor, SensorNoise):
                 module.set_noise(optics.sensor)
+
+
+def _psf_bank(optics: TiDyOptics, channels: int, nodes: list[float]) -> PSFBank:
+    """Return a camera's PSFs for 1 channel, green, or 3; measured ones of the one number serve for the other."""
+    measured = optics.psf_model.measured
+    if measured is None:
+        return optics.psf_bank(channels, defocus=nodes)
+    return measured.to(optics.masks.phase.device).at_defocus(nodes).with_channels(channels)
 
 
 def _nodes(optics: TiDyOptics, count: int) -> list[float]:
@@ -173,11 +200,42 @@ def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> T
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     _check_sizes(state, settings, str(path))
-    optics, head = build_optics(settings), build_head(settings)
+    try:
+        optics = build_optics(settings, stored_psfs(state))
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    head = build_head(settings)
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
         update_psfs(head, optics)
     return TrainedSystem(optics.eval(), head.eval(), settings, int(state["global_step"]), run)
+
+
+def psfs_to_store(optics: TiDyOptics) -> dict[str, Tensor]:
+    """Return the measured PSFs of a camera as tensors by name, for a checkpoint; none if they are computed."""
+    bank = optics.psf_model.measured
+    fields = {} if bank is None else vars(bank)
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def stored_psfs(state: Mapping[str, Any]) -> PSFBank | None:
+    """Return the measured PSFs of a state that was read; None if it has none.
+
+    Raises:
+        ValueError: if they are no PSFs, or a value is not finite.
+    """
+    tensors = state.get("psfs", {})
+    if not isinstance(tensors, Mapping) or not all(isinstance(value, Tensor) for value in tensors.values()):
+        raise ValueError(f"measured PSFs must be tensors by name, got {tensors!r:.80}")
+    if not tensors:
+        return None
+    try:
+        bank = PSFBank(**tensors)
+    except TypeError:
+        raise ValueError(f"measured PSFs must have psfs, defocus and energy, got {sorted(tensors)!r:.80}") from None
+    for name, value in tensors.items():
+        check_finite(f"{name} of the measured PSFs", value)
+    return bank
 
 
 def weights_of(state: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -114,6 +114,57 @@ class PSFBank:
         light = self.psfs.sum((2, 3), keepdim=True)
         psfs = (1 - TAILS) * self.psfs + TAILS * light * (tails / tails.sum())
         return PSFBank(psfs, self.defocus, self.energy, self.veil)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> PSFBank:
+        """Return the bank on a device and in a data type; None: as it is."""
+        present = {name: value for name in _FIELDS if (value := getattr(self, name)) is not None}
+        return PSFBank(**{name: value.to(device, dtype or value.dtype) for name, value in present.items()})
+
+    def at_defocus(self, defocus: Sequence[float]) -> PSFBank:
+        """Return the PSFs at other defocus, as a capture through linear layers has them.
+
+        Between two nodes they are mixed linearly. Beyond the first and the last node they are those of that node.
+
+        Args:
+            defocus: nodes in radians, ascending.
+
+        Example:
+            >>> bank = PSFBank(torch.tensor([0.0, 1.0]).view(2, 1, 1, 1), torch.tensor([-1.0, 1.0]), torch.ones(2, 1))
+            >>> bank.at_defocus([-3.0, 0.5, 1.0]).psfs.flatten()
+            tensor([0.0000, 0.7500, 1.0000])
+        """
+        wanted = torch.as_tensor(defocus, dtype=torch.float64, device=self.defocus.device)
+        nodes = self.defocus.double()
+        upper = torch.searchsorted(nodes, wanted).clamp(1, max(len(nodes) - 1, 1)).clamp(max=len(nodes) - 1)
+        lower = (upper - 1).clamp(min=0)
+        span = (nodes[upper] - nodes[lower]).clamp(min=torch.finfo(torch.float64).tiny)
+        share = ((wanted - nodes[lower]) / span).clamp(0, 1)
+
+        def mixed(values: Tensor) -> Tensor:
+            weight = share.to(values).view(-1, *[1] * (values.ndim - 1))
+            return torch.lerp(values[lower], values[upper], weight)
+
+        veil = None if self.veil is None else mixed(self.veil)
+        return PSFBank(mixed(self.psfs), wanted.to(self.defocus), mixed(self.energy), veil)
+
+    def with_channels(self, channels: int) -> PSFBank:
+        """Return the PSFs of one channel for three colours, or green of three for one channel.
+
+        Args:
+            channels: 1 or 3.
+
+        Raises:
+            ValueError: if they are of another number of channels, or another one is asked for.
+
+        Example:
+            >>> PSFBank.from_measured(torch.rand(2, 1, 5, 5), torch.arange(2.0)).with_channels(3).psfs.shape
+            torch.Size([2, 3, 5, 5])
+        """
+        chosen = {(1, 3): [0, 0, 0], (3, 1): [1]}.get((own := self.psfs.shape[1], channels), list(range(own)))
+        if len(chosen) != channels:
+            raise ValueError(f"PSFs of {channels} channels are needed, got {own}")
+        veil = None if self.veil is None else self.veil[:, chosen]
+        return PSFBank(self.psfs[:, chosen], self.defocus, self.energy[:, chosen], veil)
 
     def save(
         self,

@@ -206,7 +206,8 @@ class PSFModel:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
-        Without gradients, PSFs are remembered while masks and camera stay as they are.
+        Without gradients, PSFs are remembered while masks and camera stay as they are. Measured PSFs are mixed linearly
+        between their nodes, as a capture mixes them.
 
         Args:
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
@@ -217,9 +218,10 @@ class PSFModel:
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = self.bank_dtype(dtype)
         if self.measured is not None:
-            if states or defocus is not None:
-                raise ValueError("PSFs that were measured are known at their own defocus and for the whole exposure")
-            return self._measured_bank(spectrum, dtype)
+            if states:
+                raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
+            bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
+            return bank if defocus is None else bank.at_defocus(defocus)
         now = self.snapshot(dtype)
         nodes, stray_light = now.defocus_nodes if defocus is None else tuple(defocus), now.fidelity.stray_light
         if not states:
@@ -360,8 +362,7 @@ class PSFModel:
         bank = cast("PSFBank", self.measured)
         if bank.psfs.shape[1] != len(spectrum.weights):
             raise ValueError(f"the measured PSFs have {bank.psfs.shape[1]} channels, not {len(spectrum.weights)}")
-        veil = None if bank.veil is None else bank.veil.to(device, dtype)
-        return PSFBank(*(x.to(device, dtype) for x in (bank.psfs, bank.defocus, bank.energy)), veil)
+        return bank.to(device, dtype)
 
     # ------------------------------------------------------------------ the exposure
 

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 LEAST = 1e-12  # variance, in units of full scale squared
 
 
-def developed_noise(raw: RawCapture, white_balance: str | Tensor | None = None) -> SensorNoise | None:
+def developed_noise(
+    raw: RawCapture, white_balance: str | Tensor | None = None, sensor: SensorNoise | None = None
+) -> SensorNoise | None:
     r"""Return the sensor whose noise is that of a developed picture, the mean of its three colours.
 
     White balance g and colour matrix M turn the variance :math:`S x + O` of the sensor's values into that of linear
@@ -28,9 +30,11 @@ def developed_noise(raw: RawCapture, white_balance: str | Tensor | None = None) 
     Args:
         raw: the capture.
         white_balance: as for :func:`~kornia_tidy.raw.develop.develop`, with which it is developed.
+        sensor: noise that was measured, in units where full scale is the count of saturation. None: that of the noise
+            profile in the file.
 
     Returns:
-        Read noise and full well in units of the developed picture's full scale; None if the file has no noise profile.
+        Read noise and full well in units of the developed picture's full scale; None if the noise is not known.
 
     Convention:
         Demosaicing is left out. It averages the noise of interpolated values, which is then less than told.
@@ -45,7 +49,7 @@ def developed_noise(raw: RawCapture, white_balance: str | Tensor | None = None) 
         >>> developed_noise(replace(raw, camera_to_srgb=torch.eye(3), info=info))
         SensorNoise(read noise 0.001 of full scale, full well 10000 electrons, clipped to [0, 1])
     """
-    profile = raw.info.noise_profile
+    profile = raw.info.noise_profile if sensor is None else (_profile(sensor),)
     if profile is None:
         return None
     if not raw.colors:
@@ -60,3 +64,9 @@ def developed_noise(raw: RawCapture, white_balance: str | Tensor | None = None) 
         slope = float((squares @ (gains * slopes)).mean())
         dark = float((squares @ (gains.square() * offsets)).mean())
     return SensorNoise(math.sqrt(max(dark, LEAST)), full_well=1 / slope if slope > 0 else None)
+
+
+def _profile(sensor: SensorNoise) -> tuple[float, float]:
+    """Return the slope and the offset of a sensor's variance over light."""
+    dark, full = sensor.std(torch.tensor([0.0, 1.0], dtype=torch.float64)).square().tolist()
+    return full - dark, dark

@@ -15,8 +15,17 @@ from torch import Tensor, nn
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.inference.tasks import MAPS, centre_crop, depth_logits, normalised_inverse_depth, split_maps
-from kornia_tidy.inference.trained import build_head, build_optics, check_weights, describe, fix_window, update_psfs
+from kornia_tidy.inference.trained import (
+    build_head,
+    build_optics,
+    check_weights,
+    describe,
+    fix_window,
+    psfs_to_store,
+    update_psfs,
+)
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
@@ -161,15 +170,23 @@ class TidyTraining(pl.LightningModule):
         self._held_out: list[tuple[Tensor, ...]] = []  # distributions of depth of validation scenes, with the truth
 
     @classmethod
-    def from_settings(cls, settings: TrainingSettings, *, design: bool = True, progress: bool = False) -> TidyTraining:
+    def from_settings(
+        cls,
+        settings: TrainingSettings,
+        *,
+        psfs: PSFBank | None = None,
+        design: bool = True,
+        progress: bool = False,
+    ) -> TidyTraining:
         """Return the module that settings describe; the network's weights are drawn from the global generator.
 
         Args:
             settings: of the system and the run.
+            psfs: measured ones, for settings that say so.
             design: design the masks first if the settings say so; not needed if masks are loaded afterwards.
             progress: show a progress bar of the design.
         """
-        optics = build_optics(settings)
+        optics = build_optics(settings, psfs)
         if design and settings.design and settings.masks:
             design_masks(optics, settings.design, progress=progress)
             optics.fidelity = optics.fidelity.replace(window=settings.window)
@@ -344,6 +361,8 @@ class TidyTraining(pl.LightningModule):
         checkpoint["settings"] = None if self.settings is None else self.settings.as_dict()
         checkpoint["task"] = self.task
         checkpoint["description"] = describe(self.optics, self.head)
+        if psfs := psfs_to_store(self.optics):
+            checkpoint["psfs"] = psfs
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raise ``ValueError`` for a checkpoint of another camera or network, before its weights are loaded.

@@ -23,7 +23,15 @@ from kornia_tidy.camera.saved_camera import below
 from kornia_tidy.files import only_here
 from kornia_tidy.inference.heads import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.inference.trained import fix_window, head_prefix, load_masks, load_weights, weights_of
+from kornia_tidy.inference.trained import (
+    fix_window,
+    head_prefix,
+    load_masks,
+    load_weights,
+    stored_psfs,
+    weights_of,
+)
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.nafnet import deepened
@@ -51,6 +59,7 @@ def train(
     head_from: str | os.PathLike[str] | None = None,
     refiner_from: str | os.PathLike[str] | None = None,
     masks_from: str | os.PathLike[str] | None = None,
+    psfs: PSFBank | None = None,
     captures: str | os.PathLike[str] | None = None,
     save_every: int = 100,
     workers: int = 0,
@@ -71,6 +80,8 @@ def train(
         refiner_from: checkpoint with a network for the image, with whose weights the refiner of ``refined`` begins.
         masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
             as ``camera.safetensors`` of ``kornia-tidy design``.
+        psfs: measured ones, for settings of :func:`~kornia_tidy.inference.measured.measured_settings`. A run that
+            resumes has them in its checkpoint.
         captures: folder of the noise-free captures, for fixed optics. Runs with the same camera and scenes may
             share it. Default: ``captures/`` in the folder of the run.
         save_every: steps between checkpoints within an epoch.
@@ -101,8 +112,8 @@ def train(
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
         stored = folder / "captures" if captures is None else Path(captures)
         return _train(
-            settings, folder, scenes, validation, resume, head_from, refiner_from, masks_from, stored, save_every,
-            workers, progress, trainer_options,
+            settings, folder, scenes, validation, resume, head_from, refiner_from, masks_from, psfs, stored,
+            save_every, workers, progress, trainer_options,
         )  # fmt: skip
 
 
@@ -115,6 +126,7 @@ def _train(
     head_from: str | os.PathLike[str] | None,
     refiner_from: str | os.PathLike[str] | None,
     masks_from: str | os.PathLike[str] | None,
+    psfs: PSFBank | None,
     captures: Path,
     save_every: int,
     workers: int,
@@ -129,6 +141,7 @@ def _train(
         stage: dict[str, Any] = {
             "head_from": head_from,
             "refiner_from": refiner_from,
+            "psfs": psfs,
             "save_every": save_every,
             "workers": workers,
             "progress": progress,
@@ -138,7 +151,10 @@ def _train(
     if checkpoint is not None:  # the window was measured on the masks before training
         settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
     pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
-    module = TidyTraining.from_settings(settings, design=checkpoint is None and masks_from is None, progress=progress)
+    psfs = psfs if stored is None else _same_psfs(psfs, stored_psfs(stored), checkpoint)
+    module = TidyTraining.from_settings(
+        settings, psfs=psfs, design=checkpoint is None and masks_from is None, progress=progress
+    )
     assert module.settings is not None
     if settings.data in PAINTED:
         module.optics.notes.first_time("depth")  # painted in metres: a far scene is no sign of another unit
@@ -200,6 +216,13 @@ def _read_run(path: Path) -> dict[str, Any]:
     state = read_state(path)
     weights_of(state, path)
     return state
+
+
+def _same_psfs(given: PSFBank | None, stored: PSFBank | None, path: Path | None) -> PSFBank | None:
+    """Return the measured PSFs of a run, or raise ``ValueError`` if others are given for going on with it."""
+    if given is not None and (stored is None or not torch.equal(given.psfs, stored.psfs)):
+        raise ValueError(f"cannot resume from {path}: its PSFs are not those that are given")
+    return stored
 
 
 def _check_run(

@@ -164,10 +164,10 @@ class TestRawReconstruct(BaseTester):
     def test_feature_not_even_a_mistake_of_ours_stops_the_rest(self, batch, monkeypatch, capsys):
         files, weights, folder = batch
 
-        def read(path, args):
+        def read(path, *how):
             if path == files[1]:
                 raise RuntimeError("out of memory\nallocated 5 of 4 GiB")
-            return read_light(path, args)
+            return read_light(path, *how)
 
         read_light = raw_reconstruct.read_light
         monkeypatch.setattr(raw_reconstruct, "read_light", read)
@@ -283,7 +283,7 @@ class TestRawReconstruct(BaseTester):
         plain = checkpoint(tmp_path / "plain.safetensors", task="edof")
         assert reconstruct(files, plain, tmp_path / "no", "--noise", "0.03") == 2
         assert "--noise is for a network that takes it" in capsys.readouterr().err
-        assert reconstruct(files, system, tmp_path / "no", "--noise", "-1") == 2
+        assert reconstruct(files, system, tmp_path / "no", "--noise", "0") == 2
 
     def test_feature_a_raw_file_keeps_camera_and_exposure(self, tmp_path):
         image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")
@@ -303,7 +303,10 @@ class TestRawReconstruct(BaseTester):
             ([[*files, twin], weights, folder], "would both become"),
             ([files, weights, folder.parent], "it is an input"),
             ([files, files[0], folder], "is no checkpoint of kornia_tidy"),
-            ([files, "edof-7", folder], f"--head is {', '.join(PRETRAINED)}, or a checkpoint: there is no file edof-7"),
+            (
+                [files, "edof-7", folder],
+                f"a system is {', '.join(PRETRAINED)}, or a checkpoint: there is no file edof-7",
+            ),
             ([files, wide, folder, "--memory", "1"], "the smallest tile of this head"),
         ):
             assert reconstruct(*words) == 2

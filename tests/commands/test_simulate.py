@@ -81,7 +81,7 @@ class TestSimulate(BaseTester):
     @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
     def test_feature_every_option_reaches_the_camera(self, scene, capsys, compositing):
         options = (
-            "--bits 16 --masks 2 --mask-seed 7 --seed 8 --sigma 0.02 --fidelity draft --border valid "
+            "--bits 16 --masks 2 --mask-seed 7 --seed 8 --noise 0.02 --fidelity draft --border valid "
             "--color-space linear --focal-length 0.04 --aperture-diameter 0.002 --focus-distance 0.8 "
             f"--depth-range 0.5 8 --pixel-pitch 1e-5 --compositing {compositing}"
         )
@@ -154,7 +154,7 @@ class TestSimulate(BaseTester):
             ("image.png --depth depth.pfm --depth-kind disparity", "disparity without calibration"),
             ("image.png --depth depth.pfm --depth-scale 0", "scale must be positive"),
             ("image.png --depth depth.pfm --masks 0", "num_masks must be positive and finite, got 0"),
-            ("image.png --depth depth.pfm --sigma -1", "sigma must be zero or positive"),
+            ("image.png --depth depth.pfm --noise -1", "a noise must be zero or positive"),
             ("image.png --depth depth.pfm --focal-length 0.7", "focus_distance must be beyond the focal length"),
             ("image.png --depth depth.pfm --focus-distance inf", "needs depth_range"),
             ("image.png --depth depth.pfm --fit-depth --focus-distance 1", "--fit-depth chooses --focus-distance"),

@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from kornia_tidy import DefocusRange, PSFBank, TiDyOptics
+from kornia_tidy import DefocusRange, PSFBank, ThinLensCamera, TiDyOptics
 from kornia_tidy.psf.psf_bank import enclosing_window
 from kornia_tidy.render import render
 from tests.base import BaseTester
@@ -33,6 +33,33 @@ class TestPSFBank(BaseTester):
     def test_feature_a_psf_without_light_stays_finite(self):
         dark = PSFBank(torch.zeros(1, 1, 3, 3), torch.zeros(1), torch.zeros(1, 1)).with_stray_light("renormalize")
         assert float(dark.psfs.abs().max()) == 0
+
+    @pytest.mark.parametrize("psi", [-9.0, -3.0, -1.3, 0.4, 3.0, 12.0])
+    def test_feature_at_any_defocus_as_a_capture_has_it(self, bank, psi):
+        """A point of light at that depth, photographed through the bank, is the PSF."""
+        camera = ThinLensCamera()
+        optics = TiDyOptics(camera=camera, sensor=None, color_space="linear").with_bank(bank)
+        point = torch.zeros(1, 3, 17, 17)
+        point[..., 8, 8] = 1
+        depth = camera.depth(torch.full((1, 1, 17, 17), psi))
+        seen = optics(point, depth)[0, :, 5:12, 5:12]
+        found = optics.psf_bank(defocus=[psi])
+        self.assert_close(found.psfs[0], seen, atol=1e-6, rtol=0)
+        self.assert_close(found.energy[0], seen.sum((1, 2)), atol=1e-5, rtol=0)
+
+    def test_feature_of_one_node_at_any_defocus_it_is_that(self, bank):
+        one = PSFBank(bank.psfs[:1], bank.defocus[:1], bank.energy[:1], bank.energy[:1])
+        found = one.at_defocus([-20.0, 0.0, 20.0])
+        for name in ("psfs", "energy", "veil"):
+            assert torch.equal(getattr(found, name), getattr(one, name).expand(3, *getattr(one, name).shape[1:]))
+
+    def test_feature_channels_from_grey_to_colours_and_green_of_them(self, bank):
+        assert torch.equal(bank.with_channels(1).psfs, bank.psfs[:, 1:2])
+        assert torch.equal(bank.with_channels(1).with_channels(3).energy, bank.energy[:, [1, 1, 1]])
+        assert torch.equal(bank.with_channels(3).psfs, bank.psfs)
+        four = PSFBank(bank.psfs[:, [0, 1, 1, 2]], bank.defocus, bank.energy[:, [0, 1, 1, 2]])
+        with pytest.raises(ValueError, match="PSFs of 3 channels are needed, got 4"):
+            four.with_channels(3)
 
     @pytest.mark.parametrize("kind", ["renormalize", "veil"])
     def test_feature_saved_and_loaded_it_is_the_same(self, bank, kind, tmp_path):

@@ -10,6 +10,7 @@ from kornia_tidy.raw.capture import RawCapture, RawInfo
 from kornia_tidy.raw.develop import develop
 from kornia_tidy.raw.developed_noise import developed_noise
 from kornia_tidy.raw.tags import NOISE_PROFILE, camera_tags
+from kornia_tidy.sensor.noise import SensorNoise
 from tests.base import BaseTester
 from tests.raw.dng import DOUBLE, dng
 
@@ -58,3 +59,14 @@ class TestDevelopedNoise(BaseTester):
         grey = RawCapture(torch.zeros(1, 4, 4), None, "", torch.zeros(1), 1023.0)
         sensor = developed_noise(replace(grey, info=RawInfo(noise_profile=((0.0, 4e-6),))))
         assert (sensor.sigma, sensor.full_well) == (pytest.approx(2e-3), None)
+
+    def test_feature_a_measured_sensor_takes_the_place_of_the_profile(self):
+        """Its variance in the sensor's units is a profile; a converter's rounding counts too."""
+        raw = RawCapture.from_counts(torch.from_numpy(COUNTS)[None], "RGGB", 64, 1023)
+        raw = replace(raw, camera_to_srgb=MATRIX, white_balance=torch.tensor([*BALANCE, 1.0]))
+        sensor = SensorNoise(1e-3, full_well=5000.0, bits=10)
+        profile = (1 / 5000, 1e-6 + 1 / 1023**2 / 12)
+        wanted = developed_noise(replace(raw, info=RawInfo(noise_profile=(profile,))))
+        found = developed_noise(replace(raw, info=RawInfo(noise_profile=((0.5, 0.5),))), None, sensor)
+        assert found.sigma == pytest.approx(wanted.sigma, rel=1e-9)
+        assert found.full_well == pytest.approx(wanted.full_well, rel=1e-9)

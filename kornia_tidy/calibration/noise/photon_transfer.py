@@ -26,6 +26,7 @@ from kornia_tidy.calibration.noise.transfer_curve import (
     temporal_points,
     tile_of,
 )
+from kornia_tidy.checks import check_number
 from kornia_tidy.files import parse_json, read_bytes, write_bytes
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.sensor.noise import SensorNoise
@@ -34,6 +35,7 @@ FORMAT = "kornia_tidy.photon_transfer/1"
 ROUNDING = 1 / 12  # variance that rounding to whole counts adds
 RESOLVED = 0.24  # counts squared; EMVA 1288: with less variance, rounding hides the read noise
 SAME_LEVEL = 0.02  # captures whose levels differ by at most this fraction plus one count have the same exposure
+SAME_WHITE = 0.01  # relative: readers correct the saturation count of a file by its brightest pixels
 LEAST_POINTS, LEAST_POINTS_SINGLE = 3, 8  # a point from a single picture is less certain than one from flats
 WORST_R_SQUARED, WORST_GAIN_ERROR = 0.9, 0.25  # a worse fit is refused
 _BISQUARE = 4.685  # Tukey's constant: 95 % efficient for Gaussian noise
@@ -101,6 +103,20 @@ class PhotonTransfer:
         """
         least = max(self.line.read_noise - 3 * self.line.read_noise_error, 0.0)
         return (least / self.line.gain) ** 2 + ROUNDING >= RESOLVED
+
+    def check_taken_alike(self, raw: RawCapture, name: str) -> None:
+        """Raise ``ValueError`` if a capture was taken by another camera or at another gain, as far as it is known.
+
+        Args:
+            raw: the capture.
+            name: of its file, for the message.
+        """
+        told = [("by", self.camera, raw.info.camera), ("at ISO", _in_words(self.iso), _in_words(raw.info.iso))]
+        if abs(self.white - raw.white) > SAME_WHITE * raw.white:
+            told.append(("with a saturation count of", _in_words(self.white), _in_words(raw.white)))
+        for what, here, there in told:
+            if here and there and here != there:
+                raise ValueError(f"the noise was measured {what} {here}, and {name} was taken {what} {there}")
 
     def sensor_noise(self) -> SensorNoise:
         """Return a sensor with this camera's noise, in units where full scale is the count of saturation.
@@ -252,10 +268,16 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         points = tuple(_numbers(CurvePoint, point) for point in document.pop("points"))
         line = _numbers(TransferLine, document.pop("line"))
         result = PhotonTransfer(line=line, channels=channels, points=points, **document)
+        if result.iso is not None:
+            check_number("iso", result.iso)
         result.sensor_noise()
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON's are ValueErrors
         raise ValueError(f"{path} is not a readable noise calibration: {error!s:.200}") from None
     return result
+
+
+def _in_words(value: float | None) -> str:
+    return "" if value is None else f"{value:g}"
 
 
 # ---------------------------------------------------------------------- the fit

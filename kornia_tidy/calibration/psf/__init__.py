@@ -6,6 +6,7 @@ Captures of a point at several depths come in. A PSF bank with its uncertainty, 
 
 from kornia_tidy.calibration.psf.dithering import ResolvedPSF, resolve_psf
 from kornia_tidy.calibration.psf.exposures import capture_variance, merge_exposures
+from kornia_tidy.calibration.psf.measured_camera import measured_camera
 from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs, PointReport, diffraction_cutoff, measure_psfs
 from kornia_tidy.calibration.psf.phase_retrieval import MaskFit, fit_masks, retrieve_mask
 from kornia_tidy.calibration.psf.point_images import PointImage, point_images
@@ -21,6 +22,7 @@ __all__ = [
     "diffraction_cutoff",
     "fit_masks",
     "measure_psfs",
+    "measured_camera",
     "merge_exposures",
     "point_images",
     "register",

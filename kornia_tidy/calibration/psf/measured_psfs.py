@@ -6,7 +6,8 @@ import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +25,8 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.tensor_files import read_tensors
 
+LENS = ("focal_length", "aperture_diameter", "focus_distance", "pixel_pitch")  # metres
+ONE_DISTANCE = 0.01  # of it, on either side: the range of a camera that was measured at one distance
 MOST_MISFIT = 25.0  # residuals of five times the noise; with larger ones the PSF does not describe the captures
 
 
@@ -59,12 +62,14 @@ class MeasuredPSFs:
             motion of the point between frames, appear in the misfit of the reports.
         distances: (D,) distance in metres of each node of the bank, from far to near.
         reports: one for each point image.
+        camera: the lens, which turns distance into defocus. None if unknown, as of files of earlier versions.
     """
 
     bank: PSFBank
     uncertainty: Tensor
     distances: Tensor
     reports: tuple[PointReport, ...] = ()
+    camera: ThinLensCamera | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.bank.psfs.shape)
@@ -74,6 +79,19 @@ class MeasuredPSFs:
             )
         if tuple(self.distances.shape) != shape[:1]:
             raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
+
+    def known_camera(self) -> ThinLensCamera:
+        """Return the lens.
+
+        Raises:
+            ValueError: if it is unknown.
+        """
+        if self.camera is None:
+            raise ValueError(
+                "the measured PSFs come without the lens that turns distance into defocus: measure them again with "
+                "kornia-tidy raw calibrate-psf, or take TiDyOptics(camera=...).with_bank(bank)"
+            )
+        return self.camera
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the measurement as a safetensors file, whose bank :meth:`PSFBank.load` reads.
@@ -85,7 +103,10 @@ class MeasuredPSFs:
             FileNotFoundError: if the folder does not exist.
         """
         measured = {"measured.uncertainty": self.uncertainty, "measured.distances": self.distances}
-        self.bank.save(path, measured, {"reports": json.dumps([asdict(report) for report in self.reports])})
+        notes = {"reports": json.dumps([asdict(report) for report in self.reports])}
+        if self.camera is not None:
+            notes["camera"] = json.dumps({name: float(getattr(self.camera, name)) for name in LENS})
+        self.bank.save(path, measured, notes)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> MeasuredPSFs:
@@ -102,12 +123,34 @@ class MeasuredPSFs:
         bank = PSFBank.load(path, device)
         found, notes = read_tensors(path, "PSF bank", device)
         names = [name for name in ("measured.uncertainty", "measured.distances") if name in found]
-        tensors = {name.removeprefix("measured."): found[name] for name in names}
+        tensors: dict[str, Any] = {name.removeprefix("measured."): found[name] for name in names}
         try:
             reports = tuple(PointReport(**report) for report in parse_json(notes.get("reports", "")))
-            return cls(bank, reports=reports, **tensors)
+            measured = cls(bank, reports=reports, **tensors)
+            return replace(measured, camera=_lens(notes["camera"], measured)) if "camera" in notes else measured
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
+
+
+def _lens(text: str, measured: MeasuredPSFs) -> ThinLensCamera:
+    """Return the lens of a file over the distances that were measured."""
+    values = parse_json(text)
+    if not isinstance(values, dict) or set(values) != set(LENS):
+        raise ValueError(f"its lens must be given by {', '.join(LENS)}, got {text!r:.200}")
+    camera = _over(ThinLensCamera(**values, depth_range=(1.0, 2.0)), measured.distances)
+    nodes = camera.defocus(measured.distances)
+    if not torch.allclose(nodes, measured.bank.defocus.double(), rtol=1e-3, atol=0.01):
+        raise ValueError("the defocus of its PSFs is not that of its lens at its distances")
+    return camera
+
+
+def _over(camera: ThinLensCamera, distances: Tensor) -> ThinLensCamera:
+    """Return a lens over the range of these distances."""
+    near, far = float(distances.min()), float(distances.max())
+    if near == far:
+        near, far = near * (1 - ONE_DISTANCE), far * (1 + ONE_DISTANCE)
+    lens: dict[str, Any] = {name: float(getattr(camera, name)) for name in LENS}
+    return ThinLensCamera(depth_range=(near, far), **lens)
 
 
 def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil | None = None) -> float:
@@ -201,7 +244,7 @@ def measure_psfs(
     defocus = torch.tensor([psi for psi, _ in nodes], dtype=torch.float32)
     bank = PSFBank.from_measured(torch.stack(psfs).float(), defocus)
     distances = torch.tensor([distance for _, distance in nodes], dtype=torch.float64)
-    return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports))
+    return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports), _over(camera, distances))
 
 
 def _limits(images: Mapping[float, Sequence[PointImage]], cutoff: float | Sequence[float]) -> list[float]:

@@ -108,4 +108,5 @@ def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, sh
         weights = in_eight_bits(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
     weights |= {name: value[..., :0, :0] for name, value in weights.items() if name.endswith("closed_form.psfs")}
     settings = {name: None if name == "root" else value for name, value in state["settings"].items()}
-    write_state(path, {"settings": settings, "global_step": state["global_step"], "state_dict": weights})
+    kept = {name: state[name] for name in ("global_step", "psfs") if name in state}
+    write_state(path, {"settings": settings, "state_dict": weights, **kept})

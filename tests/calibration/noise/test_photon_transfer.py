@@ -228,6 +228,30 @@ class TestPhotonTransfer(BaseTester):
             photon_transfer([RawCapture.from_counts(counts, "RGGB", 0, 4095)])
 
 
+class TestCheckTakenAlike(BaseTester):
+    def test_exception_names_what_differs(self):
+        """Camera, ISO and saturation count; what either side does not know, and a count within a hundredth, agree."""
+        result = PhotonTransfer("Acme One", 100.0, "flats", 512.25, 4095.0, LINE, {}, ())
+        for camera, iso, white, sentence in (
+            (None, None, 4095, None),
+            ("Acme One", 100.0, 4060, None),
+            ("Acme Two", 100.0, 4095, "measured by Acme One, and a.dng was taken by Acme Two"),
+            ("Acme One", 800.0, 4095, "measured at ISO 100, and a.dng was taken at ISO 800"),
+            (
+                None,
+                100.0,
+                16383,
+                "with a saturation count of 4095, and a.dng was taken with a saturation count of 16383",
+            ),
+        ):
+            raw = RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 0, white, RawInfo(model=camera, iso=iso))
+            if sentence is None:
+                result.check_taken_alike(raw, "a.dng")
+            else:
+                with pytest.raises(ValueError, match=sentence):
+                    result.check_taken_alike(raw, "a.dng")
+
+
 class TestFiles(BaseTester):
     def result(self):
         points = tuple(curve(2.0, 6.0, [0.0, 10.0, 500.0]))
@@ -252,6 +276,7 @@ class TestFiles(BaseTester):
             (lambda d: d.pop("line"), "line"),
             (lambda d: d["line"].update(gain="2"), "gain must be a number, got '2'"),
             (lambda d: d["line"].update(gain=-2.0), "must be zero or positive"),
+            (lambda d: d.update(iso="800"), "iso must be a number"),
             (lambda d: d.update(colour="red"), "unexpected keyword argument 'colour'"),
             (lambda d: d["points"][0].pop("level"), "level"),
         ],

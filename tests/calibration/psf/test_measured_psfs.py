@@ -277,5 +277,5 @@ class TestMeasuredPSFs(BaseTester):
         optics = TiDyOptics(sensor=None).with_bank(measured.bank)
         with pytest.raises(ValueError, match="the measured PSFs have 3 channels, not 1"):
             optics(torch.rand(1, 48, 48), torch.ones(1, 48, 48))
-        with pytest.raises(ValueError, match="known at their own defocus"):
+        with pytest.raises(ValueError, match="known for the whole exposure"):
             optics.psf_bank(states=True)
