@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Measure the PSFs of a camera from pictures of a point of light at known distances.
-At each distance the point is moved by fractions of a pixel between the pictures, as
-an undersampled PSF can only be reconstructed from several of them. 16 positions are
-good, 24 behind a filter array; they need not be known. Several exposures at each
+At each distance the point is moved by some pixels and fractions of a pixel between
+the pictures: an undersampled PSF can only be reconstructed from several of them, and
+dust on the sensor stays where it is. 16 positions are good, 24 behind a filter array;
+they need not be known. Several exposures at each
 position, the longer ones saturated, measure the faint parts of a PSF as well. FILES
 are raw files or 16-bit images of linear light without black level, sorted by
 distance, then by position of the point, then by exposure. The planes of one colour of
@@ -89,6 +90,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--picture", metavar="PNG", help="draw PSFs, uncertainties and residuals")
     parser.add_argument("--fit-mask", metavar="NPY", help="find the mask behind the PSFs and write its heights, metres")
     parser.add_argument("--mask-size", type=int, default=23, metavar="N", help="its pixels along a side (default: 23)")
+    parser.add_argument(
+        "--diameter", type=float, default=0.0, metavar="M", help="of the point of light, metres (default: 0)"
+    )
     noise = parser.add_argument_group("noise of the sensor")
     noise.add_argument("--full-well", type=float, metavar="E", help="electrons from black to white")
     noise.add_argument("--read-noise", type=float, metavar="E", help="electrons")
@@ -108,7 +112,7 @@ def run(args: argparse.Namespace) -> None:
     with stages("measure"):
         images = _images(args, places)
         channels = 1 + max(next(iter(images.values()))[0].channels)
-        measured = measure_psfs(images, camera, args.window, _cutoff(camera, channels))
+        measured = measure_psfs(images, camera, args.window, _cutoff(camera, channels), args.diameter)
     tell("camera", camera.extra_repr())
     for report in measured.reports:
         if report.rejected is not None:

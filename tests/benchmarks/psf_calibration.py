@@ -62,7 +62,7 @@ def calibrate(
 ) -> MeasuredPSFs:
     """Take the captures of one distance and measure the PSFs."""
     generator = torch.Generator().manual_seed(0)
-    span = 4 if tile is None else 9  # ninths: a pixel of a plane
+    span = 31  # ninths: farther than a grain of dust is wide
     images = []
     for _ in range(places):
         ninths = tuple(torch.randint(-span, span + 1, (2,), generator=generator).tolist())

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pixel_shuffle
 
 STEPS = 16  # of conjugate gradients, enough for sharp points behind a mosaic
 REACH = 1  # pixels; with weights for each pixel, noise from farther away does not reach a pixel
@@ -53,6 +54,12 @@ class ResolvedPSF:
         spectra = torch.stack([moved, moved * derivative[:, None], moved * derivative], 1)
         image = _centred(torch.fft.ifft2(_folded(spectra, side)).real)
         return image[:, 0], image[:, 1:]
+
+    def gradient(self, upsampling: int) -> Tensor:
+        """Return the gradient of the samples with respect to the offsets of the point, (2, M, M) of the PSF's side."""
+        parts = torch.arange(upsampling, dtype=torch.float64) / upsampling
+        _, gradients = self.images_at(-torch.cartesian_prod(parts, parts).view(-1, 2))
+        return pixel_shuffle(gradients.transpose(0, 1), upsampling)[:, 0]
 
     def _grid(self) -> tuple[int, Tensor]:
         length = self.spectrum.shape[-1]
@@ -138,6 +145,8 @@ def resolve_psf(
     spectrum = solved.unflatten(2, (aliases, aliases)).permute(2, 0, 3, 1).reshape(length, length)
     fine = upsampling * side
     psf, variance = (torch.empty(fine, fine, dtype=torch.float64).to(patches) for _ in range(2))
+    if each_pixel:  # a pixel that is saturated in some images has less weight there
+        variances = variances.reciprocal().mean(0).reciprocal().expand_as(variances)
     spectral_variances = torch.fft.fft2(variances)
     for down in range(upsampling):
         for right in range(upsampling):
@@ -147,7 +156,8 @@ def resolve_psf(
             # The PSF is a sum of filtered images, so its variance is a sum of variances under the squared filters.
             filters = torch.fft.ifft2((gains * ramps[..., None]).sum(2), dim=(0, 1)).real.permute(2, 0, 1)
             if each_pixel:
-                filters = filters * _near(side, filters)
+                near = filters * _near(side, filters)
+                filters = near * (filters.square().sum((1, 2)) / near.square().sum((1, 2))).sqrt()[:, None, None]
             spectral_variance = torch.fft.fft2(filters.square()) * spectral_variances
             samples = slice(down, None, upsampling), slice(right, None, upsampling)
             psf[samples] = _centred(torch.fft.ifft2(between).real)

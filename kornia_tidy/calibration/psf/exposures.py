@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kornia_tidy.calibration.psf.shrinkage import shrink
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -46,8 +47,8 @@ def merge_exposures(
 
     .. math:: L = \frac{\sum_e w_e \, t_e y_e}{\sum_e w_e \, t_e^2}, \qquad w_e = 1 / \sigma^2(t_e L)
 
-    The variances are computed from a first estimate of L. The noisy values themselves would give too much weight to
-    values that are too low by chance.
+    The variances are computed from a first estimate of L, which is denoised. The noisy values themselves would give too
+    much weight to values that are too low by chance: an average of pixels weighted by them is one electron too low.
 
     Args:
         frames: y, (..., E, C, H, W) linear, black level subtracted, 1 at full scale, not clamped at zero.
@@ -82,7 +83,10 @@ def merge_exposures(
     value, time = frames.double(), exposures.double().view(-1, 1, 1, 1).to(frames.device)
     good = (value < saturation).double()
     shortest = int(exposures.argmin())
-    light = (good * value).sum(-4) / (good * time).sum(-4).clamp(min=1e-300)
+    together = (good * time).sum(-4).clamp(min=1e-150)
+    light = (good * value).sum(-4) / together
+    noise = (good * capture_variance(time * light.unsqueeze(-4), sensor)).sum(-4) / together.square()
+    light = shrink(light.flatten(0, -3), noise.flatten(0, -3))[0].view_as(light)
     weight = good / capture_variance(time * light.unsqueeze(-4), sensor).clamp(min=1e-300)
     information = (weight * time.square()).sum(-4)
     merged = (weight * time * value).sum(-4) / information.clamp(min=1e-300)

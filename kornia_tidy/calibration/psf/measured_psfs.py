@@ -11,7 +11,16 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from kornia_tidy.calibration.psf.disturbances import (
+    check_clipping,
+    check_diameter,
+    image_diameter,
+    share_around,
+    warn_of_light_around,
+    warn_of_still_point,
+)
 from kornia_tidy.calibration.psf.dithering import most_aliases
 from kornia_tidy.calibration.psf.point_images import PointImage
 from kornia_tidy.calibration.psf.registration import Registered, register
@@ -27,6 +36,10 @@ from kornia_tidy.tensor_files import read_tensors
 
 LENS = ("focal_length", "aperture_diameter", "focus_distance", "pixel_pitch")  # metres
 ONE_DISTANCE = 0.01  # of it, on either side: the range of a camera that was measured at one distance
+# A lens' light falls with the cube of the radius, or a little slower or faster. Of the mean light between window and
+# annulus this share, and its doubt, is in the annulus too, where it was taken for background.
+TAIL, TAIL_DOUBT = 0.4, 0.3
+LEVEL = (1 + TAIL) ** 2 + 1.8 * TAIL**2  # variance of the background so corrected, by that of the annulus
 MOST_MISFIT = 25.0  # residuals of five times the noise; with larger ones the PSF does not describe the captures
 
 
@@ -58,8 +71,9 @@ class MeasuredPSFs:
 
     Args:
         bank: the PSFs, each summing to one. Light outside the window was not measured and is ignored.
-        uncertainty: (D, C, P, P) standard deviation of each value from the noise of the captures. Other errors, such as
-            motion of the point between frames, appear in the misfit of the reports.
+        uncertainty: (D, C, P, P) standard deviation of each value: from the noise and the scatter of the captures, the
+            background, the light around the window, the position and the diameter of the point. The truth lies within
+            1.96 of it for 95 % of the values; docs/calibration.md has figures, and says what no capture reveals.
         distances: (D,) distance in metres of each node of the bank, from far to near.
         reports: one for each point image.
         camera: the lens, which turns distance into defocus. None if unknown, as of files of earlier versions.
@@ -178,6 +192,7 @@ def measure_psfs(
     camera: ThinLensCamera,
     window: int,
     cutoff: float | Sequence[float] = 1.0,
+    diameter: float = 0.0,
 ) -> MeasuredPSFs:
     """Measure a PSF bank from point images at known distances.
 
@@ -187,16 +202,20 @@ def measure_psfs(
         window: side P of the PSFs in pixels of the sensor, the same as for the images.
         cutoff: highest frequency that the lens passes in each channel, in cycles per pixel of the sensor, see
             :func:`diffraction_cutoff`.
+        diameter: of the point of light in metres. Its blur is corrected to second order, and half of the correction is
+            in the uncertainty.
 
     Returns:
         The PSFs, their uncertainty and a report on each image.
 
     Raises:
-        ValueError: if at some distance no image can be used or residuals exceed five times the noise, or if there is
-            not one cutoff for each channel.
+        ValueError: if at some distance no image can be used, captures are clipped below saturation, the image of the
+            point is wider than half a pixel or residuals exceed five times the noise, or if there is not one cutoff for
+            each channel.
 
     Warns:
-        UserWarning: if there are fewer images than aliased frequencies. The warning comes before any computation.
+        UserWarning: if there are fewer images than aliased frequencies, if the point moves less than a grain of dust is
+            wide (both before any computation), or if more than 5 % of the light lies around the window.
 
     Example:
         >>> from kornia_tidy import SensorNoise
@@ -211,9 +230,12 @@ def measure_psfs(
     """
     check_depth(torch.tensor(list(images)))
     limits = _limits(images, cutoff)
-    _warn_of_few(images, limits)
+    check_diameter(diameter, list(images), camera)
+    check_clipping(images)
+    if not _warn_of_few(images, limits):
+        warn_of_still_point(images)
     nodes = sorted((float(camera.defocus(torch.tensor(z, dtype=torch.float64))), z) for z in images)
-    psfs, deviations, reports = [], [], []
+    psfs, deviations, reports, shares = [], [], [], {}
     for _, distance in nodes:
         all_images = list(images[distance])
         good = [image for image in all_images if image.fault is None]
@@ -233,18 +255,83 @@ def measure_psfs(
                 f"times the noise, at most {MOST_MISFIT**0.5:g} are allowed"
             )
         reports += _reports(distance, good, found)
-        psf, variance = (
-            torch.stack([_central(getattr(one, name), good[0], window) for one in found.psfs])
-            for name in ("psf", "variance")
-        )
-        total = psf.sum((1, 2))[:, None, None]
-        psf, variance = shrink(psf / total, variance / total**2)
+        raw = _raw(good, found, window, image_diameter(diameter, distance, camera))
+        shares[distance] = share_around(float(raw.around.max()), window)
+        psf, remaining = shrink(raw.psf, raw.variance)
         psfs.append(psf.clamp(min=0))
-        deviations.append(variance.sqrt())
+        # An error of the total, by which all values are divided, changes them in proportion.
+        remaining = remaining * (1 - 2 * psf).clamp(min=0) + psf.square() * raw.variance.sum((1, 2), keepdim=True)
+        common = raw.common - psf[:, None] * raw.common.sum((2, 3), keepdim=True)
+        deviations.append((remaining + common.square().sum(1)).sqrt())
+    warn_of_light_around(shares, window)
     defocus = torch.tensor([psi for psi, _ in nodes], dtype=torch.float32)
     bank = PSFBank.from_measured(torch.stack(psfs).float(), defocus)
     distances = torch.tensor([distance for _, distance in nodes], dtype=torch.float64)
     return MeasuredPSFs(bank, torch.stack(deviations).float(), distances, tuple(reports), _over(camera, distances))
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    """PSFs of one distance before denoising, (C, P, P), each with a sum of one.
+
+    Args:
+        psf: the PSFs.
+        variance: of their noise.
+        common: (C, K, P, P) errors of all pixels together, each of one standard deviation.
+        around: (C,) mean light of a pixel around the window.
+    """
+
+    psf: Tensor
+    variance: Tensor
+    common: Tensor
+    around: Tensor
+
+
+def _raw(images: Sequence[PointImage], found: Registered, window: int, blur: float) -> _Raw:
+    """Return the PSFs with the background corrected, and their errors.
+
+    Args:
+        images: those that were registered.
+        found: the registration.
+        window: side P of the PSFs.
+        blur: diameter of the point's image in pixels.
+    """
+    used = [image for image, good in zip(images, found.used.tolist(), strict=True) if good]
+    scale = found.brightness[found.used]
+    told = torch.tensor([image.offset for image in used], dtype=torch.float64)
+    # The mean position is that of the centres of light, whose scatter about the registered positions tells its error.
+    spread = (told - found.offsets[found.used]).var(0, correction=min(1, len(used) - 1))
+    position = (spread / len(used)).sqrt()
+    count = len(images[0].light)
+    around = torch.stack([image.around.expand(count) / b for image, b in zip(used, scale, strict=True)])
+    background = torch.stack(
+        [image.background_variance.expand(count) / b**2 for image, b in zip(used, scale, strict=True)]
+    )
+    raw = []
+    for channel, one in enumerate(found.psfs):
+        planes = [plane for plane, other in enumerate(images[0].channels) if other == channel]
+        beyond = around[:, planes].median()
+        level = (
+            (TAIL_DOUBT * beyond).square() + LEVEL * background[:, planes].mean() / background[:, planes].numel()
+        ).sqrt()
+        slopes = one.gradient(_upsampling(images[0]))
+        psf, variance, scatter, down, right = (
+            _central(x, images[0], window) for x in (one.psf, one.variance, found.scatter[channel], *slopes)
+        )
+        blurred = blur**2 / 32 * _laplacian(psf)
+        psf = psf + TAIL * beyond - blurred
+        total = psf.sum()
+        # The images' scatter about the PSF, where it exceeds the noise, is an error of each image: dust, for example.
+        variance = variance * scatter.clamp(min=1)
+        common = [position[0] * down, position[1] * right, level.expand_as(psf), 0.5 * blurred]
+        raw.append((psf / total, variance / total**2, torch.stack(common) / total, beyond / total))
+    return _Raw(*(torch.stack(parts) for parts in zip(*raw, strict=True)))
+
+
+def _laplacian(psf: Tensor) -> Tensor:
+    """Return the Laplacian: a disc of diameter d blurs a PSF by d² / 32 times it, to second order."""
+    wide = pad(psf[None], (1, 1, 1, 1), mode="replicate")[0]
+    return wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:] - 4 * psf
 
 
 def _limits(images: Mapping[float, Sequence[PointImage]], cutoff: float | Sequence[float]) -> list[float]:
@@ -257,8 +344,12 @@ def _limits(images: Mapping[float, Sequence[PointImage]], cutoff: float | Sequen
     return limits
 
 
-def _warn_of_few(images: Mapping[float, Sequence[PointImage]], limits: Sequence[float]) -> None:
-    """Warn once, for the distance and channel that lack most images, that they do not determine the PSF."""
+def _warn_of_few(images: Mapping[float, Sequence[PointImage]], limits: Sequence[float]) -> bool:
+    """Warn once, for the distance and channel that lack most images, that they do not determine the PSF.
+
+    Returns:
+        Whether it warned.
+    """
     lacking = []
     for distance, at_distance in images.items():
         good = [image for image in at_distance if image.fault is None]
@@ -273,6 +364,8 @@ def _warn_of_few(images: Mapping[float, Sequence[PointImage]], limits: Sequence[
             f"part a guess, which its noise does not tell: {wanted} are needed, half as many again are good",
             stacklevel=3,
         )
+        return True
+    return False
 
 
 def _upsampling(image: PointImage) -> int:

@@ -7,18 +7,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kornia_tidy.calibration.psf.exposures import SATURATION, merge_exposures
+from kornia_tidy.calibration.psf.exposures import SATURATION, capture_variance, merge_exposures
 from kornia_tidy.calibration.psf.points import (
     annulus_background,
     centre_of_light,
     centre_of_symmetry,
     cut_out,
     find_points,
+    light_around,
 )
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.sensor.noise import SensorNoise
 
 MARGIN = 8  # pixels around the window, where a sub-pixel shift of an image may ring
+NOTHING = torch.zeros(1, dtype=torch.float64)
 LEAST_SIGNAL = 10.0  # ratio of a point's light to its noise
 Tile = tuple[tuple[int, ...], ...]  # channel of each pixel in a filter array's square tile, by rows
 
@@ -33,6 +35,11 @@ class PointImage:
         variance: (C, M, M) noise variance of ``light``.
         tile: tile of the filter array if the C planes are those of a mosaic, or None.
         fault: reason for which the image cannot be used, or None.
+        around: (C,) mean light of a pixel between the window and the annulus of the background.
+        background_variance: (C,) variance of the background that was subtracted.
+        peaks: (E, C) brightest value below saturation in the window of each frame, 1 at full scale.
+        peak_shot: (E, C) standard deviation of the shot noise of these values.
+        peak_noise: standard deviation of a clipped value, which has no shot noise.
     """
 
     place: tuple[float, float]
@@ -40,6 +47,11 @@ class PointImage:
     variance: Tensor
     tile: Tile | None = None
     fault: str | None = None
+    around: Tensor = NOTHING
+    background_variance: Tensor = NOTHING
+    peaks: Tensor = NOTHING
+    peak_shot: Tensor = NOTHING
+    peak_noise: float = 0.0
 
     @property
     def offset(self) -> tuple[float, float]:
@@ -148,16 +160,19 @@ def _point_image(
     near = start[0] - corner[0], start[1] - corner[1]
     light, variance = merge_exposures(frames[..., rows, columns], exposures, sensor, saturation)
     try:
-        light = light - annulus_background(light, near, window, 1.5 * window)
+        background, background_variance = annulus_background(light, near, window, 1.5 * window)
+        light = light - background
         clear, centre = light, centre_of_light
         if reference is not None:
             clear, centre = reference[..., rows, columns].double(), centre_of_symmetry
-            clear = clear - annulus_background(clear, near, window, 1.5 * window)
+            clear = clear - annulus_background(clear, near, window, 1.5 * window)[0]
         places = torch.tensor([centre(channel[None], near, window) for channel in clear], dtype=torch.float64)
         places = places + _phases(tile, len(places))
         weight = cut_out(clear, near, window).sum((1, 2)).clamp(min=0)
         row, column = (weight @ places / weight.sum()).tolist()
         nearest = round(row), round(column)
+        around = light_around(light, nearest, window)
+        inside = cut_out(frames[..., rows, columns], nearest, window)
         light, variance = (cut_out(x, nearest, side) for x in (light, variance))
     except ValueError as error:
         empty = torch.zeros(frames.shape[1], side, side, dtype=torch.float64)
@@ -170,4 +185,10 @@ def _point_image(
         signal = float((light.sum((1, 2)) / variance.sum((1, 2)).sqrt()).min())
         if signal < LEAST_SIGNAL:
             fault = f"its light is {signal:.1f} times its noise, {LEAST_SIGNAL:g} are needed"
-    return PointImage((row + corner[0], column + corner[1]), light, variance, tile, fault)
+    place = row + corner[0], column + corner[1]
+    peaks = torch.where(inside < saturation, inside, 0).amax((-2, -1))
+    clipped = capture_variance(torch.zeros_like(peaks), sensor)
+    shot = (capture_variance(peaks, sensor) - clipped).clamp(min=0).sqrt()
+    return PointImage(
+        place, light, variance, tile, fault, around, background_variance, peaks, shot, float(clipped.max().sqrt())
+    )

@@ -42,7 +42,7 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
     rows, columns = (torch.linspace(-1, 1, length, dtype=torch.float64, device=image.device) for length in image.shape)
     basis = torch.stack(torch.broadcast_tensors(torch.ones_like(image).double(), rows[:, None], columns))
     every = max(1, image.numel() // MOST_SAMPLES)
-    factors = _plane(basis.flatten(1)[:, ::every], image.double().flatten()[None, ::every])
+    factors, _ = _plane(basis.flatten(1)[:, ::every], image.double().flatten()[None, ::every])
     value = image.double() - torch.einsum("ci,ihw->hw", factors, basis)
     # A box of half the window collects enough light. Two passes give a peak where one would give a plateau.
     box = max(1, window // 4) * 2 + 1
@@ -61,7 +61,7 @@ def find_points(image: Tensor, count: int, window: int) -> list[tuple[int, int]]
     return found
 
 
-def annulus_background(image: Tensor, centre: tuple[float, float], inner: float, outer: float) -> Tensor:
+def annulus_background(image: Tensor, centre: tuple[float, float], inner: float, outer: float) -> tuple[Tensor, Tensor]:
     r"""Return the background around a point: a plane through the pixels of an annulus, without outliers.
 
     .. math:: b(r, c) = b_0 + b_r r + b_c c
@@ -76,7 +76,8 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
         outer: outer radius in pixels.
 
     Returns:
-        (C, H, W) the plane at each pixel of the picture.
+        (C, H, W) the plane at each pixel of the picture, and (C,) the variance of its value at the centre, from the
+        scatter of the annulus.
 
     Raises:
         ValueError: if fewer than 32 pixels are within the picture.
@@ -84,7 +85,8 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
     Example:
         >>> image = torch.full((1, 32, 32), 0.1) + 1e-3 * torch.arange(32)
         >>> image[0, 16, 16], image[0, 4, 16] = 1.0, 0.7
-        >>> annulus_background(image, (16, 16), 10, 14)[0, 16, 14:19]
+        >>> background, _ = annulus_background(image, (16, 16), 10, 14)
+        >>> background[0, 16, 14:19]
         tensor([0.1140, 0.1150, 0.1160, 0.1170, 0.1180])
     """
     rows = torch.arange(image.shape[-2], dtype=torch.float64, device=image.device) - centre[0]
@@ -98,11 +100,38 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
             f"column {centre[1]:.0f}, the picture of {image.shape[-2]}x{image.shape[-1]} has {ring.shape[1]}"
         )
     basis = torch.stack(torch.broadcast_tensors(torch.ones_like(radius), rows[:, None] / outer, columns / outer))
-    return torch.einsum("ci,ihw->chw", _plane(basis[:, within], ring), basis).to(image.dtype)
+    factors, variance = _plane(basis[:, within], ring)
+    return torch.einsum("ci,ihw->chw", factors, basis).to(image.dtype), variance
 
 
-def _plane(at: Tensor, values: Tensor) -> Tensor:
-    """Return the factors (C, 3) of planes through values (C, n) where the basis is ``at``, (3, n), without outliers."""
+def light_around(image: Tensor, centre: tuple[int, int], window: int) -> Tensor:
+    """Return the mean light (C,) between a window and the circle whose radius is the window's side.
+
+    Args:
+        image: (C, H, W), background subtracted.
+        centre: row and column of the pixel at the centre.
+        window: side of the window in pixels, odd.
+
+    Example:
+        >>> image = torch.ones(1, 21, 21)
+        >>> image[:, 6:15, 6:15] = 9.0
+        >>> light_around(image, (10, 10), 9)
+        tensor([1.])
+    """
+    rows, columns = (
+        (torch.arange(length, device=image.device) - at).abs()
+        for at, length in zip(centre, image.shape[-2:], strict=True)
+    )
+    outside = (rows[:, None] > window // 2) | (columns > window // 2)
+    return image[:, outside & (torch.hypot(rows[:, None].double(), columns.double()) < window)].mean(1)
+
+
+def _plane(at: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit planes to values (C, n) without outliers, where the basis is ``at``, (3, n).
+
+    Returns:
+        The factors (C, 3), and the variance (C,) of the first of them from the scatter about the plane.
+    """
     kept, rounding = torch.ones_like(values), 1e-12 * values.abs().amax(1, keepdim=True)
     for _ in range(FITS):
         normal = torch.einsum("cn,in,jn->cij", kept, at, at)
@@ -110,7 +139,8 @@ def _plane(at: Tensor, values: Tensor) -> Tensor:
         deviation = (values - factors @ at).abs()
         spread = deviation.median(1, keepdim=True).values.maximum(rounding)
         kept = (deviation <= 3 * 1.4826 * spread).double()
-    return factors
+    scatter = (kept * deviation.square()).sum(1) / kept.sum(1)
+    return factors, scatter * torch.linalg.inv(torch.einsum("cn,in,jn->cij", kept, at, at))[:, 0, 0]
 
 
 def centre_of_light(image: Tensor, start: tuple[int, int], window: int) -> tuple[float, float]:

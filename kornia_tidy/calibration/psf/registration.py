@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from kornia_tidy.calibration.psf.dithering import ResolvedPSF, resolve_psf
 from kornia_tidy.calibration.psf.point_images import MARGIN, PointImage
@@ -16,6 +17,7 @@ ROUNDS, SMALL_STEP = 8, 5e-4  # the step is relative in brightness and in pixels
 LEAST_MISFIT, IMPROVEMENT = 1.5, 0.7
 LEAST_IMAGES = 4  # with fewer, no outlier can be identified
 INSIDE = slice(MARGIN, -MARGIN)
+NEAR = 5  # pixels along a side, over which the scatter of the images is averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,7 @@ class Registered:
         offsets: (N, 2) position of each image's chief ray relative to the centre of its pixel.
         misfit: (N,) mean square of each image's residuals in units of their variance.
         used: (N,) whether each image was used.
+        scatter: mean square of the images' residuals in units of their variance around each pixel of each PSF.
     """
 
     psfs: list[ResolvedPSF]
@@ -35,6 +38,7 @@ class Registered:
     offsets: Tensor
     misfit: Tensor
     used: Tensor
+    scatter: list[Tensor]
 
 
 def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registered:
@@ -69,9 +73,10 @@ def register(images: Sequence[PointImage], cutoff: Sequence[float]) -> Registere
                 break
         outlier = _outlier(stack, offsets, brightness, used, fit)
         if outlier is None:
-            return Registered(
-                stack.resolve(offsets, brightness, used, final=True), brightness, offsets, fit.misfit, used
-            )
+            psfs = stack.resolve(offsets, brightness, used, final=True)
+            squares = stack.residuals(psfs, offsets, brightness, used).square()
+            misfit = squares[..., INSIDE, INSIDE].mean((1, 2, 3))
+            return Registered(psfs, brightness, offsets, misfit, used, stack.scatter(squares[used].mean(0)))
         used[outlier] = False
 
 
@@ -108,6 +113,27 @@ class _Stack:
             upsampling = self.upsampling if final else 1
             psfs.append(resolve_psf(*parts, limit * self.upsampling, upsampling, each_pixel=final))
         return psfs
+
+    def residuals(self, psfs: Sequence[ResolvedPSF], offsets: Tensor, brightness: Tensor, used: Tensor) -> Tensor:
+        """Return what PSFs leave of the images (N, C, M, M) in units of the noise, 1 on average for pure noise.
+
+        The PSFs follow the noise of the images that were used, which lowers their residuals by the leverage.
+        """
+        scale = brightness.view(-1, 1, 1)
+        residuals = []
+        for plane, channel in enumerate(self.channels):
+            image, _ = psfs[channel].images_at(offsets - self.phases[plane])
+            rest = (self.light[:, plane] - scale * image) / self.variance[:, plane].sqrt()
+            free = torch.where(used, max(1 - psfs[channel].leverage, 0.1), 1.0).view(-1, 1, 1)
+            residuals.append(rest / free.sqrt())
+        return torch.stack(residuals, 1)
+
+    def scatter(self, squares: Tensor) -> list[Tensor]:
+        """Average squared residuals (C, M, M) around each pixel of each PSF, on the pixels of the sensor."""
+        near = avg_pool2d(squares[None], NEAR, 1, NEAR // 2, count_include_pad=False)[0]
+        fine = near.repeat_interleave(self.upsampling, 1).repeat_interleave(self.upsampling, 2)
+        planes = [[plane for plane, other in enumerate(self.channels) if other == n] for n in range(len(self.cutoff))]
+        return [fine[own].mean(0) for own in planes]
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,7 @@ def captured(coded, flat, count, seed=0, spoil=None, background=0.0):
     for z in coded:
         images[z] = []
         for n in range(count):
-            ninths = tuple(torch.randint(-4, 5, (2,), generator=generator).tolist())
+            ninths = tuple(torch.randint(-31, 32, (2,), generator=generator).tolist())  # up to 3.5 pixels
             light = on_pixels(coded[z], ninths)
             frames = exposed(0.5 * light / light.max() + background, EXPOSURES, generator, 10500, 2.4, 0.003)
             clear = on_pixels(flat[z], ninths)
@@ -71,7 +71,7 @@ def of_a_mosaic(coded, flat, tile, count, exposures=EXPOSURES):
     generator = torch.Generator().manual_seed(0)
     images = []
     for _ in range(count):
-        ninths = tuple(torch.randint(-9, 10, (2,), generator=generator).tolist())
+        ninths = tuple(torch.randint(-31, 32, (2,), generator=generator).tolist())
         light, clear = (planes(on_pixels(fine, ninths), tile) for fine in (coded, flat))
         frames = exposed(0.5 * light / light.max(), exposures, generator, 10500, 2.4, 0.003)
         clear = exposed(0.8 * clear / clear.max(), torch.ones(1), generator, 10500, 2.4, 0.003)[0]
