@@ -234,6 +234,53 @@ def field_gradient(draw: random.Random) -> Call:
     return Call(about, "mutual_energies_gradients", arguments, 2 * products, truth)
 
 
+def srgb(draw: random.Random) -> Call:
+    """``convert`` of srgb.c: to 2e-7 in float32, and to 16 roundings of the value: the power raises some."""
+    image, encode, about = _colours(draw)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        expected = srgb_by_definition(image.double(), encode)
+        least = 2e-7 if image.dtype == torch.float32 else gamma(16, image.dtype)
+        return expected, (gamma(16, image.dtype) * expected.abs()).clamp(min=least)
+
+    return Call(about, "srgb", (image, encode), image.numel(), truth)
+
+
+def srgb_gradient(draw: random.Random) -> Call:
+    """``convert`` of srgb.c with a gradient: to 16 roundings of it."""
+    image, encode, about = _colours(draw)
+    gradient = torch.randn_like(image)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        exact = image.detach().double().requires_grad_()
+        (expected,) = torch.autograd.grad(srgb_by_definition(exact, encode), exact, gradient.double())
+        return expected, gamma(16, image.dtype) * expected.abs() + torch.finfo(image.dtype).tiny
+
+    return Call(about, "srgb_gradient", (image, gradient, encode), image.numel(), truth)
+
+
+def srgb_by_definition(image: Tensor, encode: bool) -> Tensor:
+    """The formulas of IEC 61966-2-1."""
+    if encode:
+        return torch.where(image > 0.0031308, 1.055 * image.clamp(min=0.003) ** (1 / 2.4) - 0.055, 12.92 * image)
+    return torch.where(image > 0.04045, ((image.clamp(min=0.04) + 0.055) / 1.055) ** 2.4, image / 12.92)
+
+
+def _colours(draw: random.Random) -> tuple[Tensor, bool, str]:
+    """An image in any order of memory, mostly of [0, 1], whether it is to be encoded, and all this in words."""
+    dtype, encode = draw.choice(DTYPES), draw.random() < 0.5
+    shape = *(draw.randint(2, 9) for _ in range(draw.randint(0, 2))), draw.choice((1, 2, 15, 16, 17, 40, 999))
+    image = 2 * torch.rand(shape, dtype=dtype) ** 3 * draw.choice((1, 1, 1, 40)) - draw.choice((0, 0.1))
+    memory = draw.choice(("dense", "turned", "cut out", "shared"))
+    if memory == "turned":
+        image = image.T.contiguous().T if image.ndim == 2 else image.movedim(0, -1).contiguous().movedim(-1, 0)
+    elif memory == "cut out":
+        image = torch.nn.functional.pad(image, (1, 2))[..., 1:-2]
+    elif memory == "shared":
+        image = image[..., :1].expand(shape)
+    return image, encode, f"{dtype} {shape} {memory} encode {encode}"
+
+
 def _in_double(case: tuple[Tensor, Tensor, Tensor]) -> list[Tensor]:
     return [x.to(torch.complex128) if x.is_complex() else x.double() for x in case]
 
@@ -262,6 +309,8 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "occlusion.c": occlude,
     "mutual_intensity.c: energies": energies,
     "mutual_intensity.c: gradient": field_gradient,
+    "srgb.c: values": srgb,
+    "srgb.c: gradient": srgb_gradient,
 }
 
 
