@@ -16,7 +16,7 @@ from torch import Tensor
 from kornia_tidy.kernels import gather_ops
 from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.gather_ops import SOURCE, gather_direct, gather_direct_psf_gradient
-from kornia_tidy.kernels.occlusion_ops import occlusion_direct
+from kornia_tidy.kernels.occlusion_ops import occlusion_direct, occlusion_direct_gradients
 from kornia_tidy.kernels.overlap_ops import scatter_overlap
 from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends import direct_occlusion
@@ -64,12 +64,11 @@ class DirectBackend:
         return gather_direct(scene.plane, scene.psfs, scene.labels.layer_index, scene.labels.layer_weight)
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-        """Return the gradients of PSFs and layer weight directly, that of the image and of occlusion by transforms."""
+        """Return the gradients of PSFs and layer weight directly, that of the image by transforms."""
         keep_memory()
         labels, layers, side = scene.labels, len(scene.psfs), scene.psfs.shape[-1]
         if scene.compositing == "occlusion":
-            grid = choose_grid(labels, layers, side, WINDOWS)
-            return occlusion_gradients(occlusion_planes(scene), labels, grid, WINDOWS, gradient)
+            return _occlusion_gradients(scene, gradient)
         tensors = scene.plane, scene.psfs, scene.batch_weight
         plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
@@ -81,6 +80,19 @@ class DirectBackend:
         if wants_gradient(tensors[2]):
             of_weight = gather_direct(plane, psfs, index, weight, weight_gradient=True).mul_(gradient).sum(1)
         return gradient_pairs(tensors, (of_plane, of_psfs, of_weight))
+
+
+def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+    """Return the gradients of PSFs and stray light directly; with those of image or depth all of them by tiles."""
+    planes = occlusion_planes(scene)
+    light, psfs, weight, mean, stray_light, index, inside = planes
+    if any(wants_gradient(x) for x in (light, weight, mean)):
+        grid = choose_grid(scene.labels, len(psfs), psfs.shape[-1], WINDOWS)
+        return occlusion_gradients(planes, scene.labels, grid, WINDOWS, gradient)
+    with torch.no_grad():
+        found = occlusion_direct_gradients(light, psfs, index, weight, mean, stray_light, inside, gradient)
+    pairs = gradient_pairs((psfs, stray_light), (*found, None)[:2])
+    return [(tensor, own) for tensor, own in pairs if tensor.requires_grad]
 
 
 def refusal(labels: Labels, dtype: torch.dtype) -> str | None:

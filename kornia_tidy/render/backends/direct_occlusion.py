@@ -4,8 +4,8 @@ A block of 8 vectors (in float32 8 x 16 pixels, where they have 64 bytes) meets 
 the rows and columns where it is. All that is added up is positive, so float32 is enough: the relative error of every
 sum is small, however small the
 normaliser that it becomes. Whole weights along runs of pixels are not even convolved: their blur is known from where
-runs begin and end. The work is done in C (``occlusion.c``), see :mod:`kornia_tidy.kernels.build`. Gradients are made by
-tiles.
+runs begin and end. The work is done in C (``occlusion.c``), see :mod:`kornia_tidy.kernels.build`. Gradients of PSFs
+and stray light are made in the same way, those of image and depth by tiles.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.occlusion_ops import occlusion_direct
 from kornia_tidy.render.backends.direct_occlusion import SOURCE, can_go_directly
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render.compositing import occlusion, render
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.layers import assign_layers
 from kornia_tidy.render.scene import layered_scene
@@ -141,6 +141,23 @@ class TestDirectOcclusion(RenderTester):
         atol = 2e-5 if dtype == torch.float32 else 1e-10
         options = {"layers": layers, "border": border}
         self.assert_gradients_equal_dense("direct", image, defocus, bank, "occlusion", atol, **options)
+
+    @pytest.mark.parametrize("layers", ["nearest", "linear"])
+    @pytest.mark.parametrize("border", ["reflect", "zero", "valid"])
+    def test_feature_gradients_of_psfs_alone_equal_those_of_the_dense_render(self, layers, border, device, dtype):
+        """And of stray light. They go another way than with those of image and depth, and make no tiles."""
+        bank = make_bank(5, 2, 7, dtype=dtype, device=device, light=0.8, veil=True)
+        image, _ = make_scene(bank, 2, 31, 46)
+        defocus = label_map("squares", bank, 31, 46) + 0.5
+        gradients = []
+        for method in ("dense", "direct"):
+            leaves = bank.psfs.clone().requires_grad_(), bank.veil.clone().requires_grad_()
+            scene = image, defocus, bank.defocus, *leaves
+            coded = occlusion(*scene, layers=layers, border=border, method=method)
+            gradients.append(torch.autograd.grad(coded.square().mean(), leaves))
+        for expected, found in zip(*gradients, strict=True):
+            atol = (2e-5 if dtype == torch.float32 else 1e-10) * float(expected.abs().max())
+            self.assert_close(found, expected, rtol=0, atol=atol)
 
     # When it is chosen
 
