@@ -9,13 +9,12 @@ from types import SimpleNamespace
 
 import torch
 from kornia.augmentation.random_generator import PlainUniformGenerator
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.ranges import Range, checked_range
-from kornia_tidy.camera.color import any_channels
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
+from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.render.compositing import render
 from kornia_tidy.runtime.tracing import is_value_unknown
@@ -129,10 +128,10 @@ def depth_blur(
     radius = radius.clamp(-max_radius, max_radius)
     light = image.to(dtype)
     if color_space == "srgb":
-        light = any_channels(rgb_to_linear_rgb, light)
+        light = srgb_to_linear(light)
     blurred = render(light, radius, _discs(radius, image.shape[1]), compositing, border="replicate")
     if color_space == "srgb":
-        blurred = any_channels(linear_rgb_to_rgb, blurred)
+        blurred = linear_to_srgb(blurred)
     return blurred.to(image.dtype)
 
 

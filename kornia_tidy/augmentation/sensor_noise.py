@@ -8,13 +8,12 @@ from typing import Any
 import kornia.augmentation as K
 import torch
 from kornia.augmentation.random_generator import PlainUniformGenerator
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.augmentation.ranges import Range, check_probability, checked_range
 from kornia_tidy.augmentation.rows import changed_rows, row_seeds
-from kornia_tidy.camera.color import any_channels
 from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.sensor.noise import SensorNoise, quantize
 from kornia_tidy.sensor.shot import shot_noise
 
@@ -79,12 +78,12 @@ def sensor_noise(
         params = both.draw(image.shape, device=image.device, generator=generator, dtype=dtype)
     light = image.to(dtype)
     if color_space == "srgb":
-        light = any_channels(rgb_to_linear_rgb, light)
+        light = srgb_to_linear(light)
     electrons = shot_noise(light.clamp(min=0) * well + dark, params["shot"].to(light)).minimum(well)
     value = (electrons - dark + sigma * params["read"].to(light)) / well
     value = (value if bits is None else quantize(value, bits)).clamp(0, 1)
     if color_space == "srgb":
-        value = any_channels(linear_rgb_to_rgb, value)
+        value = linear_to_srgb(value)
     return value.to(image.dtype)
 
 

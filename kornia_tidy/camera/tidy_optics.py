@@ -7,12 +7,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.camera.advice import explain_capture, plan_capture
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
-from kornia_tidy.camera.color import any_channels
 from kornia_tidy.camera.dataset_transform import DatasetTransform
 from kornia_tidy.camera.samples import (
     Sample,
@@ -26,6 +24,7 @@ from kornia_tidy.camera.samples import (
 from kornia_tidy.camera.strips import placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.spectrum import Spectrum
@@ -323,15 +322,11 @@ class TiDyOptics(CameraState):
 
     def decode(self, image: Tensor) -> Tensor:
         """Return linear light from an image (B, C, H, W) in the camera's colour space."""
-        if self.color_space != "srgb":
-            return image
-        return rgb_to_linear_rgb(image) if image.shape[1] == 3 else any_channels(rgb_to_linear_rgb, image)
+        return srgb_to_linear(image) if self.color_space == "srgb" else image
 
     def encode(self, light: Tensor) -> Tensor:
         """Return an image in the camera's colour space from linear light (B, C, H, W)."""
-        if self.color_space != "srgb":
-            return light
-        return linear_rgb_to_rgb(light) if light.shape[1] == 3 else any_channels(linear_rgb_to_rgb, light)
+        return linear_to_srgb(light) if self.color_space == "srgb" else light
 
     def defocus(self, depth: Tensor) -> Tensor:
         """Return the defocus map of a depth map in radians at 530 nm, checked as the camera's inputs are.

@@ -17,7 +17,7 @@ import torch
 
 import kornia_tidy
 from kornia_tidy.commands.report import tell
-from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops
+from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops, srgb_ops
 from kornia_tidy.kernels.build import REALS, build, cache_folder, vector_bytes
 from kornia_tidy.kernels.compiler import Compiler, find_compiler
 
@@ -32,7 +32,7 @@ PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
     *("lightning", "matplotlib", "h5py", "OpenEXR"),
 )
-SOURCES = tuple(ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops))
+SOURCES = tuple(ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, srgb_ops))
 
 
 def add_parser(subparsers: Any) -> None:

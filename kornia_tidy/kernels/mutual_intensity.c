@@ -12,13 +12,15 @@
 
 #include "vectors.h"
 
-enum { BLOCK = 8, STEP = LANES > BLOCK ? LANES : BLOCK };  // rows of J that stay in registers, and what rows are padded to
+enum { BLOCK = REGISTERS == 32 ? 8 : 4, SPAN = 3 };    // rows of J and vectors of each that stay in registers
+enum { PIXELS = REGISTERS == 32 ? 4 : VECTOR_BYTES == 32 ? 3 : 2, LINES = 4 }; // as many pixels, or vectors of B, of as many rows of pixels
+enum { STEP = LANES > 8 ? LANES : 8 };                 // what rows are padded to
 
 // Computes `count` vectors of a wave: the sum over m of x[m] u[m], complex, with a row x of the kernel and the field u.
 INLINE void add_wave(const REAL *x, const vec *u, int64_t cells, int64_t vecs, int count, vec *re, vec *im) {
-    vec a[2] = {0}, b[2] = {0}, c[2] = {0}, e[2] = {0};
+    vec a[SPAN] = {0}, b[SPAN] = {0}, c[SPAN] = {0}, e[SPAN] = {0};
     for (int64_t m = 0; m < cells; m++, u += 2 * vecs)
-#pragma GCC unroll 2
+#pragma GCC unroll 3
         for (int i = 0; i < count; i++) {
             a[i] += x[2 * m] * u[i], b[i] += x[2 * m] * u[vecs + i];
             c[i] += x[2 * m + 1] * u[vecs + i], e[i] += x[2 * m + 1] * u[i];
@@ -26,57 +28,83 @@ INLINE void add_wave(const REAL *x, const vec *u, int64_t cells, int64_t vecs, i
     for (int i = 0; i < count; i++) re[i] = a[i] - c[i], im[i] = b[i] + e[i];
 }
 
-// Computes the light in `count` successive pixels: the inner products of J with their matrices B.
-INLINE void add_light(const vec *intensity, const vec *pixel, int64_t plane, int count, REAL *light) {
-    vec sums[4][2];
+static void add_waves(const REAL *x, const vec *u, int64_t cells, int64_t vecs, vec *re, vec *im) {
+    int64_t v = 0;
+    for (; v + SPAN <= vecs; v += SPAN) add_wave(x, u + v, cells, vecs, SPAN, re + v, im + v);
+    if (vecs - v == 2) add_wave(x, u + v, cells, vecs, 2, re + v, im + v);
+    else if (vecs - v == 1) add_wave(x, u + v, cells, vecs, 1, re + v, im + v);
+}
+
+// Computes the light in `count` successive pixels of `lines` rows: the inner products of J with their matrices B.
+INLINE void add_light(const vec *intensity, const vec *pixel, int64_t plane, int lines, int count, int64_t window, REAL *light) {
+    vec sums[LINES][PIXELS];
     memset(sums, 0, sizeof sums);
-    int64_t n = 0;
-    for (; n + 2 <= plane; n += 2)
+    for (int64_t n = 0; n < plane; n++)
 #pragma GCC unroll 4
+        for (int p = 0; p < lines; p++)
+#pragma GCC unroll 4
+            for (int i = 0; i < count; i++) sums[p][i] += intensity[p * plane + n] * pixel[i * plane + n];
+    for (int p = 0; p < lines; p++)
         for (int i = 0; i < count; i++) {
-            sums[i][0] += intensity[n] * pixel[i * plane + n];
-            sums[i][1] += intensity[n + 1] * pixel[i * plane + n + 1];
+            const REAL sum = sum_of(sums[p][i]);
+            light[p * window + i] = sum < 0 ? 0 : sum;  // rounding can make dark pixels negative
         }
-    for (int i = 0; n < plane && i < count; i++) sums[i][0] += intensity[n] * pixel[i * plane + n];
-    for (int i = 0; i < count; i++) {
-        light[i] = sum_of(sums[i][0] + sums[i][1]);
-        if (light[i] < 0) light[i] = 0;  // rounding can make dark pixels negative
+}
+
+INLINE void add_lines(const vec *intensity, const vec *pixels, int64_t plane, int lines, int64_t window, REAL *light) {
+    int64_t s = 0;
+    for (; s + PIXELS <= window; s += PIXELS) add_light(intensity, pixels + s * plane, plane, lines, PIXELS, window, light + s);
+    for (; s < window; s++) add_light(intensity, pixels + s * plane, plane, lines, 1, window, light + s);
+}
+
+INLINE void add_products(const vec *re, const vec *im, const vec *one, const vec *two, int64_t waves, int64_t vecs,
+                         int64_t first, int count, vec *total) {
+    vec sums[BLOCK][SPAN];
+    memset(sums, 0, sizeof sums);
+    for (int64_t w = 0; w < waves * vecs; w += vecs) {
+        const REAL *a = (const REAL *)(re + w) + first, *b = (const REAL *)(im + w) + first;
+#pragma GCC unroll 8
+        for (int n = 0; n < BLOCK; n++)
+#pragma GCC unroll 3
+            for (int i = 0; i < count; i++) {
+                sums[n][i] += a[n] * one[w + i];
+                sums[n][i] += b[n] * two[w + i];
+            }
     }
+    for (int n = 0; n < BLOCK; n++)
+        for (int i = 0; i < count; i++) total[(first + n) * vecs + i] = sums[n][i];
 }
 
 // Computes J or B in packed form: total[n][m] is the sum over waves of re[n] one[m] + im[n] two[m]. Padded rows n are zero.
 static void products(const vec *re, const vec *im, const vec *one, const vec *two, int64_t waves, int64_t rows,
                      int64_t vecs, vec *total) {
-    for (int64_t first = 0; first < rows; first += BLOCK)
-        for (int64_t m = 0; m < vecs; m++) {
-            vec sums[BLOCK];
-            memset(sums, 0, sizeof sums);
-            for (int64_t w = 0; w < waves; w++) {
-                const REAL *a = (const REAL *)(re + w * vecs) + first, *b = (const REAL *)(im + w * vecs) + first;
-                vec x = one[w * vecs + m], y = two[w * vecs + m];
-#pragma GCC unroll 8
-                for (int n = 0; n < BLOCK; n++) sums[n] += a[n] * x + b[n] * y;
-            }
-            for (int n = 0; n < BLOCK; n++) total[(first + n) * vecs + m] = sums[n];
-        }
+    for (int64_t n = 0; n < rows; n += BLOCK) {
+        int64_t m = 0;
+        for (; m + SPAN <= vecs; m += SPAN) add_products(re, im, one + m, two + m, waves, vecs, n, SPAN, total + m);
+        if (vecs - m == 2) add_products(re, im, one + m, two + m, waves, vecs, n, 2, total + m);
+        else if (vecs - m == 1) add_products(re, im, one + m, two + m, waves, vecs, n, 1, total + m);
+    }
 }
 
-// Sums B over pixels with `count` rows of weights: a row's gradient of J.
-INLINE void add_pixels(const vec *pixels, const REAL *gradient, int64_t window, int64_t plane, int count, vec *total) {
-    for (int64_t n = 0; n < plane; n += 2) {
-        const int64_t next = least(n + 1, plane - 1);
-        vec sums[4][2];
-        memset(sums, 0, sizeof sums);
-        for (int64_t s = 0; s < window; s++) {
-            vec x = pixels[s * plane + n], y = pixels[s * plane + next];
+INLINE void add_pixel_part(const vec *pixels, const REAL *gradient, int64_t window, int64_t plane, int lines, int count,
+                           vec *total) {
+    vec sums[LINES][PIXELS];
+    memset(sums, 0, sizeof sums);
+    for (int64_t s = 0; s < window; s++)
 #pragma GCC unroll 4
-            for (int i = 0; i < count; i++) {
-                sums[i][0] += gradient[i * window + s] * x;
-                sums[i][1] += gradient[i * window + s] * y;
-            }
-        }
-        for (int i = 0; i < count; i++) total[i * plane + n] = sums[i][0], total[i * plane + next] = sums[i][1];
-    }
+        for (int p = 0; p < lines; p++)
+#pragma GCC unroll 4
+            for (int i = 0; i < count; i++) sums[p][i] += gradient[p * window + s] * pixels[s * plane + i];
+    for (int p = 0; p < lines; p++)
+        for (int i = 0; i < count; i++) total[p * plane + i] = sums[p][i];
+}
+
+// Sums B over pixels with `lines` rows of weights: gradients of J.
+INLINE void add_pixels(const vec *pixels, const REAL *gradient, int64_t window, int64_t plane, int lines, vec *total) {
+    int64_t n = 0;
+    for (; n + PIXELS <= plane; n += PIXELS)
+        add_pixel_part(pixels + n, gradient, window, plane, lines, PIXELS, total + n);
+    for (; n < plane; n++) add_pixel_part(pixels + n, gradient, window, plane, lines, 1, total + n);
 }
 
 // The sizes of one call. Rows of planes are `vecs` vectors of `pitch` numbers.
@@ -129,10 +157,9 @@ static void fill_row(const sizes *z, const vec *fields, const REAL *kernel, int6
         for (int64_t q = 0; q < z->order; q++) {
             const REAL *x = kernel + (p * z->order + q) * z->cells * 2;
             const vec *u = fields + k * z->cells * 2 * z->vecs;
-            int64_t at = (k * z->order + q) * z->vecs, v = 0;
-            for (; v + 2 <= z->vecs; v += 2) add_wave(x, u + v, z->cells, z->vecs, 2, r.re + at + v, r.im + at + v);
-            for (; v < z->vecs; v++) add_wave(x, u + v, z->cells, z->vecs, 1, r.re + at + v, r.im + at + v);
-            for (v = at; v < at + z->vecs; v++)
+            const int64_t at = (k * z->order + q) * z->vecs;
+            add_waves(x, u, z->cells, z->vecs, r.re + at, r.im + at);
+            for (int64_t v = at; v < at + z->vecs; v++)
                 r.one[v] = z->weights[k] * (r.re[v] - r.im[v]), r.two[v] = z->weights[k] * (r.re[v] + r.im[v]);
         }
 }
@@ -148,23 +175,25 @@ int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels,
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
     for (int64_t d = 0; d < depths; d++) {
         int64_t part = z->waves * z->vecs;
-        vec *memory = aligned_alloc(sizeof(vec), (4 * part + (window + 1) * z->plane) * sizeof(vec));
+        vec *memory = aligned_alloc(sizeof(vec), (4 * part + (window + LINES) * z->plane) * sizeof(vec));
         if (!memory) {
 #pragma omp atomic write
             failed = 1;
             continue;
         }
         row r = {memory, memory + part, memory + 2 * part, memory + 3 * part};
-        vec *intensity = memory + 4 * part, *pixels = intensity + z->plane;
+        vec *intensity = memory + 4 * part, *pixels = intensity + LINES * z->plane;
         const REAL *kernel = kernels + d * window * order * cells * 2;
         fill_pixels(z, kernel, r, pixels);
-        for (int64_t p = 0; p < window; p++) {
-            fill_row(z, fields, kernel, p, r);
-            products(r.re, r.im, r.one, r.two, z->waves, z->rows, z->vecs, intensity);
+        for (int64_t p = 0, lines; p < window; p += lines) {
+            lines = p + LINES <= window ? LINES : 1;
+            for (int64_t i = 0; i < lines; i++) {
+                fill_row(z, fields, kernel, p + i, r);
+                products(r.re, r.im, r.one, r.two, z->waves, z->rows, z->vecs, intensity + i * z->plane);
+            }
             REAL *light = energies + (d * window + p) * window;
-            int64_t s = 0;
-            for (; s + 4 <= window; s += 4) add_light(intensity, pixels + s * z->plane, z->plane, 4, light + s);
-            for (; s < window; s++) add_light(intensity, pixels + s * z->plane, z->plane, 1, light + s);
+            if (lines == LINES) add_lines(intensity, pixels, z->plane, LINES, window, light);
+            else add_lines(intensity, pixels, z->plane, 1, window, light);
         }
         free(memory);
     }
@@ -192,26 +221,24 @@ static void add_row_gradient(const sizes *z, const vec *intensity, int64_t p, co
     }
     for (int64_t k = 0; k < z->states; k++)
         for (int64_t q = 0; q < z->order; q++) {
-            int64_t from = (k * z->order + q) * z->vecs, at = ((k * z->window + p) * z->order + q) * z->vecs, v = 0;
+            const int64_t from = (k * z->order + q) * z->vecs, at = ((k * z->window + p) * z->order + q) * z->vecs;
             for (int64_t n = 0; n < z->cells; n++) {
                 d->turned[2 * n] = ((const REAL *)(d->r.two + from))[n];
                 d->turned[2 * n + 1] = -((const REAL *)(d->r.one + from))[n];
             }
-            for (; v + 2 <= z->vecs; v += 2)
-                add_wave(d->turned, d->form + v, z->cells, z->vecs, 2, d->re + at + v, d->im + at + v);
-            for (; v < z->vecs; v++) add_wave(d->turned, d->form + v, z->cells, z->vecs, 1, d->re + at + v, d->im + at + v);
-            for (v = at; v < at + z->vecs; v++) d->less[v] = -d->re[v];
+            add_waves(d->turned, d->form, z->cells, z->vecs, d->re + at, d->im + at);
+            for (int64_t v = at; v < at + z->vecs; v++) d->less[v] = -d->re[v];
         }
 }
 
 // Adds the gradient of a depth to the sums.
 static void add_depth_gradient(const sizes *z, const vec *fields, const REAL *kernel, const REAL *gradient, const desk *d) {
     fill_pixels(z, kernel, d->r, d->pixels);
-    for (int64_t p = 0, count; p < z->window; p += count) {
-        count = p + 4 <= z->window ? 4 : 1;
-        if (count == 4) add_pixels(d->pixels, gradient + p * z->window, z->window, z->plane, 4, d->intensity);
+    for (int64_t p = 0, lines; p < z->window; p += lines) {
+        lines = p + LINES <= z->window ? LINES : 1;
+        if (lines == LINES) add_pixels(d->pixels, gradient + p * z->window, z->window, z->plane, LINES, d->intensity);
         else add_pixels(d->pixels, gradient + p * z->window, z->window, z->plane, 1, d->intensity);
-        for (int64_t i = 0; i < count; i++) {
+        for (int64_t i = 0; i < lines; i++) {
             fill_row(z, fields, kernel, p + i, d->r);
             add_row_gradient(z, d->intensity + i * z->plane, p + i, d);
         }
@@ -238,7 +265,7 @@ int mutual_field_gradient(const REAL *field, const REAL *weights, const REAL *ke
                           int64_t states, int64_t depths, int64_t window, int64_t order, int64_t cells, int64_t threads) {
     const sizes all = sizes_of(weights, states, depths, window, order, cells), *z = &all;
     const int64_t slabs = least(threads, depths), part = z->waves * z->vecs, points = window * order * z->vecs;
-    const int64_t each[] = {4 * part, window * z->plane, 4 * z->plane, 2 * cells * z->vecs, 2 * z->vecs,
+    const int64_t each[] = {4 * part, window * z->plane, LINES * z->plane, 2 * cells * z->vecs, 2 * z->vecs,
                             3 * states * points, 2 * points, 2 * states * z->plane};
     int64_t size = 0;
     for (int n = 0; n < 8; n++) size += each[n];

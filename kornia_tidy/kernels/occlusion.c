@@ -38,6 +38,8 @@ typedef struct {
     const REAL *mean;   // (images, channels) mean light, spread as stray light, or null
     const REAL *veil;   // (layers, channels) share of stray light
     REAL *out;          // (images, channels, height, width)
+    const REAL *gradient;  // of `out`
+    REAL *psf_gradient, *veil_gradient;  // of `psfs` and `veil`, like them
 } scene_parameters;
 
 // A run of pixels of one row with the same layer index; either all or none of them are shared with the next layer.
@@ -50,6 +52,8 @@ typedef struct {
     const REAL *light;
     int32_t from, to;
 } ray;
+
+enum { BLURRED, ALPHA, DIVISOR, PASSED, KEPT, CUMULATIVE = DIVISOR };  // the first three, then their gradients
 
 // Start (sign 1) or end (-1) of a run of weights 1, as an index into the tables of partial sums.
 typedef struct {
@@ -82,6 +86,7 @@ typedef struct {
     ray *rays;          // of one channel
     vec (*total)[BAND], (*through)[BAND];  // by channel: light of the nearer layers, and their transmission
     outline outline;
+    vec (*kept)[KEPT][BAND];  // of a block, by layer and channel, for gradients
     void *all[20];
     int count;
 } workspace;
@@ -193,8 +198,8 @@ INLINE void start_row(region *a, int64_t at, int whole) {
     a->open = whole;
 }
 
-// Finds the runs and rows of a layer in a window.
-static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int32_t layer, int64_t pitch) {
+// Finds the runs and rows of a layer in a window. Rows of this layer alone are not masked, unless they are to be `copied`.
+static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int32_t layer, int64_t pitch, int copied) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1;
     outline *o = &d->outline;
     o->own.column_count = o->own.row_count = o->own.open = 0;
@@ -205,7 +210,7 @@ static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int
         const run *p = d->heads[r];
         int64_t place = (BAND - 1 + r) * table_pitch(s) + s->side + LANES - 2 + x;  // subtract the first column of a run
         int was_own = p->layer == layer && !p->shared, was_behind = was_own || p->layer < layer;
-        int whole = was_own && p[1].start >= x + span;
+        int whole = !copied && was_own && p[1].start >= x + span;
         start_row(&o->own, rows - 1 - r, was_own);
         start_row(&o->behind, rows - 1 - r, was_behind);
         for (; p->start < x + span; p++) {
@@ -219,7 +224,7 @@ static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int
             if (below) reach(&lower, from, to);
             if (above) reach(&upper, from, to);
         }
-        // Rows of this layer alone need no mask: null means the row of the plane itself.
+        // Null means the row of the plane itself.
         o->light[r] = ray_of(s, light, whole ? 0 : d->rows[0] + r * pitch, d->nothing);
         o->lower[r] = ray_of(s, lower, d->rows[1] + r * pitch, d->nothing);
         o->upper[r] = ray_of(s, upper, d->rows[2] + r * pitch, d->nothing);
@@ -367,47 +372,76 @@ static void lay_alone(const scene_parameters *s, workspace *d, const double *tab
     }
 }
 
+// A block of one strip, at the corner of its window.
+typedef struct {
+    int64_t image, x, light;  // light: of the first channel's pixel in `plane`
+    const REAL *lower, *share;
+    int layers;
+} block;
+
+static block block_at(const scene_parameters *s, workspace *d, int64_t image, int64_t y, int64_t x) {
+    int64_t corner = image * s->map_image + y * s->map_row + x;
+    int count = list_layers(s, d, s->side + BAND - 1, x, s->side + LANES - 1);
+    return (block){image, x, image * s->plane_image + y * s->plane_row + x, s->lower + corner, s->share ? s->share + corner : 0, count};
+}
+
+// Finds a layer in a window, and the rows of its shared weights.
+static void find_layer(const scene_parameters *s, workspace *d, const block *b, int32_t layer, int copied) {
+    outline *o = &d->outline;
+    draw_outline(s, d, b->x, layer, window_pitch(s), copied);
+    if (o->lower_count) mask_rows(s, o->lower, layer, LOWER, b->lower, b->share, b->lower, d->rows[1], window_pitch(s));
+    if (o->upper_count) mask_rows(s, o->upper, layer, UPPER, b->lower, b->share, b->lower, d->rows[2], window_pitch(s));
+}
+
+// Masks the light of the layer that was found, in one channel.
+static void find_light(const scene_parameters *s, workspace *d, const block *b, int32_t layer, int64_t c) {
+    const REAL *plane = s->plane + b->light + c * s->plane_channel;
+    for (int64_t r = 0; r < s->side + BAND - 1; r++) {
+        d->rays[r] = d->outline.light[r];
+        if (!d->rays[r].light) d->rays[r].light = plane + r * s->plane_row;
+    }
+    mask_light(s, d->outline.light, layer, b->lower, b->share, plane, d->rows[0], window_pitch(s));
+}
+
+// Blurs light, alpha and cumulative alpha of the n-th layer from near, which was found, in one channel.
+INLINE void blur_layer(const scene_parameters *s, workspace *d, const double *tables, const block *b, int n, int64_t c,
+                       vec (*light)[BAND], vec (*own)[BAND], vec (*seen)[BAND]) {
+    const outline *o = &d->outline;
+    const int64_t plane = d->members[n] * s->channels + c;
+    const REAL *psf = s->psfs + plane * s->side * s->side;
+    const double *table = tables + plane * table_size(s);
+    vec weight[1][BAND];
+    find_light(s, d, b, d->members[n], c);
+    convolve_one(d->rays, psf, s->side, light);
+    add_edges(s, table, &o->own, *own);
+    if (n == b->layers - 1) memcpy(seen, own, sizeof *seen);  // the farthest layer: the cumulative alpha is its own
+    else add_edges(s, table, &o->behind, *seen);
+    if (o->lower_count) {
+        convolve_one(o->lower, psf, s->side, weight);
+        for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v], seen[0][v] += weight[0][v];
+    }
+    if (o->upper_count) {
+        convolve_one(o->upper, psf, s->side, weight);
+        for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v];
+    }
+}
+
 // Renders a block of one strip by compositing its layers from near to far.
 static void lay_over(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
-    int64_t area = s->side * s->side, rows = s->side + BAND - 1, pitch = window_pitch(s);
-    int count = list_layers(s, d, rows, x, s->side + LANES - 1);
-    int64_t corner = image * s->map_image + y * s->map_row + x;
-    const REAL *lower = s->lower + corner, *share = s->share ? s->share + corner : 0;
-    outline *o = &d->outline;
+    const block b = block_at(s, d, image, y, x);
     vec(*total)[BAND] = d->total, (*through)[BAND] = d->through;
     for (int64_t c = 0; c < s->channels; c++)
         for (int v = 0; v < BAND; v++) total[c][v] = (vec){0}, through[c][v] = 1 - (vec){0};
-    for (int n = 0; n < count; n++) {
+    for (int n = 0; n < b.layers; n++) {
         int32_t layer = d->members[n];
-        draw_outline(s, d, x, layer, pitch);
-        if (o->lower_count) mask_rows(s, o->lower, layer, LOWER, lower, share, lower, d->rows[1], pitch);
-        if (o->upper_count) mask_rows(s, o->upper, layer, UPPER, lower, share, lower, d->rows[2], pitch);
+        find_layer(s, d, &b, layer, 0);
         for (int64_t c = 0; c < s->channels; c++) {
-            const REAL *psf = s->psfs + (layer * s->channels + c) * area;
-            const double *table = tables + (layer * s->channels + c) * table_size(s);
-            const REAL *plane = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
-            for (int64_t r = 0; r < rows; r++) {
-                d->rays[r] = o->light[r];
-                if (!d->rays[r].light) d->rays[r].light = plane + r * s->plane_row;
-            }
-            vec light[2][BAND], own[2][BAND], seen[BAND], weight[2][BAND];
-            mask_light(s, o->light, layer, lower, share, plane, d->rows[0], pitch);
-            convolve_one(d->rays, psf, s->side, light);
-            add_edges(s, table, &o->own, own[0]);
-            if (n == count - 1) memcpy(seen, own[0], sizeof seen);  // the farthest layer: the cumulative alpha is its own
-            else add_edges(s, table, &o->behind, seen);
-            if (o->lower_count) {
-                convolve_one(o->lower, psf, s->side, weight);
-                for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v], seen[v] += weight[0][v];
-            }
-            if (o->upper_count) {
-                convolve_one(o->upper, psf, s->side, weight);
-                for (int v = 0; v < BAND; v++) own[0][v] += weight[0][v];
-            }
+            vec light[1][BAND], own[1][BAND], seen[1][BAND];
+            blur_layer(s, d, tables, &b, n, c, light, own, seen);
             REAL veil = s->veil ? s->veil[layer * s->channels + c] : 0;
             REAL glow = s->veil ? veil * s->mean[image * s->channels + c] : 0;
             for (int v = 0; v < BAND; v++) {
-                vec passed = through[c][v] / (only(seen[v], seen[v] > 0) + EPSILON);
+                vec passed = through[c][v] / (only(seen[0][v], seen[0][v] > 0) + EPSILON);
                 total[c][v] += passed * ((1 - veil) * light[0][v] + glow * own[0][v]);
                 through[c][v] -= passed * own[0][v];
             }
@@ -419,7 +453,7 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
     }
 }
 
-// Counts of operations for the cost of a scene, see `direct_cost` in direct_occlusion.py.
+// Counts of operations for the cost of a scene, see `count_operations` in occlusion_ops.py.
 enum { ALONE, PAIRS, COLUMNS, EDGES, COUNTS };
 
 static int64_t count_columns(const ray *rays, int64_t side) {
@@ -437,7 +471,7 @@ static void count_block(const scene_parameters *s, workspace *d, int64_t x, int6
     const outline *o = &d->outline;
     counts[PAIRS] += count;
     for (int n = 0; n < count; n++) {
-        draw_outline(s, d, x, d->members[n], window_pitch(s));
+        draw_outline(s, d, x, d->members[n], window_pitch(s), 0);
         counts[COLUMNS] += count_columns(o->light, s->side);
         if (o->lower_count) counts[COLUMNS] += count_columns(o->lower, s->side);
         if (o->upper_count) counts[COLUMNS] += count_columns(o->upper, s->side);
@@ -474,6 +508,7 @@ static int allocate_workspace(const scene_parameters *s, workspace *d) {
     o->behind.columns = take(d, rows * span * sizeof(edge));
     o->own.rows = take(d, rows * sizeof(edge));
     o->behind.rows = take(d, rows * sizeof(edge));
+    d->kept = take(d, (s->gradient ? (s->layers + 1) * s->channels : 1) * sizeof *d->kept);
     int ok = 1;
     for (int n = 0; n < d->count; n++) ok &= d->all[n] != 0;
     for (int64_t r = 0; ok && r < rows; r++) d->made[r] = -1;
@@ -536,5 +571,238 @@ int occlude(const scene_parameters *s) {
         free_workspace(&d);
     }
     free(tables);
+    return failed;
+}
+
+// ---- Gradients of the PSFs and of stray light. Each block is rendered again.
+
+enum { LINES = 4, SPAN = REGISTERS / 8 };  // rows of a PSF, and vectors of each, whose sums stay in registers
+
+// Gradients of a thread, by layer and channel.
+typedef struct {
+    double *tables, *psfs, *veil;
+    REAL *band;  // of PSFs, (LINES side / LINES, pitch) rounded up, of the blocks of one band
+    char *met;   // whether a block of the band has the layer
+    int64_t pitch, size;
+} tally;
+
+static int allocate_tally(const scene_parameters *s, tally *t) {
+    const int64_t planes = s->layers * s->channels, area = s->side * s->side;
+    t->pitch = (s->side + LANES - 1) / LANES * LANES;
+    t->size = (s->side + LINES - 1) / LINES * LINES * t->pitch;
+    t->tables = calloc(planes * (table_size(s) + area + 1), sizeof(double));
+    t->psfs = t->tables + planes * table_size(s), t->veil = t->psfs + planes * area;
+    t->band = calloc(planes * t->size, sizeof(REAL));
+    t->met = calloc(s->layers, 1);
+    return t->tables && t->band && t->met;
+}
+
+static void free_tally(tally *t) { free(t->tables), free(t->band), free(t->met); }
+
+// Adds the products of a row of light, the r-th, with the block's rows that it meets for lines `first` to `last`.
+INLINE void add_row(const ray *row, REAL (*block)[LANES], int64_t r, int first, int last, int64_t j, int width, vec (*sums)[SPAN]) {
+    if (!row->to) return;
+    for (int lane = 0; lane < LANES; lane++)
+#pragma GCC unroll 4
+        for (int k = 0; k < width; k++) {
+            const vec light = *(const loose *)(row->light + j + lane + k * LANES);
+#pragma GCC unroll 4
+            for (int q = first; q <= last; q++) sums[q][k] += block[r - q][lane] * light;
+        }
+}
+
+// Adds to LINES rows of `total` the correlation of `count` rows of light with a block.
+INLINE void correlate_lines(const ray *rays, int64_t count, REAL (*block)[LANES], int64_t j, int width, int64_t pitch, REAL *total) {
+    vec sums[LINES][SPAN];
+    for (int q = 0; q < LINES; q++)
+        for (int k = 0; k < width; k++) sums[q][k] = *(const loose *)(total + q * pitch + j + k * LANES);
+#pragma GCC unroll 3
+    for (int r = 0; r < LINES - 1; r++) add_row(rays + r, block, r, 0, r, j, width, sums);
+    for (int64_t r = LINES - 1; r < BAND; r++) add_row(rays + r, block, r, 0, LINES - 1, j, width, sums);
+#pragma GCC unroll 3
+    for (int r = BAND; r < BAND + LINES - 1; r++)
+        if (r < count) add_row(rays + r, block, r, r - BAND + 1, LINES - 1, j, width, sums);
+    for (int q = 0; q < LINES; q++)
+        for (int k = 0; k < width; k++) *(loose *)(total + q * pitch + j + k * LANES) = sums[q][k];
+}
+
+// Adds the gradient of a PSF, whose convolution with rows of light has the gradient `block`: the transpose of convolve_one.
+static void correlate_rays(const ray *rays, const vec *block, int64_t side, const tally *t, REAL *total) {
+    REAL rows[BAND][LANES];
+    memcpy(rows, block, sizeof rows);
+    for (int64_t i = 0; i < side; i += LINES, total += LINES * t->pitch) {
+        const int64_t count = least(LINES, side - i) + BAND - 1;
+        int64_t from = side, to = 0;
+        for (const ray *r = rays + i; r < rays + i + count; r++) {
+            if (r->to && r->from < from) from = r->from;
+            if (r->to > to) to = r->to;
+        }
+        int64_t j = from / LANES * LANES;
+        for (; j + (SPAN - 1) * LANES < to; j += SPAN * LANES) correlate_lines(rays + i, count, rows, j, SPAN, t->pitch, total);
+        for (; j + LANES < to; j += 2 * LANES) correlate_lines(rays + i, count, rows, j, 2, t->pitch, total);
+        if (j < to) correlate_lines(rays + i, count, rows, j, 1, t->pitch, total);
+    }
+}
+
+// The transpose of add_edges.
+static void spread_edges(const scene_parameters *s, double *table, const region *a, const vec *block) {
+    const int64_t pitch = table_pitch(s);
+    dvec parts[BAND][PARTS];
+    double sums[BAND] = {0};
+    for (int v = 0; v < BAND; v++)
+        for (int p = 0; p < PARTS; p++) {
+            part half;
+            memcpy(&half, (const char *)(block + v) + p * sizeof half, sizeof half);
+            parts[v][p] = __builtin_convertvector(half, dvec);
+            for (int n = 0; n < DOUBLES; n++) sums[v] += parts[v][p][n];
+        }
+    for (const edge *e = a->rows; e < a->rows + a->row_count; e++)
+        for (int v = 0; v < BAND; v++) table[table_rows(s) * pitch + e->at + v] += e->sign * sums[v];
+    for (const edge *e = a->columns; e < a->columns + a->column_count; e++)
+        for (int v = 0; v < BAND; v++)
+            for (int p = 0; p < PARTS; p++) *(dloose *)(table + e->at - v * pitch + p * DOUBLES) += e->sign * parts[v][p];
+}
+
+// The transpose of fill_table: adds to the gradient of a PSF, and leaves partial sums in the table.
+static void fold_table(const scene_parameters *s, double *table, double *psf) {
+    const int64_t pitch = table_pitch(s), rows = table_rows(s);
+    double *ends = table + rows * pitch;
+    for (int64_t u = rows - 2; u >= 0; u--) ends[u] += ends[u + 1];
+    for (int64_t k = 0; k < s->side; k++) {
+        double sum = ends[s->side + BAND - 2 - k], *row = table + (BAND - 1 + k) * pitch;
+        for (int64_t u = pitch - 1; u >= 0; u--) {
+            int64_t column = s->side + LANES - 2 - u;
+            sum += row[u];
+            if (column >= 0 && column < s->side) psf[column * s->side + k] += sum;
+        }
+    }
+}
+
+// Renders the layers of a block, and keeps what gradients are made of.
+static void keep_layers(const scene_parameters *s, workspace *d, const double *tables, const block *b) {
+    vec(*through)[BAND] = d->through;
+    for (int64_t c = 0; c < s->channels; c++)
+        for (int v = 0; v < BAND; v++) through[c][v] = 1 - (vec){0};
+    for (int n = 0; n < b->layers; n++) {
+        find_layer(s, d, b, d->members[n], 1);
+        for (int64_t c = 0; c < s->channels; c++) {
+            vec(*k)[BAND] = d->kept[n * s->channels + c];
+            blur_layer(s, d, tables, b, n, c, k + BLURRED, k + ALPHA, k + CUMULATIVE);
+            for (int v = 0; v < BAND; v++) {
+                k[DIVISOR][v] = only(k[CUMULATIVE][v], k[CUMULATIVE][v] > 0) + EPSILON;
+                k[PASSED][v] = through[c][v] / k[DIVISOR][v];
+                through[c][v] -= k[PASSED][v] * k[ALPHA][v];
+            }
+        }
+    }
+}
+
+// Makes of what was kept the gradients of the blurred planes, from far to near. Of the block's pixels those above `skip` and
+// left of `overlap` belong to others.
+static void turn_back(const scene_parameters *s, workspace *d, tally *t, const block *b, const REAL *corner, int skip, int64_t overlap) {
+    vec(*through)[BAND] = d->through;  // its gradient
+    for (int64_t c = 0; c < s->channels; c++) {
+        vec gradient[BAND];
+        for (int v = 0; v < BAND; v++) {
+            gradient[v] = *(const loose *)(corner + (c * s->height + v) * s->width);
+            for (int lane = 0; lane < (v < skip ? LANES : overlap); lane++) gradient[v][lane] = 0;
+            through[c][v] = (vec){0};
+        }
+        for (int n = b->layers - 1; n >= 0; n--) {
+            const int64_t plane = d->members[n] * s->channels + c;
+            const REAL veil = s->veil ? s->veil[plane] : 0, mean = s->veil ? s->mean[b->image * s->channels + c] : 0;
+            vec(*k)[BAND] = d->kept[n * s->channels + c], of_veil = {0};
+            for (int v = 0; v < BAND; v++) {
+                vec light = k[BLURRED][v], own = k[ALPHA][v], divisor = k[DIVISOR][v], passed = k[PASSED][v];
+                vec of_passed = gradient[v] * ((1 - veil) * light + veil * mean * own) - through[c][v] * own;
+                of_veil += gradient[v] * passed * (mean * own - light);
+                k[BLURRED][v] = (1 - veil) * gradient[v] * passed;
+                k[ALPHA][v] = passed * (veil * mean * gradient[v] - through[c][v]);
+                k[CUMULATIVE][v] = only(-of_passed * passed / divisor, divisor > EPSILON);
+                through[c][v] += of_passed / divisor;
+            }
+            t->veil[plane] += sum_of(of_veil);
+        }
+    }
+}
+
+// Adds the gradients of the PSFs from those of the planes that they have blurred.
+static void add_layers(const scene_parameters *s, workspace *d, tally *t, const block *b) {
+    const outline *o = &d->outline;
+    for (int n = 0; n < b->layers; n++) {
+        const int32_t layer = d->members[n];
+        find_layer(s, d, b, layer, 1);
+        t->met[layer] = 1;
+        for (int64_t c = 0; c < s->channels; c++) {
+            const int64_t plane = layer * s->channels + c;
+            vec(*k)[BAND] = d->kept[n * s->channels + c], both[BAND];
+            double *table = t->tables + plane * table_size(s);
+            REAL *total = t->band + plane * t->size;
+            for (int v = 0; v < BAND; v++) both[v] = k[ALPHA][v] + k[CUMULATIVE][v];
+            find_light(s, d, b, layer, c);
+            correlate_rays(d->rays, k[BLURRED], s->side, t, total);
+            if (n < b->layers - 1) spread_edges(s, table, &o->behind, k[CUMULATIVE]);
+            spread_edges(s, table, &o->own, n < b->layers - 1 ? k[ALPHA] : both);
+            if (o->lower_count) correlate_rays(o->lower, both, s->side, t, total);
+            if (o->upper_count) correlate_rays(o->upper, k[ALPHA], s->side, t, total);
+        }
+    }
+}
+
+static void go_back(const scene_parameters *s, workspace *d, tally *t, const double *tables, int64_t band) {
+    const int64_t bands = (s->height + BAND - 1) / BAND, image = band / bands, area = s->side * s->side;
+    const int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
+    find_runs_of_band(s, d, image, y);
+    for (int64_t x = 0; x < s->width; x += LANES) {
+        const int64_t left = least(x, s->width - LANES);
+        move_heads(d, s->side + BAND - 1, left, 0);
+        const block b = block_at(s, d, image, y, left);
+        keep_layers(s, d, tables, &b);
+        turn_back(s, d, t, &b, s->gradient + (image * s->channels * s->height + y) * s->width + left, top - y, x - left);
+        add_layers(s, d, t, &b);
+    }
+    for (int64_t n = 0; n < s->layers * s->channels; n++) {
+        if (!t->met[n / s->channels]) continue;
+        REAL *total = t->band + n * t->size;
+        for (int64_t i = 0; i < s->side; i++)
+            for (int64_t j = 0; j < s->side; j++) t->psfs[n * area + j * s->side + i] += total[i * t->pitch + j];
+        memset(total, 0, t->size * sizeof *total);
+    }
+    memset(t->met, 0, s->layers);
+}
+
+// Computes the gradients of PSFs and stray light from that of the light. Each thread sums bands, always the same ones, and
+// threads are summed in their order. Returns 0, or 1 if there is no memory.
+int occlusion_gradients(const scene_parameters *s) {
+    const int64_t bands = s->images * ((s->height + BAND - 1) / BAND), all = s->layers * s->channels, area = s->side * s->side;
+    double *tables = malloc(all * table_size(s) * sizeof(double));
+    tally *tallies = calloc(s->threads, sizeof *tallies);
+    int failed = !tables || !tallies;
+    if (!failed) {
+#pragma omp parallel for schedule(static, 1) num_threads(s->threads)
+        for (int64_t n = 0; n < all; n++) fill_table(s, s->psfs + n * area, tables + n * table_size(s));
+#pragma omp parallel for schedule(static, 1) num_threads(s->threads)
+        for (int64_t thread = 0; thread < s->threads; thread++) {
+            workspace d;
+            tally *t = tallies + thread;
+            const int ready = allocate_workspace(s, &d) & allocate_tally(s, t);
+            if (!ready) {
+#pragma omp atomic write
+                failed = 1;
+            }
+            for (int64_t n = bands * thread / s->threads; ready && n < bands * (thread + 1) / s->threads; n++)
+                go_back(s, &d, t, tables, n);
+            for (int64_t n = 0; ready && n < all; n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
+            free_workspace(&d);
+        }
+    }
+    for (int64_t n = 0; !failed && n < all * (area + 1); n++) {
+        double sum = 0;
+        for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].psfs[n];  // `veil` follows `psfs`
+        if (n < all * area) s->psf_gradient[n] = sum;
+        else if (s->veil_gradient) s->veil_gradient[n - all * area] = sum;
+    }
+    for (int64_t thread = 0; tallies && thread < s->threads; thread++) free_tally(tallies + thread);
+    free(tables), free(tallies);
     return failed;
 }

@@ -1,7 +1,7 @@
 """Operator of occlusion by direct convolution: in C.
 
 Sums are of positive terms only, so float32 keeps their relative accuracy however small the divisor that they become.
-The operator has no gradient of its own: the renderer makes gradients by tiles.
+A second operator makes the gradients of PSFs and stray light. Those of light and layers the renderer makes by tiles.
 
 The operator is defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
 """
@@ -26,11 +26,12 @@ SMALLEST_SIDE = BLOCK_ROWS - 1  # px, of PSFs; smaller ones are padded to it
 # PSF that meets a row of light, and for an end of a run of whole weights.
 _BLOCK, _COLUMN, _END = 170, 1, 3
 
-torch.library.define(
-    "kornia_tidy::occlusion_direct",
-    "(Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, Tensor? mean, Tensor? stray_light,"
-    " Tensor? inside) -> Tensor",
+_SCENE = (
+    "Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, Tensor? mean, Tensor? stray_light,"
+    " Tensor? inside"
 )
+torch.library.define("kornia_tidy::occlusion_direct", f"({_SCENE}) -> Tensor")
+torch.library.define("kornia_tidy::occlusion_direct_gradients", f"({_SCENE}, Tensor gradient) -> Tensor[]")
 
 
 def occlusion_direct(
@@ -65,6 +66,44 @@ def occlusion_direct(
         NotBuiltError: if the source cannot be compiled.
     """
     return torch.ops.kornia_tidy.occlusion_direct(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
+
+
+def occlusion_direct_gradients(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None,
+    stray_light: Tensor | None,
+    inside: Tensor | None,
+    gradient: Tensor,
+) -> list[Tensor]:
+    """Return gradients of :func:`occlusion_direct`: operator ``kornia_tidy::occlusion_direct_gradients``.
+
+    Each block is rendered again, and its convolutions and compositing are transposed.
+
+    Args:
+        plane: as there, as the arguments up to ``inside``, but on a processor.
+        psfs: as there.
+        layer_index: as there.
+        layer_weight: as there.
+        mean: as there.
+        stray_light: as there.
+        inside: as there.
+        gradient: (B, C, H, W) of the light, of the plane's dtype.
+
+    Returns:
+        The gradient of the PSFs and, where there is stray light, that of ``stray_light``. They have none.
+
+    Raises:
+        TypeError: as there.
+        ValueError: as there, or if the gradient does not fit.
+        MemoryError: as there.
+        NotBuiltError: as there.
+    """
+    return torch.ops.kornia_tidy.occlusion_direct_gradients(
+        plane, psfs, layer_index, layer_weight, mean, stray_light, inside, gradient
+    )
 
 
 def count_operations(
@@ -113,6 +152,7 @@ class _Scene(ctypes.Structure):
         *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
         *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "map_image", "map_row")),
         *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "mean", "stray_light", "out")),
+        *((name, ctypes.c_void_p) for name in ("gradient", "psf_gradient", "stray_light_gradient")),
     )
 
 
@@ -222,6 +262,51 @@ def _occlude(
     return light
 
 
+def _new_gradients(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None,
+    stray_light: Tensor | None,
+    inside: Tensor | None,
+    gradient: Tensor,
+) -> list[Tensor]:
+    light = _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
+    if gradient.shape != light.shape or gradient.dtype != light.dtype:
+        raise ValueError(
+            f"gradient must be {light.dtype} of shape {tuple(light.shape)}, got {gradient.dtype} of shape "
+            f"{tuple(gradient.shape)}"
+        )
+    return [x.new_empty(x.shape) for x in (psfs, stray_light) if x is not None]
+
+
+def _gradients(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None,
+    stray_light: Tensor | None,
+    inside: Tensor | None,
+    gradient: Tensor,
+) -> list[Tensor]:
+    found = _new_gradients(plane, psfs, layer_index, layer_weight, mean, stray_light, inside, gradient)
+    scene, kept = _scene(plane, psfs, layer_index, layer_weight, inside)
+    columns = psfs.new_empty(*psfs.shape[:2], scene.side, scene.side)
+    kept += [gradient.contiguous(), columns]
+    scene.gradient, scene.psf_gradient = (x.data_ptr() for x in kept[-2:])
+    if mean is not None and stray_light is not None:  # both or none
+        kept += [mean.contiguous(), stray_light.contiguous()]
+        scene.mean, scene.stray_light = (x.data_ptr() for x in kept[-2:])
+        scene.stray_light_gradient = found[1].data_ptr()
+    if load(SOURCE, plane.dtype).occlusion_gradients(ctypes.byref(scene)):
+        raise MemoryError(f"no memory for gradients of PSFs of {scene.side}x{scene.side} pixels")
+    extra, side = (scene.side - psfs.shape[-1]) // 2, psfs.shape[-1]
+    found[0].copy_(columns.mT.flip((-2, -1))[..., extra : extra + side, extra : extra + side])
+    return found
+
+
 def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
     raise NotImplementedError(
         "kornia_tidy::occlusion_direct has no gradient: call kornia_tidy.render.occlusion, which makes it by tiles"
@@ -230,4 +315,6 @@ def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
 
 torch.library.impl("kornia_tidy::occlusion_direct", "CPU", _occlude)
 torch.library.register_fake("kornia_tidy::occlusion_direct", _new_light)
+torch.library.impl("kornia_tidy::occlusion_direct_gradients", "CPU", _gradients)
+torch.library.register_fake("kornia_tidy::occlusion_direct_gradients", _new_gradients)
 torch.library.register_autograd("kornia_tidy::occlusion_direct", _refuse)

@@ -20,8 +20,16 @@ from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.window_sides import is_window_size, size_step
 from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW
 from kornia_tidy.render.backends.dense import DenseBackend
+from kornia_tidy.render.backends.dense_occlusion import (
+    EPSILON,
+    OcclusionPlanes,
+    cumulative_weight,
+    occlude_dense,
+    occlusion_planes,
+)
 from kornia_tidy.render.borders import BORDERS, pad_border
-from kornia_tidy.render.scene import scene_of_layers
+from kornia_tidy.render.layers import weight_of_layer
+from kornia_tidy.render.scene import LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies import gradient_round_off, round_off, written_out
 from tests.rounding import gamma
@@ -58,9 +66,10 @@ class Call:
 
     @cached_property
     def got(self) -> Tensor:
-        """What the operator returns: of complex gradients the first one, as real numbers."""
+        """What the operator returns, of gradients the first one, complex ones as real numbers."""
         made = self.operator(*self.arguments)
-        return torch.view_as_real(made[0]) if isinstance(made, list) else made
+        first = made[0] if isinstance(made, list) else made
+        return torch.view_as_real(first) if first.is_complex() else first
 
     def error(self) -> float:
         """Return the largest difference as a multiple of the allowed one."""
@@ -170,6 +179,65 @@ def occlude(draw: random.Random) -> Call:
     through is a difference and keeps its absolute error, which grows with each layer, and so does the sum of layers. In
     float64 whole weights come from differences of sums up to 1, which a layer seen by a single pixel is divided by.
     """
+    arguments, scene, about, products = _occluding(draw)
+    psfs = arguments[1]
+    assert occlusion_ops.count_operations(*arguments[2:4], psfs, len(arguments[0])) >= 0, about
+
+    def truth() -> tuple[Tensor, float]:
+        return DenseBackend().render(scene), 6 * _occlusion_error(psfs, psfs.shape[-1] ** 2 + 16)
+
+    return Call(about, "occlusion_direct", arguments, products, truth)
+
+
+def occlude_gradient(draw: random.Random) -> Call:
+    """``occlusion_gradients`` of occlusion.c, that of the PSFs.
+
+    What the blurred planes pass on is as exact as the light, to a share of its bound. With light up to 1 and a gradient
+    g that is g T / E for light, twice as much for alpha, and as much times alpha / E for E. Products of these with
+    light and weights are summed in the light's type along a band of blocks.
+    """
+    arguments, scene, about, products = _occluding(draw)
+    psfs = arguments[1]
+    gradient = torch.randn(*scene.image.shape[:2], *scene.output_size, dtype=psfs.dtype)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        exact = psfs.detach().double().clone().requires_grad_()
+        planes = occlusion_planes(scene)._replace(psfs=exact)
+        (expected,) = torch.autograd.grad((occlude_dense(*planes) * gradient).sum(), exact)
+        roundings = psfs.shape[-1] ** 2 + 16 + 8 * gradient.shape[-1]
+        return expected, 12 * _occlusion_error(psfs, roundings) * _occlusion_magnitude(planes, gradient.abs())
+
+    return Call(about, "occlusion_direct_gradients", (*arguments, gradient), 3 * products, truth)
+
+
+def _occlusion_error(psfs: Tensor, roundings: int) -> float:
+    layers, apart = len(psfs), 1 if psfs.dtype == torch.float32 else 1 + 3 * psfs.shape[-1] ** 2
+    return layers * (layers + 1) * apart * gamma(roundings, psfs.dtype)
+
+
+def _occlusion_magnitude(planes: OcclusionPlanes, gradient: Tensor) -> Tensor:
+    """Sums of the magnitudes of all terms of the PSFs' gradient."""
+    light, psfs, weight, _, _, index, inside = planes
+    weight, lit = None if weight is None else weight.double(), 1 if inside is None else inside[:, None]
+
+    def blur(plane: Tensor, psf: Tensor) -> Tensor:
+        plane = (plane * lit).double().expand(-1, len(psf), -1, -1)
+        return conv2d(plane, psf.flip((-2, -1))[:, None], groups=len(psf))
+
+    total, passed = torch.zeros(()), torch.ones(())
+    for layer in reversed(range(len(psfs))):
+        weights = (weight_of_layer(index, weight, layer), cumulative_weight(index, weight, layer))
+        own, cumulative = (x[:, None].double() for x in weights)
+        alpha, seen = blur(own, psfs[layer]), blur(cumulative, psfs[layer])
+        divisor = seen.detach() + EPSILON
+        share = alpha.detach() / divisor
+        terms = blur(own * light, psfs[layer]) + 2 * alpha + 2 * share * seen
+        total, passed = total + (gradient * passed / divisor * terms).sum(), passed * (1 - share)
+    return torch.autograd.grad(total, psfs)[0]
+
+
+def _occluding(draw: random.Random) -> tuple[tuple[Any, ...], LayeredScene, str, int]:
+    """Arguments of ``occlusion_direct`` and the scene they are of, the shapes in words, and the number of products."""
     dtype, border = draw.choice(DTYPES), draw.choice(BORDERS)
     products = LARGEST + 1
     while products > LARGEST:
@@ -191,18 +259,10 @@ def occlude(draw: random.Random) -> Call:
     share = None if fraction is None else pad_border(fraction[:, None], radius, border)[:, 0]
     inside = pad_border(torch.ones(1, 1, height, width, dtype=dtype), radius, border)[0] if border == "zero" else None
     mean = None if veil is None else image.mean((-2, -1))
-    assert occlusion_ops.count_operations(below, share, psfs, images) >= 0, about
     seen = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
-
-    def truth() -> tuple[Tensor, float]:
-        shared = None if fraction is None else fraction[:, None]
-        scene = scene_of_layers(image, lower[:, None], shared, psfs, veil, border, "occlusion", dtype)
-        expected = DenseBackend().render(scene)
-        apart = 1 if dtype == torch.float32 else 1 + 3 * side**2
-        return expected, 6 * layers * (layers + 1) * apart * gamma(side**2 + 16, dtype)
-
-    arguments = plane, psfs, below, share, mean, seen, inside
-    return Call(about, "occlusion_direct", arguments, products, truth)
+    shared = None if fraction is None else fraction[:, None]
+    scene = scene_of_layers(image, lower[:, None], shared, psfs, veil, border, "occlusion", dtype)
+    return (plane, psfs, below, share, mean, seen, inside), scene, about, products
 
 
 def energies(draw: random.Random) -> Call:
@@ -231,6 +291,53 @@ def field_gradient(draw: random.Random) -> Call:
     return Call(about, "mutual_energies_gradients", arguments, 2 * products, truth)
 
 
+def srgb(draw: random.Random) -> Call:
+    """``convert`` of srgb.c: to 2e-7 in float32, and to 16 roundings of the value: the power raises some."""
+    image, encode, about = _colours(draw)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        expected = srgb_by_definition(image.double(), encode)
+        least = 2e-7 if image.dtype == torch.float32 else gamma(16, image.dtype)
+        return expected, (gamma(16, image.dtype) * expected.abs()).clamp(min=least)
+
+    return Call(about, "srgb", (image, encode), image.numel(), truth)
+
+
+def srgb_gradient(draw: random.Random) -> Call:
+    """``convert`` of srgb.c with a gradient: to 16 roundings of it."""
+    image, encode, about = _colours(draw)
+    gradient = torch.randn_like(image)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        exact = image.detach().double().requires_grad_()
+        (expected,) = torch.autograd.grad(srgb_by_definition(exact, encode), exact, gradient.double())
+        return expected, gamma(16, image.dtype) * expected.abs() + torch.finfo(image.dtype).tiny
+
+    return Call(about, "srgb_gradient", (image, gradient, encode), image.numel(), truth)
+
+
+def srgb_by_definition(image: Tensor, encode: bool) -> Tensor:
+    """The formulas of IEC 61966-2-1."""
+    if encode:
+        return torch.where(image > 0.0031308, 1.055 * image.clamp(min=0.003) ** (1 / 2.4) - 0.055, 12.92 * image)
+    return torch.where(image > 0.04045, ((image.clamp(min=0.04) + 0.055) / 1.055) ** 2.4, image / 12.92)
+
+
+def _colours(draw: random.Random) -> tuple[Tensor, bool, str]:
+    """An image in any order of memory, mostly of [0, 1], whether it is to be encoded, and all this in words."""
+    dtype, encode = draw.choice(DTYPES), draw.random() < 0.5
+    shape = *(draw.randint(2, 9) for _ in range(draw.randint(0, 2))), draw.choice((1, 2, 15, 16, 17, 40, 999))
+    image = 2 * torch.rand(shape, dtype=dtype) ** 3 * draw.choice((1, 1, 1, 40)) - draw.choice((0, 0.1))
+    memory = draw.choice(("dense", "turned", "cut out", "shared"))
+    if memory == "turned":
+        image = image.T.contiguous().T if image.ndim == 2 else image.movedim(0, -1).contiguous().movedim(-1, 0)
+    elif memory == "cut out":
+        image = torch.nn.functional.pad(image, (1, 2))[..., 1:-2]
+    elif memory == "shared":
+        image = image[..., :1].expand(shape)
+    return image, encode, f"{dtype} {shape} {memory} encode {encode}"
+
+
 def _in_double(case: tuple[Tensor, Tensor, Tensor]) -> list[Tensor]:
     return [x.to(torch.complex128) if x.is_complex() else x.double() for x in case]
 
@@ -256,9 +363,12 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "overlap.c: correlate": overlap_correlate,
     "direct.c: gather": gather,
     "direct.c: correlate": correlate,
-    "occlusion.c": occlude,
+    "occlusion.c: light": occlude,
+    "occlusion.c: gradient": occlude_gradient,
     "mutual_intensity.c: energies": energies,
     "mutual_intensity.c: gradient": field_gradient,
+    "srgb.c: values": srgb,
+    "srgb.c: gradient": srgb_gradient,
 }
 
 

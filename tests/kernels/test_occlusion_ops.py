@@ -1,13 +1,14 @@
-"""Occlusion by direct convolution as an operator: values, refused arguments."""
+"""Occlusion by direct convolution as operators: values, gradients, refused arguments."""
 
 from __future__ import annotations
 
+import random
 from typing import Any
 
 import pytest
 import torch
 
-from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct
+from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct, occlusion_direct_gradients
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
 
@@ -85,3 +86,45 @@ class TestOcclusionDirect(OperatorTester):
     def test_exception(self, changes, error, words):
         with pytest.raises(error, match=words):
             occlusion_direct(**scene(**changes))
+
+
+class TestOcclusionDirectGradients(OperatorTester):
+    draw = staticmethod(kernel_shapes.occlude_gradient)
+    source = SOURCE
+
+    def test_cardinality_tensors_without_memory(self):
+        """Of a list, and so not as for the other operators."""
+        arguments = kernel_shapes.occlude_gradient(random.Random(1)).arguments
+        found = occlusion_direct_gradients(*(None if x is None else x.to("meta") for x in arguments))
+        given = [x for x in (arguments[1], arguments[5]) if x is not None]
+        assert [(x.shape, x.dtype, x.is_meta) for x in found] == [(x.shape, x.dtype, True) for x in given]
+
+    def test_dynamo_is_one_node_of_a_whole_graph(self):
+        call = kernel_shapes.occlude_gradient(random.Random(1))
+        compiled = torch.compile(call.operator, fullgraph=True, backend="aot_eager")
+        assert torch.equal(compiled(*call.arguments)[0], call.got)
+
+    def smallest(self):
+        return self.of(torch.zeros(2, 2, 9, 32))
+
+    @staticmethod
+    def of(gradient):
+        return occlusion_direct_gradients(**scene(), mean=None, stray_light=None, inside=None, gradient=gradient)
+
+    @needs_compiler
+    @pytest.mark.parametrize("threads", [1, 3, 50])
+    def test_feature_the_same_every_time_with_as_many_threads(self, threads):
+        before, arguments = torch.get_num_threads(), kernel_shapes.occlude_gradient(random.Random(3)).arguments
+        try:
+            torch.set_num_threads(threads)
+            first, second = (occlusion_direct_gradients(*arguments)[0] for _ in range(2))
+        finally:
+            torch.set_num_threads(before)
+        assert torch.equal(first, second)
+        assert (first - occlusion_direct_gradients(*arguments)[0]).norm() <= 1e-5 * first.norm()
+
+    def test_exception(self):
+        with pytest.raises(
+            ValueError, match=r"gradient must be .*32 of shape \(2, 2, 9, 32\), got .*32 of shape \(3,\)"
+        ):
+            self.of(torch.zeros(3))

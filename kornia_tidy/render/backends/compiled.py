@@ -3,7 +3,8 @@
 Small PSFs are convolved sample by sample (``direct.c``), larger ones by transforms of overlapping windows
 (``overlap.c``), each block or window with the PSFs of its own layers and with no other. Occlusion is convolved directly
 (``occlusion.c``): all that is added up is positive, so float32 is enough, as the relative error of every sum is small,
-however small the normaliser that it becomes. Its gradients are made by tiles. See :mod:`kornia_tidy.kernels.build`.
+however small the normaliser that it becomes. Gradients of its PSFs and stray light are made in the same way, those of
+image and depth by tiles. See :mod:`kornia_tidy.kernels.build`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from torch.nn.functional import pad
 from kornia_tidy.kernels import gather_ops, occlusion_ops, overlap_ops
 from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.gather_ops import gather_direct, gather_direct_psf_gradient
-from kornia_tidy.kernels.occlusion_ops import occlusion_direct
+from kornia_tidy.kernels.occlusion_ops import occlusion_direct, occlusion_direct_gradients
 from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient, scatter_overlap, window_size
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
@@ -76,12 +77,11 @@ class CompiledBackend:
         return spread[..., side - 1 : light.shape[-2], side - 1 : light.shape[-1]]
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-        """Return the gradients of the padded planes, of the PSFs and of the layer weight; of occlusion by tiles."""
+        """Return the gradients of the padded planes, of the PSFs and of the layer weight."""
         keep_memory()
         labels, layers, side = scene.labels, len(scene.psfs), scene.psfs.shape[-1]
         if scene.compositing == "occlusion":
-            grid = tile_grid(tuple(labels.layer_index.shape), side, WINDOWS)
-            return occlusion_gradients(occlusion_planes(scene), labels, grid, WINDOWS, gradient)
+            return _occlusion_gradients(scene, gradient)
         tensors, size = (scene.plane, scene.psfs, scene.batch_weight), window_size(side)
         plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
         of_plane = of_psfs = of_weight = None
@@ -124,6 +124,19 @@ class CompiledBackend:
         operations = words * (operations + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
         planes = layers + _WINDOW_PLANES * torch.get_num_threads()
         return Work(operations, planes * itemsize * size**2 + 3 * image + kept, size)
+
+
+def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
+    """Return the gradients of PSFs and stray light directly; with those of image or depth all of them by tiles."""
+    planes = occlusion_planes(scene)
+    light, psfs, weight, mean, stray_light, index, inside = planes
+    if any(wants_gradient(x) for x in (light, weight, mean)):
+        grid = tile_grid(tuple(scene.labels.layer_index.shape), psfs.shape[-1], WINDOWS)
+        return occlusion_gradients(planes, scene.labels, grid, WINDOWS, gradient)
+    with torch.no_grad():
+        found = occlusion_direct_gradients(light, psfs, index, weight, mean, stray_light, inside, gradient)
+    pairs = gradient_pairs((psfs, stray_light), (*found, None)[:2])
+    return [(tensor, own) for tensor, own in pairs if tensor.requires_grad]
 
 
 def _goes_directly(scene: LayeredScene) -> bool:

@@ -17,7 +17,7 @@ from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct
 from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.kernels.window_sides import is_window_size
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import COMPOSITING, render
+from kornia_tidy.render.compositing import COMPOSITING, occlusion, render
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
@@ -70,6 +70,23 @@ class TestCompiledRender(RenderTester):
             atol = ATOL[dtype] * (10 if compositing == "occlusion" else 1)
             for border in ("reflect", "zero"):
                 self.assert_equals_dense("compiled", image, psi, bank, compositing, atol, layers=layers, border=border)
+
+    @needs_compiler
+    @pytest.mark.parametrize("layers", ["nearest", "linear"])
+    @pytest.mark.parametrize("border", ["reflect", "zero", "valid"])
+    def test_feature_gradients_of_psfs_alone_through_occlusion(self, layers, border, device, dtype):
+        """And of stray light. They go another way than with those of image and depth, and make no tiles."""
+        bank = make_bank(5, 2, 7, dtype=dtype, device=device, light=0.8, veil=True)
+        image, _ = make_scene(bank, 2, 31, 46)
+        defocus = label_map("squares", bank, 31, 46) + 0.5
+        gradients = []
+        for method in ("dense", "compiled"):
+            leaves = bank.psfs.clone().requires_grad_(), bank.veil.clone().requires_grad_()
+            coded = occlusion(image, defocus, bank.defocus, *leaves, layers=layers, border=border, method=method)
+            gradients.append(torch.autograd.grad(coded.square().mean(), leaves))
+        for expected, found in zip(*gradients, strict=True):
+            atol = (2e-5 if dtype == torch.float32 else 1e-10) * float(expected.abs().max())
+            self.assert_close(found, expected, rtol=0, atol=atol)
 
     def test_feature_a_large_psf(self):
         """Of 257 px, beyond the image, where a border of zeros allows it."""
