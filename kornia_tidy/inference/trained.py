@@ -21,7 +21,7 @@ from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.psf.camera_settings import EXTRA_STATE, check_settings, settings_of
+from kornia_tidy.psf.camera_settings import EXTRA_STATE, check_settings, read_settings, settings_of
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
@@ -356,11 +356,14 @@ def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
     state = camera_state(checkpoint)
     own = below(state, "masks.")
     if EXTRA_STATE in state:
-        saved, here = masks_of_state(state), optics.masks
-        if isinstance(here, PixelwiseMask) and here.constraint == "none":
-            own = {"phase": saved.phase.detach()}
-        else:
-            check_settings({"masks": settings_of(saved)}, {"masks": settings_of(here)})
+        try:
+            check_settings(
+                {"masks": read_settings(state[EXTRA_STATE]).get("masks")}, {"masks": settings_of(optics.masks)}
+            )
+        except ValueError:
+            if not isinstance(optics.masks, PixelwiseMask) or optics.masks.constraint != "none":
+                raise
+            own = {"phase": masks_of_state(state).phase.detach()}
     check_weights(optics.masks, own, f"{checkpoint}, masks")
     optics.masks.load_state_dict(own)
 

@@ -14,6 +14,7 @@ Operators are defined by schema, as ``torch.library.custom_op`` would import the
 from __future__ import annotations
 
 import ctypes
+from functools import cache
 from itertools import count
 from typing import Any
 

@@ -104,7 +104,11 @@ def pieces_of(
             return
         _check_wide_bytes(blur, channels, dtype, compositing, budget)
     most, remembered = None, True
-    if blur is None and budget is not None and not _surely_fits(model, channels, dtype, budget):
+    if (
+        blur is None
+        and budget is not None
+        and channels * dtype.itemsize * model.most_samples > budget // 2 // _MOST_COPIES
+    ):
         most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
     make = partial(model.scene_bank, channels, dtype, device=device or reach.device)
     if not remembered:
@@ -164,13 +168,6 @@ def runs_of(present: list[bool], most: int) -> list[tuple[int, int]]:
     edges = [i for i, (before, own) in enumerate(pairwise([False, *present, False])) if before != own]
     runs = zip(edges[::2], edges[1::2], strict=True)
     return [(start, min(start + most, stop)) for first, stop in runs for start in range(first, stop, most)]
-
-
-def _surely_fits(model: PSFModel, channels: int, dtype: torch.dtype, budget: int) -> bool:
-    """Return whether PSFs of all the camera's range fit half of a budget, whatever their window."""
-    lo, hi = model.camera.defocus_range
-    samples = ((hi - lo) / model.fidelity.layer_spacing + 1) * model.largest_window**2
-    return _MOST_COPIES * samples * channels * dtype.itemsize <= budget // 2
 
 
 def _most_layers(

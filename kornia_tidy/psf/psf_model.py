@@ -533,10 +533,11 @@ class PSFModel:
         return self.fitted.side
 
     @property
-    def largest_window(self) -> int:
-        """Largest side that the PSFs may have, without measuring their window."""
-        known = self._derived.window
-        return max(self.fidelity.window or self.fidelity.max_window, 0 if known is None else known.side)
+    def most_samples(self) -> float:
+        """Samples of the PSFs of all the camera's range, at one wavelength, without measuring their window: at most."""
+        (lo, hi), known = self.camera.defocus_range, self._derived.window
+        side = max(self.fidelity.window or self.fidelity.max_window, 0 if known is None else known.side)
+        return ((hi - lo) / self.fidelity.layer_spacing + 1) * side**2
 
     @property
     def fitted(self) -> FittedWindow:

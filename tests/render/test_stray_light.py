@@ -29,6 +29,8 @@ def bank(mask: str, window: int, stray_light: str) -> PSFBank:
     generator = torch.Generator().manual_seed(4)
     if mask in SYSTEMS:
         optics = TiDyOptics.from_preset(mask, generator=generator, fidelity=fidelity, compositing="gather")
+        if optics.aperture is not None:  # of amplitudes: light that crosses a hard edge is in no window whole
+            optics.aperture = 1.0 * optics.aperture
     else:
         masks = PixelwiseMask(1, initial="flat") if mask == "flat" else PixelwiseMask(1, generator=generator)
         optics = TiDyOptics(masks, fidelity=fidelity)
