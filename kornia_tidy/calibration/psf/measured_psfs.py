@@ -223,7 +223,7 @@ def measure_psfs(
         >>> x, camera = torch.arange(64.0), ThinLensCamera()
         >>> spot = lambda at: 0.8 * torch.exp(-((x[:, None] - 32) ** 2 + (x - at) ** 2) / 8)[None, None]
         >>> sensor = SensorNoise.physical(10500, 2.4)
-        >>> points = [point_images(spot(at), torch.ones(1), sensor, 15)[0] for at in (31.7, 31.9, 32.1, 32.3)]
+        >>> points = [point_images(spot(at), torch.ones(1), sensor, 15)[0] for at in (29.7, 31.9, 32.1, 34.3)]
         >>> measured = measure_psfs({0.595: points}, camera, 15, diffraction_cutoff(camera, 530e-9))
         >>> measured.bank.psfs.shape, round(float(measured.bank.psfs.sum()), 4)
         (torch.Size([1, 1, 15, 15]), 1.0)

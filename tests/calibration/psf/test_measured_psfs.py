@@ -185,7 +185,7 @@ class TestMeasurePSFs(BaseTester):
         """A disc of the cutoff's radius has at most 4 aliased frequencies for the sensor's pixels, 13 for a plane's."""
         planes_ = 3 if tile is None else 4
         light = torch.ones(planes_, 31, 31, dtype=torch.float64)
-        images = [PointImage((40.0, 40.0), light, light, tile)] * enough
+        images = [PointImage((40.0 + 4 * n, 40.0), light, light, tile) for n in range(enough)]
         monkeypatch.setattr("kornia_tidy.calibration.psf.measured_psfs.register", lambda *_: pytest.fail("at work"))
         words = rf"^{enough - 1} places of the point at 0.7 m .* resolve channel {channel}, .* {enough} are needed"
         with pytest.raises(UserWarning, match=words):
