@@ -39,6 +39,7 @@ for _schema in (
     torch.library.define(f"kornia_tidy::{_schema.partition('(')[0]}", "(" + _schema.partition("(")[2])
 
 
+@cache
 def window_size(psf_side: int) -> int:
     """Return the side of the windows for PSFs of P pixels: the next that both data types can have from 2.5 P on.
 

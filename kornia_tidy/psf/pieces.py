@@ -104,11 +104,8 @@ def pieces_of(
             return
         _check_wide_bytes(blur, channels, dtype, compositing, budget)
     most, remembered = None, True
-    if (
-        blur is None
-        and budget is not None
-        and channels * dtype.itemsize * model.most_samples > budget // 2 // _MOST_COPIES
-    ):
+    bytes_at_most = _MOST_COPIES * channels * dtype.itemsize * model.most_samples
+    if blur is None and budget is not None and bytes_at_most > budget // 2:
         most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
     make = partial(model.scene_bank, channels, dtype, device=device or reach.device)
     if not remembered:
