@@ -24,7 +24,7 @@ from kornia_tidy.render.backends.tile_plan import WINDOWS, Grid, tile_grid
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
-# With this limit and windows of 2.5 P (see `window_size`) gather and scatter took 1.04 times the time of the best choice
+# With this limit and windows of 2.5 P (`window_size`) gather and scatter took 1.04 times the time of the best choice
 # in the geometric mean of 39 scenes, 1.30 times at most: an AMD EPYC, one thread, tests/benchmarks/dispatch_regret.py.
 LARGEST_DIRECT = 5  # px
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
