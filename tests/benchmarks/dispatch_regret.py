@@ -17,6 +17,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from statistics import geometric_mean
 from typing import NamedTuple
@@ -115,7 +116,7 @@ def measure(case: Case) -> Result:
                 for name, (method, settings) in ways.items():
                     hopeless = name != "auto" and times[name] > HOPELESS * fastest
                     if not hopeless and not LONGEST < times[name] < math.inf:
-                        with mock.patch.multiple(compiled, **settings):
+                        with mock.patch.multiple(compiled, **settings) if settings else nullcontext():
                             times[name] = min(times[name], time_once(scene, method))
             result = Result(case, chosen, times)
             if result.regret <= GOOD or number == AGAIN:

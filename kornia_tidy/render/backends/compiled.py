@@ -25,8 +25,8 @@ from kornia_tidy.render.backends.tile_plan import WINDOWS, Grid, tile_grid
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
-# Measured on a Zen 5 core, 144 scenes of 256 and 512 px with PSFs of 5 to 129 px: with windows of 2.5 P (see
-# `window_size`) this limit takes 1.10 times the time of the best choice for each scene, 1.54 times at most.
+# With this limit and windows of 2.5 P (`window_size`) gather and scatter took 1.04 times the time of the best choice
+# in the geometric mean of 39 scenes, 1.30 times at most: an AMD EPYC, one thread, tests/benchmarks/dispatch_regret.py.
 LARGEST_DIRECT = 5  # px
 NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 # Operations for each sample of a window, as many as take as long: to cut it out and to write its tile, and for each
