@@ -30,7 +30,6 @@ from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import REFINED_FROM, LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
-from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.tensor_files import read_tensors
 
 MOST_PSFS = 1 << 27  # bytes; a small file could name a window that takes gigabytes
@@ -149,7 +148,7 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
         elif isinstance(module, ClosedForm | LayeredJointHead):
             bank = _psf_bank(optics, 3, _nodes(optics, module.layers or NODES))
             module.set_psfs(bank, correlate=optics.fidelity.correlate)
-            if isinstance(module, ClosedForm) and isinstance(optics.sensor, SensorNoise):
+            if isinstance(module, ClosedForm) and optics.sensor is not None:
                 module.set_noise(optics.sensor)
 
 

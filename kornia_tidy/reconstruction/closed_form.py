@@ -17,7 +17,6 @@ from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
-from kornia_tidy.sensor.noise import SensorNoise
 
 WEIGHTS = tuple(3e-3 * 10 ** (i / 2) for i in range(4))  # 0.003 to 0.095
 # The best weight is 0.003 (noise / 0.002) ** 1.3. If a bilateral filter follows, which takes noise away, it is
@@ -226,10 +225,20 @@ class ClosedForm(nn.Module):
             middle = slice(beyond, wide.shape[-1] - beyond)
             self.whitening, self.log_determinants = likelihood_filters(wide.mean(1)[..., middle, middle])
 
-    def set_noise(self, sensor: SensorNoise) -> None:
-        """Take the noise of a sensor, by which captures are restored if no noise is given with them."""
+    def set_noise(self, sensor: nn.Module) -> None:
+        """Take the noise of a sensor, by which captures are restored if no noise is given with them.
+
+        Raises:
+            TypeError: if the sensor has no ``std``, and so cannot say what noise it makes.
+        """
+        deviation = getattr(sensor, "std", None)
+        if not callable(deviation):
+            raise TypeError(
+                f"a closed form restores captures by their noise, and {type(sensor).__name__} has no std(light) that "
+                f"tells it: add one (see kornia_tidy.sensor.Sensor), or give the noise with each capture"
+            )
         light = torch.tensor([0.0, 1.0], dtype=torch.float64)
-        dark, full = sensor.std(light).square().tolist()
+        dark, full = deviation(light).square().tolist()
         self.noise_model = self.noise_model.new_tensor([dark, full - dark])
 
     def noise_map(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.inference import update_psfs
+from kornia_tidy.reconstruction import ClosedFormHead
 from kornia_tidy.sensor import draw_pattern
 from tests.base import BaseTester
 
@@ -125,6 +127,10 @@ class TestSensor(BaseTester):
         image, depth = scene()
         coded = camera(RowCounter(), memory_budget=1)(image, depth)
         self.assert_close(coded[0, 0, :, 0], torch.arange(150.0) / 1000)
+
+    def test_exception_a_sensor_that_does_not_tell_its_noise(self):
+        with pytest.raises(TypeError, match=r"RowCounter has no std\(light\) that tells it"):
+            update_psfs(ClosedFormHead(nn.Identity(), 1), camera(RowCounter()))
 
     def test_exception_a_module_that_takes_no_place(self):
         with pytest.raises(TypeError, match=r"sensor must take origin=\(row, column\).* got Dropout.forward\(input\)"):
