@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.inference import update_psfs
+from kornia_tidy.inference.trained import update_psfs
 from kornia_tidy.reconstruction import ClosedFormHead
 from kornia_tidy.sensor import draw_pattern
 from tests.base import BaseTester
