@@ -29,6 +29,13 @@ ALL = {
 }
 
 
+class Plain(torch.nn.Module):
+    """A sensor that records light as it is."""
+
+    def forward(self, irradiance, params=None, generator=None, origin=(0, 0)):
+        return irradiance
+
+
 class TestRandomTiDyOptics(BaseTester):
     @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
     def test_smoke(self, device, kind):
@@ -198,7 +205,7 @@ class TestRandomTiDyOptics(BaseTester):
         with pytest.raises(TypeError, match="need a ThinLensCamera, whose depth is in metres"):
             RandomTiDyOptics(camera(camera=DefocusRange()), focus_distance=(0.5, 1.0))
         with pytest.raises(TypeError, match="noise_level needs a SensorNoise"):
-            RandomTiDyOptics(camera(sensor=torch.nn.Identity()), noise_level=(0.0, 0.1))
+            RandomTiDyOptics(camera(sensor=Plain()), noise_level=(0.0, 0.1))
         with pytest.raises(TypeError, match="switching_time needs a modulator of DwellTimes or Switching"):
             RandomTiDyOptics(camera(modulator=SpatialLightModulator()), switching_time=(0.0, 1e-3))
         with pytest.raises(TypeError, match="optics must be a camera"):

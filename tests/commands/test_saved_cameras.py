@@ -174,7 +174,7 @@ class OwnFamily(PixelwiseMask):
     """Of no package."""
 
 
-class OwnSensor(nn.Identity):
+class OwnSensor(SensorNoise):
     """Of no package."""
 
 

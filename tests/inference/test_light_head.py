@@ -86,8 +86,9 @@ class TestLightHead(BaseTester):
             update_psfs(head, optics)
         system = TrainedSystem(optics, head, settings, 0)
         capture = optics.encode(light)
+        # The two encode light in other ways, 2e-7 apart, which the inverse amplifies by up to 1 / .003 at this noise.
         for noise, expected in ((None, 0.002), (0.03, 0.03)):
-            self.assert_close(LightHead(system, noise)(light)[0], head(capture, expected))
+            self.assert_close(LightHead(system, noise)(light)[0], head(capture, expected), rtol=0, atol=1e-4)
         assert (head(capture, 0.03) - head(capture, 0.002)).abs().max() > 0.01
 
     def test_exception_noise(self):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.inference.trained import update_psfs
-from kornia_tidy.reconstruction import ClosedFormHead
+from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.sensor import draw_pattern
 from tests.base import BaseTester
 
@@ -130,7 +130,7 @@ class TestSensor(BaseTester):
 
     def test_exception_a_sensor_that_does_not_tell_its_noise(self):
         with pytest.raises(TypeError, match=r"RowCounter has no std\(light\) that tells it"):
-            update_psfs(ClosedFormHead(nn.Identity(), 1), camera(RowCounter()))
+            update_psfs(ClosedForm(), camera(RowCounter()))
 
     def test_exception_a_module_that_takes_no_place(self):
         with pytest.raises(TypeError, match=r"sensor must take origin=\(row, column\).* got Dropout.forward\(input\)"):
