@@ -95,7 +95,7 @@ def pieces_of(
     Example:
         >>> [piece] = pieces_of(PSFModel(fidelity="draft"), 3, torch.float32, torch.tensor([-4.0, 5.0]))
         >>> piece.bank().psfs.shape[:2], piece.span
-        (torch.Size([7, 3]), None)
+        (torch.Size([6, 3]), None)
     """
     scene = reach if scene is None else scene
     if (blur := None if is_value_unknown() else model.wide_blur) is not None:

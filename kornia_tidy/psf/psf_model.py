@@ -563,7 +563,8 @@ class PSFModel:
     def _disc_window(self) -> int | None:
         """Return the side that holds the lens's widest defocus disc; None where ``max_window`` holds it.
 
-        Also where that is below :data:`LEAST_WINDOW`, or the disc is wider than :data:`WIDEST_DISC`.
+        Also where that is below :data:`LEAST_WINDOW`, the disc is wider than :data:`WIDEST_DISC`, or most of a window
+        would be diffraction around it, as of macro lenses.
         """
         step, shifts = self.pixel_step, [self.camera.chromatic_defocus(w) for w in self.spectrum.wavelengths]
         size = float(step.detach()) if isinstance(step, Tensor) else step
@@ -571,7 +572,8 @@ class PSFModel:
         radius = blur_radius(max(-(lo + min(*shifts, 0.0)), hi + max(*shifts, 0.0)), size)
         if not LEAST_WINDOW <= self.fidelity.max_window < 2 * radius <= WIDEST_DISC:
             return None
-        return window_of(radius, size, self.pupil.extent)
+        side = window_of(radius, size, self.pupil.extent)
+        return side if side < 2 * WIDEST_DISC else None
 
     @torch.no_grad()
     def _sampled_psfs(self, size: int) -> Tensor:

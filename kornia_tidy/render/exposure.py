@@ -52,7 +52,7 @@ def render_pieces(light: Tensor, defocus: Tensor, pieces: Iterable[Piece], rende
         >>> from kornia_tidy.psf.pieces import pieces_of
         >>> light, defocus = torch.ones(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
         >>> pieces = pieces_of(PSFModel(fidelity="draft"), 3, light.dtype, defocus)
-        >>> render_pieces(light, defocus, pieces, Rendering("gather", "reflect")).mean().round()
+        >>> render_pieces(light, defocus, pieces, Rendering("gather", "reflect")).detach().mean().round()
         tensor(1.)
     """
     total = None

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.inference.trained import update_psfs
 from kornia_tidy.reconstruction.closed_form import ClosedForm
-from kornia_tidy.sensor import draw_pattern
+from kornia_tidy.sensor import Sensor, draw_pattern
 from tests.base import BaseTester
 
 SIZE = (150, 60)  # rows of a strip: 64
@@ -113,12 +113,15 @@ class TestPatternedSensor(BaseTester):
             patterned()(torch.rand(1, 1, 151, 60))
 
 
-class RowCounter(nn.Module):
+class RowCounter(nn.Module, Sensor):
     """A sensor of somebody else's, that records on which row of it light falls."""
 
     def forward(self, irradiance, params=None, generator=None, origin=(0, 0)):
         rows = torch.arange(origin[0], origin[0] + irradiance.shape[-2]).to(irradiance)
         return rows[:, None].expand_as(irradiance) / 1000
+
+    def draw(self, shape, device=None, generator=None, dtype=torch.float32):
+        return {}
 
 
 class TestSensor(BaseTester):
