@@ -11,7 +11,7 @@ import torch
 from kornia_tidy.calibration.psf.point_images import PointImage
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
-MOST_AROUND = 0.05  # share of the light between the window and the annulus; with more, the background is a guess
+MOST_AROUND = 0.1  # share of the light between the window and the annulus; with more, the background is a guess
 MOST_DIAMETER = 0.5  # pixels, of a point's image, whose blur can be corrected to second order
 LEAST_MOVEMENT = 4.0  # pixels, about the size of a grain of dust
 LEAST_CHANCE = 1e-3  # that brightest values are alike without being clipped

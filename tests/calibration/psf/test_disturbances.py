@@ -56,6 +56,6 @@ class TestMeasurePSFs(BaseTester):
 
     def test_exception_light_around_the_window(self):
         with pytest.warns(
-            UserWarning, match=r"^\d+% of the light at 0\.6 m lies around the window of 15 pixels, at most 5%"
+            UserWarning, match=r"^\d+% of the light at 0\.6 m lies around the window of 15 pixels, at most 10%"
         ):
             measure_psfs(captures(halo=0.02), CAMERA, 15)
