@@ -32,6 +32,7 @@ NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 # Operations for each sample of a window, as many as take as long: to cut it out and to write its tile, and for each
 # layer to multiply by a spectrum and to add up.
 _TILE, _PAIR = 100, 14
+_WINDOW = 1e5  # for each window beside those of its samples: what small ones take longer
 _WINDOW_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
 
 
@@ -121,7 +122,7 @@ class CompiledBackend:
         present = grid.present(labels.every(SAMPLE), len(scene.psfs), SAMPLE)
         pairs, layers = int(present.sum()), int(present.any(0).sum())
         operations = transform_operations(size, size) * (grid.blocks + pairs + layers)
-        operations = words * (operations + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
+        operations = words * (operations + _WINDOW * grid.blocks + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
         planes = layers + _WINDOW_PLANES * torch.get_num_threads()
         return Work(operations, planes * itemsize * size**2 + 3 * image + kept, size)
 
