@@ -31,7 +31,7 @@ KERNELS = (
     "tests/kernels/test_mutual_intensity_ops.py",
     "tests/kernels/test_occlusion_ops.py",
     "tests/render/backends/test_compiled.py",
-    "tests/psf/test_mutual_intensity.py",
+    "tests/psf/test_energies.py",
 )
 COMPILED = (  # what calls the C kernels
     "tests/kernels",

@@ -2,8 +2,8 @@ r"""Operator of the energy of many waves by their mutual intensity in C.
 
 .. math:: E_d = \sum_k w_k \, |K_d U_k K_d^T|^2
 
-The formula and its derivation are in :mod:`kornia_tidy.psf.mutual_intensity`. The gradient is made of the waves, which
-the operator itself does not form: products of complex matrices, one depth at a time.
+The formula and its derivation are in :mod:`kornia_tidy.psf.energies`. The gradient of the field is made in C, too.
+Those of weights and kernels, and gradients of gradients, are made of the waves, one depth at a time.
 
 The operator is defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
 """
@@ -20,9 +20,9 @@ from kornia_tidy.kernels.build import KERNELS, load
 
 SOURCE = KERNELS / "mutual_intensity.c"
 
-torch.library.define(
-    "kornia_tidy::mutual_intensity_energies", "(Tensor field, Tensor weights, Tensor kernels) -> Tensor"
-)
+_WAVES = "Tensor field, Tensor weights, Tensor kernels"
+torch.library.define("kornia_tidy::mutual_intensity_energies", f"({_WAVES}) -> Tensor")
+torch.library.define("kornia_tidy::mutual_field_gradient", f"({_WAVES}, Tensor gradient) -> Tensor")
 
 
 def mutual_intensity_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
@@ -76,23 +76,12 @@ def _energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     return energies
 
 
-def mutual_field_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor) -> Tensor:
-    """Return the gradient of the field from that of the energies; it has no gradient of its own.
+def _new_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor) -> Tensor:
+    return torch.empty_like(field, memory_format=torch.contiguous_format)
 
-    Args:
-        field: as for :func:`mutual_intensity_energies`.
-        weights: as there.
-        kernels: as there.
-        gradient: (D, P, P) of the energies.
 
-    Returns:
-        (K, N, N) complex, summed in the same order every time.
-
-    Raises:
-        MemoryError: if there is no memory for the waves of a depth.
-        NotBuiltError: if the source cannot be compiled.
-    """
-    _new_energies(field, weights, kernels)
+def _field_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor) -> Tensor:
+    """Return (K, N, N), summed in the same order every time."""
     tensors = [x.resolve_conj().contiguous() for x in (field, weights, kernels, gradient)]
     depths, window, order, cells = kernels.shape
     out = torch.empty_like(tensors[0])
@@ -112,6 +101,8 @@ def _keep(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> No
 def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     r"""Return the gradients from those of the waves :math:`W = K U K^T`, which are :math:`2 w g W`."""
     field, weights, kernels = ctx.saved_tensors
+    if not torch.is_grad_enabled() and not any(ctx.needs_input_grad[1:]):
+        return torch.ops.kornia_tidy.mutual_field_gradient(field, weights, kernels, gradient), None, None
     order = kernels.shape[2]
     of_field, of_weights = torch.zeros_like(field), torch.zeros_like(weights)
     of_kernels: list[Tensor] = []
@@ -131,3 +122,5 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
 torch.library.impl("kornia_tidy::mutual_intensity_energies", "CPU", _energies)
 torch.library.register_fake("kornia_tidy::mutual_intensity_energies", _new_energies)
 torch.library.register_autograd("kornia_tidy::mutual_intensity_energies", _backward, setup_context=_keep)
+torch.library.impl("kornia_tidy::mutual_field_gradient", "CPU", _field_gradient)
+torch.library.register_fake("kornia_tidy::mutual_field_gradient", _new_gradient)

@@ -11,7 +11,7 @@ import torch
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-from kornia_tidy.psf.propagation import energy_operations
+from kornia_tidy.psf.energies import energy_operations
 from kornia_tidy.psf.pupil import Pupil
 
 _points = cache(gauss_legendre_order)
@@ -50,7 +50,7 @@ class BankGeometry:
 def bank_operations(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> float:
     r"""Return the operations of an exact PSF bank.
 
-    For each layer and wavelength as many as :func:`~kornia_tidy.psf.propagation.energy_operations` says, of its two
+    For each layer and wavelength as many as :func:`~kornia_tidy.psf.energies.energy_operations` says, of its two
     ways the one with fewer.
 
     Example:

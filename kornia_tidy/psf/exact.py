@@ -7,14 +7,13 @@ from collections import OrderedDict
 from collections.abc import Callable, Generator, Hashable, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import cast
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
-from kornia_tidy.psf.batched_energies import batched_energies, energy_matrices
-from kornia_tidy.psf.propagation import pixel_energies, sensor_kernels
+from kornia_tidy.psf.energies import energy_matrices, intensity_energies, pixel_energies
+from kornia_tidy.psf.propagation import sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
 from kornia_tidy.runtime.precision import has_float64
@@ -22,10 +21,32 @@ from kornia_tidy.runtime.tracing import is_followed
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
-Key = tuple[float, float, Geometry, Gaps, torch.device, torch.dtype, int]  # the last is the number of threads
-_CACHE: OrderedDict[Key, Tensor] = OrderedDict()
-_MATRICES: OrderedDict[tuple[Hashable, ...], tuple[Tensor, Tensor]] = OrderedDict()  # of accelerators
-_CACHE_BYTES = 256 * 2**20
+_MOST_BYTES = 256 * 2**20
+
+
+class _Memory:
+    """Tensors of each depth, by all that they depend on: of those used last so many bytes."""
+
+    def __init__(self) -> None:
+        self.held: OrderedDict[Hashable, tuple[Tensor, ...]] = OrderedDict()
+
+    def recall(self, keys: Sequence[Hashable], make: Callable[[list[int]], tuple[Tensor, ...]]) -> list[Tensor]:
+        """Return the tensors of all keys, stacked; ``make`` gives those of missing keys, by their places."""
+        if missing := [place for place, key in enumerate(keys) if key not in self.held]:
+            with torch.inference_mode(False), torch.no_grad():
+                made = zip(*(tensor.unbind() for tensor in make(missing)), strict=True)
+            self.held.update(zip([keys[place] for place in missing], made, strict=True))
+        for key in keys:
+            self.held.move_to_end(key)
+        found = [torch.stack(tensors) for tensors in zip(*(self.held[key] for key in keys), strict=True)]
+        one = sum(tensor.nbytes for tensor in self.held[keys[-1]])
+        while len(self.held) * one > _MOST_BYTES and len(self.held) > len(keys):
+            self.held.popitem(last=False)
+        return found
+
+
+_kernel_memory = _Memory()
+_matrix_memory = _Memory()  # of accelerators
 
 
 class _Thread(threading.local):
@@ -113,9 +134,15 @@ def exact_psf_bank(
 
     if phase.device.type != "cpu" and not is_followed() and isinstance(pixel_step, float):
         columns = cells if gaps is None else 2 * cells
-        if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _CACHE_BYTES:
-            constants = (tuple(spectrum.wavelengths), tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device)
-            left, pixels = _matrices_of(kernels_of, tuple(defocus), constants)
+        if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _MOST_BYTES:
+            constants = spectrum.wavelengths, tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device
+
+            def matrices_of(places: list[int]) -> tuple[Tensor, ...]:  # made on the CPU
+                at, waves = [defocus[place] for place in places], range(len(spectrum.wavelengths))
+                made = energy_matrices([kernels_of(at, w, torch.device("cpu")) for w in waves])
+                return tuple(matrix.to(phase.device) for matrix in made)
+
+            left, pixels = _matrix_memory.recall([(psi, constants) for psi in defocus], matrices_of)
             lens = pupil, tuple(dispersion), per_channel
             scales, amplitude, share = _constants_of(*lens, phase.device, phase.dtype)
             nodes = _nodes_of(tuple(defocus), phase.device, phase.dtype)
@@ -123,7 +150,7 @@ def exact_psf_bank(
             if each_state:  # in the place of more wavelengths
                 waves, weights = waves.transpose(0, 1).flatten(0, 1)[:, None], torch.ones_like(weights[:1])
                 left, pixels = (x.repeat(1, len(phase), *[1] * (x.ndim - 2)) for x in (left, pixels))
-            energies = batched_energies(waves, weights.to(phase.dtype), left, pixels)
+            energies = intensity_energies(waves, weights.to(phase.dtype), left, pixels)
             by_state = energies.unflatten(1, (-1, len(share[0])))
             psfs = torch.einsum("dswyx,cw->dscyx", by_state, share).flatten(1, 2)
             return PSFBank(psfs, nodes, psfs.sum((2, 3)))
@@ -141,28 +168,6 @@ def exact_psf_bank(
         share = phase.new_tensor([channel[w] for channel in per_channel])
         psfs = psfs + energies[:, None] * share[:, None, None]
     return PSFBank(psfs, phase.new_tensor(defocus), psfs.sum((2, 3)))
-
-
-def _matrices_of(
-    kernels_of: Callable[..., Tensor], defocus: tuple[float, ...], constants: tuple[Hashable, ...]
-) -> tuple[Tensor, Tensor]:
-    """Return the matrices of :func:`batched_energies` for each depth, computed once, on the CPU, and remembered."""
-    keys = [(psi, constants) for psi in defocus]
-    missing = [key for key in keys if key not in _MATRICES]
-    if missing:
-        at, device = [key[0] for key in missing], cast("torch.device", constants[-1])
-        with torch.inference_mode(False), torch.no_grad():
-            waves = range(len(cast("tuple[float, ...]", constants[0])))
-            made = energy_matrices([kernels_of(at, w, torch.device("cpu")) for w in waves])
-            left, pixels = (matrix.to(device).unbind() for matrix in made)
-        _MATRICES.update(zip(missing, zip(left, pixels, strict=True), strict=True))
-    for key in keys:
-        _MATRICES.move_to_end(key)
-    found = tuple(torch.stack(matrices) for matrices in zip(*(_MATRICES[key] for key in keys), strict=True))
-    one = sum(matrix.nbytes for matrix in _MATRICES[keys[-1]])
-    while len(_MATRICES) * one > _CACHE_BYTES and len(_MATRICES) > len(keys):
-        _MATRICES.popitem(last=False)
-    return found[0], found[1]
 
 
 @lru_cache(maxsize=16)
@@ -208,14 +213,8 @@ def _kernels(
     if is_followed() or _thread.forgets:
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
     keys = [(psi, step, geometry, gaps, device, dtype, torch.get_num_threads()) for psi in defocus]
-    missing = [key for key in keys if key not in _CACHE]
-    if missing:
-        with torch.inference_mode(False), torch.no_grad():
-            made = sensor_kernels([key[0] for key in missing], step, *geometry, device, spans).to(dtype)
-        _CACHE.update(zip(missing, made.unbind(), strict=True))
-    for key in keys:
-        _CACHE.move_to_end(key)
-    kernels = torch.stack([_CACHE[key] for key in keys])
-    while len(_CACHE) * _CACHE[keys[-1]].nbytes > _CACHE_BYTES and len(_CACHE) > len(keys):
-        _CACHE.popitem(last=False)
-    return kernels
+
+    def kernels_of(places: list[int]) -> tuple[Tensor]:
+        return (sensor_kernels([defocus[place] for place in places], step, *geometry, device, spans).to(dtype),)
+
+    return _kernel_memory.recall(keys, kernels_of)[0]

@@ -17,8 +17,6 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.optics.quadrature import gauss_legendre, gauss_legendre_order
-from kornia_tidy.psf.mutual_intensity import mutual_energies
-from kornia_tidy.psf.wave_energy import wave_energies
 
 CELL_TOLERANCE = 1e-9  # of the integrals over mask pixels: exact for every purpose, and they cost next to nothing
 
@@ -129,51 +127,3 @@ def sensor_kernels(
     _, weights = gauss_legendre(order, device)
     scale = (weights.sqrt() * step**0.5).repeat(window)  # squared by the intensity, once for each axis
     return (integrals * scale[:, None]).unflatten(1, (window, order))
-
-
-def pixel_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
-    r"""Return the light that falls on each pixel, averaged over the states of the modulator.
-
-    .. math:: h_d(p) = \sum_k w_k \int_p \left| \mathcal{F}\{ U_k e^{i\psi_d\rho^2} \}(u) \right|^2 du
-
-    Args:
-        field: pupil fields U, one for each state, without defocus.
-        weights: share of the exposure of each state.
-        kernels: from :func:`sensor_kernels`.
-
-    Returns:
-        Energies in units of the squared amplitude times pupil radii squared, (D, P, P), real.
-
-    Shape:
-        - field (K, N, N) complex, weights (K,), kernels (D, P, q, N) complex.
-
-    Convention:
-        - Axes are (y, x); a phase that rises along +x moves the light towards larger column indices.
-
-    Example:
-        >>> field = torch.ones(1, 8, 8, dtype=torch.complex128)
-        >>> kernels = sensor_kernels([0.0], 0.25, 65, 8, 0.25, 1.0, 1e-9)
-        >>> light = pixel_energies(field, torch.ones(1), kernels)
-        >>> round(float(light.sum() / 4), 2)  # a square pupil of 2x2 radii lets through 4
-        0.99
-    """
-    by_waves, by_intensity = energy_operations(len(weights), *kernels.shape[1:])
-    energies = mutual_energies if by_intensity < by_waves else wave_energies
-    return energies(field, weights, kernels)
-
-
-def energy_operations(states: int, window: int, order: int, cells: int) -> tuple[int, int]:
-    r"""Return the additions and multiplications for a depth, wave by wave and by the mutual intensity.
-
-    .. math:: K (8 U N^2 + 8 U^2 N + 4 U^2) \quad\text{and}\quad 4 (5 K + 1) U N^2 + 2 P^2 N^2, \qquad U = q P
-
-    for K states, N cells of the pupil and q points a pixel along each side of a window P. The second way has little to
-    do for each state and point more, and the first for each cell.
-
-    Example:
-        >>> energy_operations(5, 61, 3, 23), energy_operations(1, 61, 3, 92)
-        ((35351940, 14004746), (37173156, 100162976))
-    """
-    points = order * window
-    by_waves = states * (8 * points * cells**2 + 8 * points**2 * cells + 4 * points**2)
-    return by_waves, (4 * (5 * states + 1) * points + 2 * window**2) * cells**2

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.gradients_only import gradients_only
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.psf.pupil import Pupil
@@ -160,7 +159,7 @@ def _psfs_fake(*arguments: Any) -> Tensor:
 def _gradients(*arguments: Any) -> list[Tensor]:
     phase, weights, *lens, gradient, wanted = arguments
     given = (phase, weights)
-    with recording_in_operator(), gradients_only(), torch.autocast(phase.device.type, enabled=False):
+    with recording_in_operator(), torch.autocast(phase.device.type, enabled=False):
         leaves = [x.detach().requires_grad_(want) for x, want in zip(given, wanted, strict=True)]
         psfs = _computed(*leaves, *lens)
         found = torch.autograd.grad(psfs, [x for x in leaves if x.requires_grad], gradient)

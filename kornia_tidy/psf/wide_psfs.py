@@ -12,7 +12,6 @@ from torch.nn.functional import pad
 
 from kornia_tidy.psf.defocus_interpolation import nodes_around
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
-from kornia_tidy.psf.gradients_only import gradients_only
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur, window_of
@@ -129,7 +128,7 @@ class _ExactGradient(torch.autograd.Function):
         wanted = [i for i in (0, 1) if ctx.needs_input_grad[i]]
         total = [torch.zeros_like(x) for x in saved]
         for psi, own in zip(ctx.nodes, gradient, strict=True):  # one depth at a time: waves of large windows are large
-            with torch.enable_grad(), gradients_only():
+            with torch.enable_grad():
                 leaves = [x.detach().requires_grad_(i in wanted) for i, x in enumerate(saved)]
                 psfs = ctx.exact(*leaves, (psi,), gradient.shape[-1]).psfs
                 found = torch.autograd.grad(psfs, [leaves[i] for i in wanted], own[None], allow_unused=True)

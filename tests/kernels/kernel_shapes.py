@@ -18,7 +18,7 @@ from torch.nn.functional import conv2d, one_hot
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.window_sides import is_window_size, size_step
-from kornia_tidy.psf.mutual_intensity import LARGEST_WINDOW
+from kornia_tidy.psf.energies import LARGEST_WINDOW
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.dense_occlusion import (
     EPSILON,
@@ -31,7 +31,7 @@ from kornia_tidy.render.borders import BORDERS, pad_border
 from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.render.scene import LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import normalised_share
-from tests.psf.energies import gradient_round_off, round_off, written_out
+from tests.psf.energies_tester import gradient_round_off, round_off, written_out
 from tests.rounding import gamma
 
 DTYPES = (torch.float32, torch.float64)
@@ -287,8 +287,7 @@ def field_gradient(draw: random.Random) -> Call:
         allowed = gradient_round_off(tuple(x.detach() for x in exact), light.double(), light.dtype)[0]
         return torch.view_as_real(expected), 2 * allowed[..., None]
 
-    arguments = *case, light, [True, False, False]
-    return Call(about, "mutual_energies_gradients", arguments, 2 * products, truth)
+    return Call(about, "mutual_field_gradient", (*case, light), 2 * products, truth)
 
 
 def srgb(draw: random.Random) -> Call:

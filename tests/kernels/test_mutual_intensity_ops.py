@@ -8,7 +8,7 @@ import torch
 from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
-from tests.psf.energies import random_case
+from tests.psf.energies_tester import random_case
 
 
 class TestMutualIntensityEnergies(OperatorTester):

@@ -137,10 +137,10 @@ class TestBudget(BaseTester):
     def test_feature_psfs_and_matrices_are_kept_only_where_they_fit(self, monkeypatch, remembered):
         model = make_optics().psf_model
         monkeypatch.setattr(pieces, "_most_layers", lambda *_: (3, remembered))
-        before = list(exact._CACHE)
+        before = list(exact._kernel_memory.held)
         _ = next(pieces_of(model, 3, torch.float32, torch.tensor([-17.0, -16.5]), budget=1)).bank()
         assert bool(model._memories) == remembered
-        assert (list(exact._CACHE) != before) == remembered
+        assert (list(exact._kernel_memory.held) != before) == remembered
 
     @pytest.mark.takes_seconds
     @torch.no_grad()

@@ -13,12 +13,12 @@ from scipy.special import j0, j1
 
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.psf.energies import pixel_energies
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.propagation import (
     cell_integrals,
     gauss_legendre,
     gauss_legendre_order,
-    pixel_energies,
     pixel_frequencies,
     sensor_kernels,
 )
@@ -259,8 +259,8 @@ class TestPixelEnergies(BaseTester):
         kernels = sensor_kernels([-4.0, 0.0, 4.0], 0.39, 11, 23, 0.1, 1.05, 1e-3)
         whole = pixel_energies(fields, torch.ones(2), kernels)
         (expected,) = torch.autograd.grad(whole.square().sum(), fields)
-        monkeypatch.setattr("kornia_tidy.psf.wave_energy._BLOCK_SAMPLES", 1)
-        monkeypatch.setattr("kornia_tidy.psf.mutual_intensity._BLOCK_NUMBERS", 1)
+        monkeypatch.setattr("kornia_tidy.psf.energies._BLOCK_SAMPLES", 1)
+        monkeypatch.setattr("kornia_tidy.psf.energies._BLOCK_NUMBERS", 1)
         chunked = pixel_energies(fields, torch.ones(2), kernels)
         (got,) = torch.autograd.grad(chunked.square().sum(), fields)
         self.assert_close(chunked, whole, rtol=1e-12, atol=0)
