@@ -17,7 +17,7 @@ from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, ch
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.render.compositing import render
-from kornia_tidy.runtime.tracing import is_value_unknown
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 SPACING = 0.5  # pixels of radius between two discs; between them the discs are blended
 COLOR_SPACES = ("srgb", "linear")
@@ -117,7 +117,7 @@ def depth_blur(
     nearest = focus_distance.min() if isinstance(focus_distance, Tensor) else focus_distance
     if not float(nearest) > focal_length:
         raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {float(nearest)}")
-    if not is_value_unknown():
+    if Mode.GRAPH not in torch_mode():
         check_depth(depth)
     dtype = torch.promote_types(image.dtype, torch.float32)
     focus, aperture = (

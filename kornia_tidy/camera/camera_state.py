@@ -32,7 +32,7 @@ from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.runtime.tracing import is_followed, refuse_torchscript
+from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
 
 _SUBMODULES = ("masks", "camera", "modulator")
 COLOR_SPACES = ("srgb", "linear", "paper")
@@ -175,7 +175,7 @@ class CameraState(nn.Module):
             states: return the PSFs of each state that the modulator shows, with their weights, not the average.
         """
         model = self.psf_model
-        if not is_followed():
+        if not torch_mode() & Mode.TRACED:
             with model.lock:  # the window and the masks of one moment
                 model = self.psf_model.snapshot(model.bank_dtype(dtype))
         if states:

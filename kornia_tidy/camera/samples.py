@@ -21,10 +21,9 @@ from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
+from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.runtime.precision import widest
-from kornia_tidy.runtime.reading import is_unread
 from kornia_tidy.runtime.threads import CaptureNotes
-from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
@@ -141,7 +140,7 @@ def read_sample(
             f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
         )
     at_once = image.device.type == "cpu" or not deferred
-    if camera.check_inputs and at_once and not is_value_unknown() and image.numel():
+    if camera.check_inputs and at_once and Mode.GRAPH not in torch_mode() and image.numel():
         lowest, highest = torch.aminmax(image.detach())
         if not bool((lowest >= 0) & (highest <= 1)):  # NaN too
             check_light(image, camera)
@@ -176,7 +175,7 @@ def check_light(image: Tensor, camera: Watchful) -> None:
     Raises:
         ValueError: if a value is NaN or infinite, an sRGB value is above 16, or light beyond 1e30.
     """
-    if camera.check_inputs and not is_value_unknown():
+    if camera.check_inputs and Mode.GRAPH not in torch_mode():
         said = check_image(image, encoded=camera.color_space != "linear")
         if said is not None:
             tell_once(camera.notes, "image", said, stacklevel=7)
@@ -217,12 +216,12 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
     lo, hi = camera.psf_model.camera.defocus_range
     extremes, pixels, clamped, reach = torch.zeros(2), 0, 0, None
     for defocus in parts:
-        if is_value_unknown():
+        if Mode.GRAPH in torch_mode():
             return DefocusSpan(defocus)
         own = defocus.detach()
         if not own.numel():
             continue
-        if defocus.requires_grad or is_transformed():
+        if defocus.requires_grad or Mode.TRANSFORM in torch_mode():
             reach = defocus
         lowest, highest = torch.aminmax(own)
         if not bool((lowest >= lo - ROUNDING) & (highest <= hi + ROUNDING)):
@@ -252,7 +251,7 @@ def survey_scene(sample: Sample, defocus: Tensor, camera: Any) -> Tensor:
         Lowest and highest defocus in radians, (2,), or the defocus map, as far as PSFs are needed for it.
     """
     fixed, lens = camera.fixed_defocus, camera.psf_model.camera
-    if not is_unread():
+    if Mode.UNREAD not in torch_mode():
         span = survey_defocus([defocus], camera)
         return span.reach if fixed is None else torch.tensor(fixed, requires_grad=defocus.requires_grad)
     own, (lo, hi) = defocus.detach(), lens.defocus_range

@@ -34,9 +34,8 @@ from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.render.exposure import Rendering, render_pieces
-from kornia_tidy.runtime.reading import is_unread, values_unread
+from kornia_tidy.runtime.mode import Mode, torch_mode, values_unread
 from kornia_tidy.runtime.threads import CaptureNotes
-from kornia_tidy.runtime.tracing import is_followed, is_transformed, is_value_unknown
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.sensor.sensor import Sensor, check_sensor
 from kornia_tidy.systems.presets import published_system
@@ -282,7 +281,7 @@ class TiDyOptics(CameraState):
         spread = self.fidelity.stray_light == "veil"
         # Beyond a zero border there is nothing that hides, which black pixels would.
         unseen = self.compositing == "occlusion" and self.border == "zero"
-        if learning or is_followed() or spread or unseen or not len(image):
+        if learning or torch_mode() & Mode.TRACED or spread or unseen or not len(image):
             return None
         allowed = self.memory_budget
         if comes_in_pieces(self.psf_model, image.shape[1], sample.dtype, self.compositing, allowed):
@@ -308,7 +307,7 @@ class TiDyOptics(CameraState):
         Args:
             dtype: float32 or float64, in which the masks are needed.
         """
-        if torch.compiler.is_compiling() or is_transformed():
+        if torch_mode() & Mode.TRACED:
             return self
         with self.psf_model.lock:
             return self._replace(psf_model=self.psf_model.snapshot(dtype))
@@ -334,7 +333,7 @@ class TiDyOptics(CameraState):
         Raises:
             ValueError: if the camera checks its inputs and a depth is NaN or not positive.
         """
-        checked = self.check_inputs and not is_value_unknown() and not is_unread()
+        checked = self.check_inputs and not torch_mode() & (Mode.GRAPH | Mode.UNREAD)
         return self.psf_model.camera.defocus(depth, check_inputs=checked)
 
     def expose(

@@ -22,7 +22,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
-from kornia_tidy.runtime.tracing import is_followed
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 SOURCE = KERNELS / "srgb.c"
 
@@ -63,7 +63,8 @@ def linear_to_srgb(light: Tensor) -> Tensor:
 
 
 def _convert(image: Tensor, encode: bool) -> Tensor:
-    here = image.device.type == "cpu" and image.dtype in REALS and not is_followed()  # a compiler fuses torch's own
+    traced = torch_mode() & Mode.TRACED  # a compiler fuses torch's own
+    here = image.device.type == "cpu" and image.dtype in REALS and not traced
     if here and compiled(SOURCE, image.dtype) is not None:
         return torch.ops.kornia_tidy.srgb(image, encode)
     return _by_torch(image, encode)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_part, check_values
+from kornia_tidy.runtime.mode import Mode, torch_mode
 from kornia_tidy.runtime.search_path import import_installed
-from kornia_tidy.runtime.tracing import is_value_unknown
 
 HOLES = ("error", "fill")  # what a camera and its adapters do about holes
 _UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)  # types that torch stores, and neither compares nor gathers
@@ -86,7 +86,7 @@ def _fill_tensor(depth: Tensor) -> tuple[Tensor, Tensor]:
     check_values("depth", depth)
     wide = depth.long() if depth.dtype in _UNSIGNED else depth
     known = wide > 0  # False for NaN
-    if not depth.numel() or (not is_value_unknown() and bool(known.all())):
+    if not depth.numel() or (Mode.GRAPH not in torch_mode() and bool(known.all())):
         return depth, known
     nearest = torch.ops.kornia_tidy.nearest_known(known)
     filled = wide.flatten(-2).gather(-1, nearest.flatten(-2)).reshape(depth.shape)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 TAPS = {"cubic": 4, "bandlimited": 10}
 SHARE_OF_NYQUIST = 0.7  # distance of samples over pi / band up to which ten taps interpolate
@@ -182,11 +182,11 @@ def interpolated_bank(
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
     """Return the nodes that a defocus map lies between; all of them where it is empty or cannot be looked at."""
-    if is_value_unknown() or not defocus.numel():
+    if Mode.GRAPH in torch_mode() or not defocus.numel():
         return nodes
     lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
     # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad or is_transformed())
+    extra = int(defocus.requires_grad or Mode.TRANSFORM in torch_mode())
     first = max(0, bisect_right(nodes, lowest) - 1 - extra)
     last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
     return nodes[min(first, last) : last + 1]

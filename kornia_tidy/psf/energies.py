@@ -31,7 +31,7 @@ from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
-from kornia_tidy.runtime.tracing import is_followed
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 # px, in C: .6 (23 px) to .85 (61 px) of the time of matrix products, beyond 100 px more than they
 LARGEST_WINDOW = 65
@@ -127,7 +127,7 @@ def _energies_of_rows(first: Tensor, rows: Tensor, left: Tensor, second: Tensor)
     """Return (depth and pixel row, 2 q P) of left (depth, row, q, 2N); rows are the weights by point and state."""
     half = (left.reshape(-1, left.shape[-1]) @ first).view(len(left), -1, left.shape[-1])  # conj(K U)
     wave = torch.bmm(half, second.mT)  # (depth, rows and points and states, 2 q P)
-    squares = wave.square() if wave.requires_grad or is_followed() else wave.square_()
+    squares = wave.square() if wave.requires_grad or torch_mode() & Mode.TRACED else wave.square_()
     return torch.matmul(rows, squares.view(-1, len(rows), wave.shape[-1]))
 
 
@@ -169,7 +169,12 @@ def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     """
     weights = weights.to(field.real.dtype)
     constant = not (torch.is_grad_enabled() and (weights.requires_grad or kernels.requires_grad))
-    if constant and not is_followed() and field.device.type == "cpu" and goes_in_c(kernels.shape[1], weights.dtype):
+    if (
+        constant
+        and not torch_mode() & Mode.TRACED
+        and field.device.type == "cpu"
+        and goes_in_c(kernels.shape[1], weights.dtype)
+    ):
         return mutual_intensity_energies(field, weights, kernels)
     window, order, cells = kernels.shape[1:]
     numbers = window * (4 * order * len(field) * cells + cells**2)
@@ -251,7 +256,7 @@ def _real_rows(numbers: Tensor) -> Tensor:
 def _in_block(energies: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """Return the energies of a block, of which only what is given is kept for the backward pass."""
     with torch.autocast(given[0].device.type, enabled=False):
-        return energies(*given) if is_followed() else _MadeAgain.apply(energies, *given)
+        return energies(*given) if torch_mode() & Mode.TRACED else _MadeAgain.apply(energies, *given)
 
 
 class _MadeAgain(torch.autograd.Function):

@@ -16,8 +16,8 @@ from kornia_tidy.psf.energies import energy_matrices, intensity_energies, pixel_
 from kornia_tidy.psf.propagation import sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
+from kornia_tidy.runtime.mode import Mode, torch_mode
 from kornia_tidy.runtime.precision import has_float64
-from kornia_tidy.runtime.tracing import is_followed
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
@@ -132,7 +132,7 @@ def exact_psf_bank(
         at = tuple((p + shifts[w]) * scale for p in psi)
         return _kernels(at, pixel_step / spectrum.wavelengths[w], geometry, gaps, device, dtype)
 
-    if phase.device.type != "cpu" and not is_followed() and isinstance(pixel_step, float):
+    if phase.device.type != "cpu" and not torch_mode() & Mode.TRACED and isinstance(pixel_step, float):
         columns = cells if gaps is None else 2 * cells
         if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _MOST_BYTES:
             constants = spectrum.wavelengths, tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device
@@ -210,7 +210,7 @@ def _kernels(
         )
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
-    if is_followed() or _thread.forgets:
+    if torch_mode() & Mode.TRACED or _thread.forgets:
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
     keys = [(psi, step, geometry, gaps, device, dtype, torch.get_num_threads()) for psi in defocus]
 

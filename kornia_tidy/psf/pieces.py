@@ -26,8 +26,7 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import EACH, PSFModel
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
-from kornia_tidy.runtime.reading import is_unread
-from kornia_tidy.runtime.tracing import is_followed, is_value_unknown
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 LEAST_BYTES = 12 << 20  # allowed to a piece whatever the budget
 _COPIES = 4  # of PSFs, while a bank is computed, stacked and normalised
@@ -98,7 +97,7 @@ def pieces_of(
         (torch.Size([6, 3]), None)
     """
     scene = reach if scene is None else scene
-    if (blur := None if is_value_unknown() else model.wide_blur) is not None:
+    if (blur := None if Mode.GRAPH in torch_mode() else model.wide_blur) is not None:
         if compositing == "gather" and scene.numel():
             yield from _wide_pieces(model, blur, channels, dtype, scene)
             return
@@ -114,7 +113,7 @@ def pieces_of(
         make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
         shares = model.state_weights(dtype)
-        if is_unread():  # all states in one bank, for one rendering
+        if Mode.UNREAD in torch_mode():  # all states in one bank, for one rendering
             yield Piece(partial(make, reach, EACH), shares)
             return
         for state, share in enumerate(shares):
@@ -172,7 +171,7 @@ def _most_layers(
 ) -> tuple[int | None, bool]:
     """Return the most layers of a piece, None where all fit at once, and whether PSFs are remembered."""
     whole, fidelity = (None, True), model.fidelity
-    if is_followed() or is_unread() or not reach.numel() or model.measured is not None:
+    if torch_mode() or not reach.numel() or model.measured is not None:
         return whole
     if fidelity.layers not in ("nearest", "linear") or (layers := len(nodes_around(model.defocus_nodes, reach))) < 3:
         return whole

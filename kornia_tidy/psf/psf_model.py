@@ -41,9 +41,8 @@ from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur, blurs_widely, wide_blur, window_of
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
-from kornia_tidy.runtime.reading import is_unread
+from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.runtime.threads import SharedLock
-from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown, refuse_torchscript
 
 EACH = -1  # in the place of a state: all of them, each for itself, in one bank
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
@@ -305,7 +304,7 @@ class PSFModel:
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        traced = torch.compiler.is_compiling() or is_transformed()
+        traced = torch_mode() & Mode.TRACED
         exact = partial(self._exact_psfs, spectrum, grid)
         build = partial(exact, states, weights, window=side, each_state=state == EACH)
         if (blur := self.wide_blur) is not None and not traced and state != EACH:
@@ -317,7 +316,7 @@ class PSFModel:
             shares = [sum(row) for row in spectrum.plane_weights]
             lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
-        if learning or traced or is_unread() or next(self.camera.parameters(), None) is not None:
+        if learning or traced or Mode.UNREAD in torch_mode() or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
         fill_factor = getattr(self.modulator, "fill_factor", 1.0)
@@ -340,7 +339,7 @@ class PSFModel:
         each_state: bool = False,
         tolerance: float | None = None,
     ) -> PSFBank:
-        if not (is_value_unknown() or is_unread()):
+        if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
             check_finite("the phase of the masks", states)
             check_finite("the weights of the modulator", weights)
         # How the phase of the masks and the focus of the lens change from wavelength to wavelength.
@@ -396,7 +395,7 @@ class PSFModel:
         """
         if torch.jit.is_tracing():
             refuse_torchscript()
-        if self.shown is not None or torch.compiler.is_compiling() or is_transformed():
+        if self.shown is not None or torch_mode() & Mode.TRACED:
             return self
         with self.lock:
             shown, derived = settled_timeline(self.masks, self.modulator, dtype), self._derived
@@ -634,7 +633,7 @@ class PSFModel:
         Found with the masks as they were at the first look, and dropped as soon as they are no longer flat.
         """
         derived = self._derived
-        if not derived.blur_known and not is_value_unknown():
+        if not derived.blur_known and Mode.GRAPH not in torch_mode():
             derived.blur, derived.blur_known = self._find_wide_blur(), True
         return derived.blur
 

@@ -19,7 +19,7 @@ from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
+from kornia_tidy.runtime.mode import Mode, recording_in_operator, torch_mode
 
 _LENS = (
     "Tensor phase, Tensor weights, Tensor amplitude, float cell_pitch, float fill_factor, float light,"
@@ -72,7 +72,7 @@ def computed_psf_bank(
         torch.Size([1, 1, 23, 23])
     """
     lens = pupil, spectrum, dispersion, defocus
-    if torch.compiler.is_compiling() and not (isinstance(pixel_step, Tensor) or each_state or is_transformed()):
+    if torch_mode() == Mode.GRAPH and not (isinstance(pixel_step, Tensor) or each_state):
         return operator_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus)
     return exact_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus, each_state)
 

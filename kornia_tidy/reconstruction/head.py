@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.optics.units import check_head_image, layout_remedy
-from kornia_tidy.runtime.tracing import is_value_unknown
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 
 class ReconstructionHead(nn.Module, ABC):
@@ -61,7 +61,7 @@ class ReconstructionHead(nn.Module, ABC):
         if image.shape[1] != self.in_channels:
             remedy = layout_remedy(tuple(image.shape), self.in_channels)
             raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}{remedy}")
-        if not self.looked and not is_value_unknown():
+        if not self.looked and Mode.GRAPH not in torch_mode():
             self.looked = True  # for the first image only, as the check waits for the device
             if (said := check_head_image(image)) is not None:
                 warnings.warn(said, stacklevel=5)

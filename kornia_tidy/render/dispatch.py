@@ -18,7 +18,7 @@ from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradi
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.scene import LayeredScene, scene_of_layers
 from kornia_tidy.render.stray_light import stray_light_of
-from kornia_tidy.runtime.tracing import is_transformed
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DenseBackend(), CompiledBackend(), TiledBackend(), BatchedBackend())
@@ -47,7 +47,7 @@ def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
         ValueError: if the method is not known, or does not support the scene.
     """
     backend = choose(scene, method) if isinstance(method, str) else method
-    if is_transformed():
+    if Mode.TRANSFORM in torch_mode():
         return render_unrecorded(backend, scene)
     return _Rendered.apply(backend, scene, scene.image, scene.layer_weight, scene.psfs, scene.stray_light)
 
@@ -141,7 +141,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """
     if method != "auto":
         return _named(scene, method)
-    if is_transformed():
+    if Mode.TRANSFORM in torch_mode():
         return BACKENDS["dense"]
     if scene.image.device.type != "cpu":
         samples = len(scene.psfs) * math.prod((*scene.image.shape[:2], *scene.padded_size))
@@ -172,7 +172,7 @@ def _named(scene: LayeredScene, method: str) -> Backend:
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:
     """Return why a backend does not support a scene, or None if it does."""
-    if backend.name != "dense" and is_transformed():
+    if backend.name != "dense" and Mode.TRANSFORM in torch_mode():
         return "torch.func and forward-mode derivatives need plain operations of torch"
     return backend.refusal(scene)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_float_tensor
-from kornia_tidy.runtime.tracing import is_transformed, is_value_unknown
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 LAYER_MODES = ("nearest", "linear")
 
@@ -75,7 +75,7 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         check_nodes(nodes)
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
-    spacing = None if is_transformed() else _even_spacing(nodes)
+    spacing = None if Mode.TRANSFORM in torch_mode() else _even_spacing(nodes)
     if mode == "nearest" and spacing is not None:
         steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
         return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
@@ -99,7 +99,7 @@ def check_nodes(nodes: Tensor) -> None:
     Args:
         nodes: (D,) defocus of the layers in radians.
     """
-    if not is_value_unknown() and not bool((nodes.diff() > 0).all()):
+    if Mode.GRAPH not in torch_mode() and not bool((nodes.diff() > 0).all()):
         raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
 
 
@@ -196,7 +196,7 @@ def present_layers(layer_index: Tensor, layer_weight: Tensor | None, count: int)
         >>> present_layers(torch.tensor([0, 3]), torch.tensor([1.0, 0.5]), count=6)
         [1, 3, 4]
     """
-    if is_transformed():
+    if Mode.TRANSFORM in torch_mode():
         return list(range(count))
     present = torch.zeros(count, dtype=torch.bool, device=layer_index.device)
     if layer_weight is None:

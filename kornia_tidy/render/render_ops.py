@@ -24,8 +24,7 @@ from kornia_tidy.render.dispatch import (
 )
 from kornia_tidy.render.layers import check_nodes
 from kornia_tidy.render.scene import SceneArguments, assigned_scene, check_scene, layered_scene, remembered_scene
-from kornia_tidy.runtime.reading import is_unread
-from kornia_tidy.runtime.tracing import is_transformed, recording_in_operator
+from kornia_tidy.runtime.mode import Mode, recording_in_operator, torch_mode
 
 _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
@@ -76,12 +75,12 @@ def render_layers(
     """
     if compositing not in COMPOSITINGS:
         check_choice("compositing", compositing, COMPOSITINGS)
-    if is_transformed():
+    if Mode.TRANSFORM in torch_mode():
         options = {"compositing": compositing, "layers": layers, "border": border}
         scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
         return render_scene(scene, method)
     check_scene(image, defocus, nodes, psfs, stray_light, border)
-    if nodes.device.type != "cpu" and not is_unread():
+    if nodes.device.type != "cpu" and Mode.UNREAD not in torch_mode():
         check_nodes(nodes)
     return torch.ops.kornia_tidy.render_layers(
         image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method

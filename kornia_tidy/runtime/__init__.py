@@ -1,5 +1,5 @@
-"""Runtime support: locks for cameras shared by threads, signals, and detection of torch's compiler and transforms.
+"""Runtime support: locks for cameras shared by threads, signals, and how torch runs.
 
-It contains no optics. ``tracing.py`` has the compiler and function transforms, ``threads.py`` the locks, ``signals.py``
-Ctrl-C and SIGTERM of the command.
+It contains no optics. ``mode.py`` tells how torch runs, ``threads.py`` has the locks, ``signals.py`` Ctrl-C and SIGTERM
+of the command.
 """
