@@ -43,25 +43,15 @@ def largest_window(border: str, height: int, width: int) -> int:
     return limits.get(border, 2**31 - 1)
 
 
-def pad_border(image: Tensor, radius: int | tuple[int, int], border: str, spare: tuple[int, int] = (0, 0)) -> Tensor:
+def pad_border(image: Tensor, radius: int | tuple[int, int], border: str) -> Tensor:
     """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` leaves them as they are.
 
     Two radii are those left and right, and above and below.
-
-    Up to ``spare`` more rows and columns are added below and on the right, where there is something to fill them with:
-    room that a user of the image need not make by a second copy.
     """
     if border == "valid":
         return image
     across, down = (radius, radius) if isinstance(radius, int) else radius
-    more = {"reflect": -1, "circular": 0}.get(border)
-    if more is not None:
-        spare = (
-            min(spare[0], image.shape[-2] + more - down),
-            min(spare[1], image.shape[-1] + more - across),
-        )
-    sides = (across, across + spare[1], down, down + spare[0])
-    return torch.nn.functional.pad(image, sides, mode=_PAD_MODES[border])
+    return torch.nn.functional.pad(image, (across, across, down, down), mode=_PAD_MODES[border])
 
 
 def cropped(tensor: Tensor, margin: int) -> Tensor:

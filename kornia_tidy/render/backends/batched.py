@@ -10,10 +10,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, wants_gradient
+from kornia_tidy.render.backend import GradientPairs, Work
 from kornia_tidy.render.backends.batched_occlusion import occlude_batched, occlusion_gradients
 from kornia_tidy.render.backends.dense import dense_work
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
+from kornia_tidy.render.backends.layer_sums import blend, blend_gradients
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
 from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
@@ -37,118 +38,66 @@ class BatchedBackend:
         """Return the rendered light, for occlusion in float64 where the device has it."""
         if scene.compositing == "occlusion":
             return occlude_batched(occlusion_planes(scene), PART_BYTES)
-        composite = _gather if scene.compositing == "gather" else _scatter
-        index, weight = scene.sorted_layers
-        plane, psfs, batch = scene.plane, scene.psfs, len(scene.image)
-        own = index[:, None].expand(batch, -1, -1, -1)
-        weight = None if weight is None else weight[:, None].expand(batch, -1, -1, -1)
-        parts = _parts(plane, len(psfs))
-        if len(parts) == 1:
-            return composite(plane, psfs, own, weight)
-        found = [composite(plane[p], psfs, own[p], None if weight is None else weight[p]) for p in parts]
-        return torch.cat(found)
+        return blend(scene, _Sums(scene))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the planes, of the PSFs and of the layers' weights."""
         if scene.compositing == "occlusion":
             return occlusion_gradients(occlusion_planes(scene), gradient, PART_BYTES)
-        plane, psfs = scene.plane, scene.psfs
-        weights = weights_of_layers(*scene.sorted_layers, len(psfs), plane.dtype)  # (B or 1, D, 1, h, w)
-        if scene.compositing == "gather":
-            return _gather_gradients(plane, psfs, weights, gradient)
-        return _scatter_gradients(plane, psfs, weights, gradient)
+        return blend_gradients(scene, _Sums(scene), gradient)
 
 
-def weights_of_layers(index: Tensor, weight: Tensor | None, count: int, dtype: torch.dtype) -> Tensor:
-    """Return the weights of all layers at every pixel, (B or 1, D, 1, h, w), from (B or 1, h, w) layers."""
-    layers = torch.arange(count, device=index.device)[:, None, None]
-    own = weight_of_layer(index[:, None], None if weight is None else weight[:, None], layers)
-    return own.to(dtype)[:, :, None]
+class _Sums:
+    """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`."""
 
+    def __init__(self, scene: LayeredScene) -> None:
+        self.psfs, self.side = scene.psfs.detach(), scene.psfs.shape[-1]
+        self.index, weight = scene.sorted_layers
+        self.weight = None if weight is None else weight.detach()
 
-def _parts(plane: Tensor, layers: int) -> list[slice]:
-    """Return the images that are worked on together, in as few parts as memory allows."""
-    batch, channels, height, width = plane.shape
-    one = channels * layers * next_fast_size(height) * next_fast_size(width) * plane.element_size()
-    together = max(1, PART_BYTES // one)
-    return [slice(first, first + together) for first in range(0, batch, together)]
+    def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
+        size, found = (plane.shape[-2], plane.shape[-1]), []
+        psfs = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
+        for part in self._parts(plane, size):
+            blurred = from_spectrum(to_spectrum(plane[part], size)[:, None] * psfs, size, self.side)
+            index, weight = self._labels(part)
+            places = index[:, None, None].expand(len(blurred), 1, plane.shape[1], -1, -1)
+            below = blurred.gather(1, places)[:, 0]
+            if weight is not None and len(psfs) > 1:
+                above = blurred.gather(1, (places + 1).clamp_(max=len(psfs) - 1))[:, 0]
+                below = above - below if weight_gradient else torch.lerp(below, above, weight[:, None])
+            found.append(below)
+        return found[0] if len(found) == 1 else torch.cat(found)
 
+    def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
+        size, found = (pixels.shape[-2] + self.side - 1, pixels.shape[-1] + self.side - 1), []
+        psfs = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
+        for part in self._parts(pixels, size):
+            spectra = to_spectrum(self._own(pixels, part), size) * psfs
+            found.append(from_spectrum(spectra.sum(1), size, 1))
+        return found[0] if len(found) == 1 else torch.cat(found)
 
-def _gather(plane: Tensor, psfs: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
-    """(B, C, h, w) of plane (B, C, H', W'), psfs (D, C, P, P), index and weight (B, 1, h, w)."""
-    size, side = (plane.shape[-2], plane.shape[-1]), psfs.shape[-1]
-    spectra = to_spectrum(plane, size)[:, None] * to_spectrum(psfs, size)
-    blurred = from_spectrum(spectra, size, side)
-    places = index[:, :, None].expand(-1, -1, plane.shape[1], -1, -1)
-    below = blurred.gather(1, places)[:, 0]
-    if weight is None or len(psfs) == 1:
-        return below
-    return torch.lerp(below, blurred.gather(1, (places + 1).clamp_(max=len(psfs) - 1))[:, 0], weight)
+    def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
+        size, found = (plane.shape[-2], plane.shape[-1]), []
+        for part in self._parts(plane, size):
+            own, light = to_spectrum(self._own(pixels, part), size), to_spectrum(plane[part], size)[:, None]
+            found.append((own.conj() * light).sum(0))
+        psfs = from_spectrum(sum(found[1:], found[0]), size, 1)[..., : self.side, : self.side]
+        return psfs if correlate else psfs.flip((-2, -1))
 
+    def _labels(self, part: slice) -> tuple[Tensor, Tensor | None]:
+        own = slice(None) if len(self.index) == 1 else part
+        return self.index[own], None if self.weight is None else self.weight[own]
 
-def _scatter(plane: Tensor, psfs: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
-    """(B, C, h, w) of plane (B, C, H', W'), psfs (D, C, P, P), index and weight (B, 1, H', W')."""
-    size, side = (plane.shape[-2], plane.shape[-1]), psfs.shape[-1]
-    own = weights_of_layers(index[:, 0], None if weight is None else weight[:, 0], len(psfs), plane.dtype)
-    spectra = to_spectrum(own * plane[:, None], size) * to_spectrum(psfs, size)
-    return from_spectrum(spectra.sum(1), size, side)
+    def _own(self, pixels: Tensor, part: slice) -> Tensor:
+        """Return the light of each layer's own pixels, (B, D, C, h, w)."""
+        index, weight = self._labels(part)
+        layers = torch.arange(len(self.psfs), device=index.device)[:, None, None]
+        own = weight_of_layer(index[:, None], None if weight is None else weight[:, None], layers)
+        return own.to(pixels.dtype)[:, :, None] * pixels[part, None]
 
-
-def _gather_gradients(plane: Tensor, psfs: Tensor, weights: Tensor, gradient: Tensor) -> GradientPairs:
-    given = plane, psfs, weights
-    of_plane, of_psfs, of_weights = (torch.zeros_like(x) if wants_gradient(x) else None for x in given)
-    size, side = (plane.shape[-2], plane.shape[-1]), psfs.shape[-1]
-    with torch.no_grad():
-        for part in _parts(plane, len(psfs)):
-            grad, own = gradient[part, None], weights if len(weights) == 1 else weights[part]
-            if of_plane is not None or of_psfs is not None:
-                spread = to_spectrum(own * grad, size)
-            if of_psfs is not None:
-                light = to_spectrum(plane[part], size)[:, None]
-                of_psfs += psf_gradient((spread.conj() * light).sum(0), size, side)
-            if of_plane is not None:
-                flipped = to_spectrum(psfs.flip((-2, -1)), size)
-                of_plane[part] = from_spectrum((spread * flipped).sum(1), size, 1)
-            if of_weights is not None:
-                spectra = to_spectrum(plane[part], size)[:, None] * to_spectrum(psfs, size)
-                found = (from_spectrum(spectra, size, side) * grad).sum(2, keepdim=True)
-                _add(of_weights, found, part)
-    return gradient_pairs(given, (of_plane, of_psfs, of_weights))
-
-
-def _scatter_gradients(plane: Tensor, psfs: Tensor, weights: Tensor, gradient: Tensor) -> GradientPairs:
-    given = plane, psfs, weights
-    of_plane, of_psfs, of_weights = (torch.zeros_like(x) if wants_gradient(x) else None for x in given)
-    size, side = (plane.shape[-2], plane.shape[-1]), psfs.shape[-1]
-    with torch.no_grad():
-        for part in _parts(plane, len(psfs)):
-            grad, own = to_spectrum(gradient[part], size)[:, None], weights if len(weights) == 1 else weights[part]
-            if of_psfs is not None:
-                light = to_spectrum(own * plane[part, None], size)
-                of_psfs += psf_gradient((grad.conj() * light).sum(0), size, side)
-            if of_plane is not None or of_weights is not None:
-                blurred = from_spectrum(grad * to_spectrum(psfs.flip((-2, -1)), size), size, 1)
-                if of_plane is not None:
-                    of_plane[part] = (own * blurred).sum(1)
-                if of_weights is not None:
-                    _add(of_weights, (blurred * plane[part, None]).sum(2, keepdim=True), part)
-    return gradient_pairs(given, (of_plane, of_psfs, of_weights))
-
-
-def psf_gradient(product: Tensor, size: tuple[int, int], side: int) -> Tensor:
-    """Return the gradient of PSFs from the spectrum of light correlated with the gradient of the blurred light.
-
-    Args:
-        product: conjugate spectrum of the gradient times that of the light.
-        size: of the padded plane.
-        side: of the PSFs.
-    """
-    return from_spectrum(product, size, 1)[..., :side, :side].flip((-2, -1))
-
-
-def _add(total: Tensor, found: Tensor, part: slice) -> None:
-    """Add the gradient of a part's weights; a batch may share them."""
-    if len(total) == 1:
-        total += found.sum(0, keepdim=True)
-    else:
-        total[part] += found
+    def _parts(self, plane: Tensor, size: tuple[int, int]) -> list[slice]:
+        """Return the images that are worked on together, in as few parts as memory allows."""
+        one = plane.shape[1] * len(self.psfs) * next_fast_size(size[0]) * next_fast_size(size[1]) * plane.element_size()
+        together = max(1, PART_BYTES // one)
+        return [slice(first, first + together) for first in range(0, len(plane), together)]

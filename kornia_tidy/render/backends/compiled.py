@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops, overlap_ops
 from kornia_tidy.kernels.build import REALS, compiled
@@ -21,6 +20,7 @@ from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
+from kornia_tidy.render.backends.layer_sums import blend, blend_gradients
 from kornia_tidy.render.backends.tile_plan import WINDOWS, Grid, tile_grid
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
@@ -69,41 +69,14 @@ class CompiledBackend:
         if scene.compositing == "occlusion":
             light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
             return occlusion_direct(light, psfs, index, weight, mean, stray_light, inside)
-        labels, light, side = (scene.labels.layer_index, scene.labels.layer_weight), scene.plane, scene.psfs.shape[-1]
-        if _goes_directly(scene):
-            return gather_direct(light, scene.psfs, *labels)
-        if scene.compositing == "gather":
-            return gather_overlap(light, scene.psfs, *labels, window_size(side))
-        spread = scatter_overlap(light, scene.psfs, *labels, window_size(side))
-        return spread[..., side - 1 : light.shape[-2], side - 1 : light.shape[-1]]
+        return blend(scene, _Sums(scene))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the padded planes, of the PSFs and of the layer weight."""
         keep_memory()
-        labels, layers, side = scene.labels, len(scene.psfs), scene.psfs.shape[-1]
         if scene.compositing == "occlusion":
             return _occlusion_gradients(scene, gradient)
-        tensors, size = (scene.plane, scene.psfs, scene.batch_weight), window_size(side)
-        plane, psfs, index, weight = tensors[0].detach(), scene.psfs.detach(), labels.layer_index, labels.layer_weight
-        of_plane = of_psfs = of_weight = None
-        # Labels of depth belong to the gradient's pixels for gather, and to those of the light for scatter.
-        scatters = scene.compositing == "scatter"
-        window, pixels = (pad(gradient, (side - 1,) * 4), plane) if scatters else (plane, gradient)
-        if wants_gradient(tensors[0]):
-            transpose, light = (gather_overlap, window) if scatters else (scatter_overlap, pixels)
-            of_plane = transpose(light, psfs, index, weight, size, correlate=True)
-        if wants_gradient(tensors[1]) and _goes_directly(scene):
-            of_psfs = gather_direct_psf_gradient(plane, gradient, index, weight, layers)
-        elif wants_gradient(tensors[1]):
-            of_psfs = overlap_psf_gradient(window, pixels, index, weight, layers, size, correlate=scatters)
-        if wants_gradient(tensors[2]):
-            more = (
-                gather_direct(plane, psfs, index, weight, weight_gradient=True)
-                if _goes_directly(scene)
-                else gather_overlap(window, psfs, index, weight, size, correlate=scatters, weight_gradient=True)
-            )
-            of_weight = more.mul_(pixels).sum(1)
-        return gradient_pairs(tensors, (of_plane, of_psfs, of_weight))
+        return blend_gradients(scene, _Sums(scene), gradient)
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work: of occlusion as the C code counts it, of windows with the layers in a sample of pixels."""
@@ -125,6 +98,29 @@ class CompiledBackend:
         operations = words * (operations + _WINDOW * grid.blocks + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
         planes = layers + _WINDOW_PLANES * torch.get_num_threads()
         return Work(operations, planes * itemsize * size**2 + 3 * image + kept, size)
+
+
+class _Sums:
+    """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`."""
+
+    def __init__(self, scene: LayeredScene) -> None:
+        self.psfs, self.labels = scene.psfs.detach(), (scene.labels.layer_index, scene.labels.layer_weight)
+        self.size, self.directly = window_size(scene.psfs.shape[-1]), _goes_directly(scene)
+
+    def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
+        if self.directly:
+            return gather_direct(plane, self.psfs, *self.labels, weight_gradient=weight_gradient)
+        options = {"correlate": correlate, "weight_gradient": weight_gradient}
+        return gather_overlap(plane, self.psfs, *self.labels, self.size, **options)
+
+    def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
+        return scatter_overlap(pixels, self.psfs, *self.labels, self.size, correlate=correlate)
+
+    def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
+        given = plane, pixels, *self.labels, len(self.psfs)
+        if self.directly:
+            return gather_direct_psf_gradient(*given)
+        return overlap_psf_gradient(*given, self.size, correlate=correlate)
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:

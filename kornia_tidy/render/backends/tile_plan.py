@@ -70,7 +70,6 @@ class Grid:
         reach: pixels beyond its lower and right end in which a layer counts as a block's own.
         rows: blocks from top to bottom; the last ones may reach beyond the plane.
         columns: blocks from left to right.
-        spare: rows and columns by which the last blocks reach beyond the plane.
     """
 
     batch: int
@@ -82,7 +81,6 @@ class Grid:
     reach: int
     rows: int
     columns: int
-    spare: tuple[int, int]
 
     @classmethod
     def of(cls, shape: tuple[int, ...], psf_size: int, size: int, kind: TileKind | None = None) -> Grid:
@@ -101,8 +99,7 @@ class Grid:
         if not windowed:
             tile = min(tile, max(math.ceil(height / rows), math.ceil(width / (across * columns)), (size + 1) // 2))
             rows, columns = math.ceil(height / tile), math.ceil(width / (across * tile))
-        spare = rows * tile - height, columns * across * tile - width
-        return cls(batch, height, width, size, tile, across, reach, rows, columns, spare)
+        return cls(batch, height, width, size, tile, across, reach, rows, columns)
 
     @property
     def blocks(self) -> int:

@@ -143,13 +143,16 @@ class TileWorkspace:
         weight = self.plan.labels.layer_weight
         return Offsets(found[0], None if weight is None else (found[1], weight[images, y, x]))
 
-    def gather_from_planes(self, blended: Tensor, planes: Tensor, offsets: Offsets) -> None:
-        """Write each pixel's mean over its layers into ``blended``."""
+    def gather_from_planes(
+        self, blended: Tensor, planes: Tensor, offsets: Offsets, *, weight_gradient: bool = False
+    ) -> None:
+        """Write each pixel's mean over its layers into ``blended``, or its derivative to the next layer's weight."""
         floats = torch.view_as_real(planes)
         torch.take(floats, offsets.below, out=blended)
         if offsets.above is not None:
             above, weight = offsets.above
-            blended.lerp_(torch.take(floats, above, out=self._buffer("above", blended.shape)), weight)
+            nearer = torch.take(floats, above, out=self._buffer("above", blended.shape))
+            blended.copy_(nearer - blended) if weight_gradient else blended.lerp_(nearer, weight)
 
     def scatter_to_planes(self, light: Tensor, offsets: Offsets, chunk: Chunk) -> Tensor:
         """Split each pixel over the planes of its layers, the transpose of gathering: (pairs, size, size) complex."""
@@ -164,48 +167,20 @@ class TileWorkspace:
         floats.index_put_((offsets.below,), light)
         return planes
 
-
-class TileGradients:
-    """Gradients that a backward pass collects chunk by chunk, where they are wanted.
-
-    Args:
-        wanted: of plane, PSFs and layer weight.
-        plane: light.
-        workspace: of the pass.
-    """
-
-    def __init__(self, wanted: Sequence[bool], plane: Tensor, workspace: TileWorkspace) -> None:
-        self._plan = workspace.plan
-        self.plane = wanted[0]
-        self.psfs = workspace.no_spectra() if wanted[1] else None
-        self.layer_weight = plane.new_zeros(self._plan.labels.layer_index.shape) if wanted[2] else None
-
-    def add_layer_weight(self, blurred: Tensor, factor: Tensor, offsets: Offsets, chunk: Chunk) -> None:
-        """Add what a pixel gains when its light moves to the next layer, times the gradient or the light it has."""
-        assert self.layer_weight is not None
-        assert offsets.above is not None
-        floats = torch.view_as_real(blurred)
-        self.layer_weight[chunk.pixels] += (floats.take(offsets.above[0]) - floats.take(offsets.below)) * factor
-
-    def add_psfs(self, light: Tensor, own: Tensor, chunk: Chunk, channel: int) -> None:
-        """Add the correlation of the layers' own pixels with the light of their windows."""
-        assert self.psfs is not None
-        light, sums = torch.conj_physical(light), self.psfs[channel]
-        if not self._plan.by_slices:
+    def correlate(self, sums: Tensor, light: Tensor, own: Tensor, chunk: Chunk) -> None:
+        """Add the correlation of the layers' own pixels with the light of their windows to the spectra of a channel."""
+        light = torch.conj_physical(light)
+        if not self.plan.by_slices:
             sums.index_add_(0, chunk.layer, light.index_select(0, chunk.block).mul_(own))
             return
         for run in chunk.runs:
             sums[run.layers].addcmul_(light[run.block], own[run.pairs])
 
-    def of_psfs(self, psfs: Tensor, *, conjugate: bool) -> Tensor | None:
-        """Return the gradient of the PSFs, where it is wanted.
+    def psfs_of(self, spectra: Tensor) -> Tensor:
+        """Return PSFs (D, C, P, P) of spectra of the layers that are present; the others are zero.
 
         Left and right tiles correlate with themselves in the real part, with each other in the imaginary part.
         """
-        if self.psfs is None:
-            return None
-        side = psfs.shape[-1]
-        gradient = torch.zeros_like(psfs)
-        found = torch.fft.ifft2(self.psfs.conj() if conjugate else self.psfs).real[..., :side, :side]
-        gradient[self._plan.present] = found.transpose(0, 1)
-        return gradient
+        side, psfs = self.psfs.shape[-1], torch.zeros_like(self.psfs)
+        psfs[self.plan.present] = torch.fft.ifft2(spectra).real[..., :side, :side].transpose(0, 1)
+        return psfs

@@ -6,20 +6,19 @@ For the backward pass nothing is kept; spectra are computed again.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
+from kornia_tidy.render.backend import GradientPairs, Work, transform_operations
 from kornia_tidy.render.backends.allocator import keep_memory
-from kornia_tidy.render.backends.block_plan import BlockPlan, plan_blocks
+from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
+from kornia_tidy.render.backends.layer_sums import blend, blend_gradients
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, Grid, TileKind, tile_grid
-from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
+from kornia_tidy.render.backends.tile_workspace import TileWorkspace
 from kornia_tidy.render.backends.tiled_occlusion import occlude_tiled, occlusion_gradients
-from kornia_tidy.render.borders import pad_border
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 _PRODUCT = 6  # operations of a complex product
@@ -46,27 +45,18 @@ class TiledBackend:
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light."""
         keep_memory()
-        labels, layers, (kind, grid) = scene.labels, len(scene.psfs), self.tiles(scene)
+        kind, grid = self.tiles(scene)
         if scene.compositing == "occlusion":
-            return occlude_tiled(occlusion_planes(scene), labels, grid, kind)
-        if scene.compositing == "scatter":
-            return _scatter(scene.plane, scene.psfs, plan_blocks(labels, layers, grid, kind, offset=0))
-        plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, grid.spare)
-        return _gather(plane, scene.psfs, plan_blocks(labels, layers, grid, kind, scene.psfs.shape[-1] - 1))
+            return occlude_tiled(occlusion_planes(scene), scene.labels, grid, kind)
+        return blend(scene, _Sums(scene, kind, grid))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the padded planes and of the PSFs."""
         keep_memory()
-        labels, layers, (kind, grid) = scene.labels, len(scene.psfs), self.tiles(scene)
+        kind, grid = self.tiles(scene)
         if scene.compositing == "occlusion":
-            return occlusion_gradients(occlusion_planes(scene), labels, grid, kind, gradient)
-        scatters = scene.compositing == "scatter"
-        plan = plan_blocks(labels, layers, grid, kind, 0 if scatters else scene.psfs.shape[-1] - 1)
-        plane = pad_border(scene.image, scene.psfs.shape[-1] // 2, scene.border, (0, 0) if scatters else grid.spare)
-        tensors = plane, scene.psfs, scene.batch_weight
-        wanted = [wants_gradient(x) for x in tensors]
-        gradients = _scatter_gradients if scatters else gather_gradients
-        return gradient_pairs(tensors, gradients(tensors[0].detach(), scene.psfs.detach(), gradient, plan, wanted))
+            return occlusion_gradients(occlusion_planes(scene), scene.labels, grid, kind, gradient)
+        return blend_gradients(scene, _Sums(scene, kind, grid), gradient)
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work, with the layers in every eighth row and column of the tiles."""
@@ -93,84 +83,44 @@ class TiledBackend:
         return kind, tile_grid(tuple(scene.labels.layer_index.shape), scene.psfs.shape[-1], kind)
 
 
-def _gather(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
-    work = TileWorkspace(plan, psfs)
-    blended = plane.new_empty(*plane.shape[:2], plan.grid.height, plan.grid.width)
-    for chunk in plan.chunks:
-        offsets = work.offsets(chunk)
-        for c in range(psfs.shape[1]):
-            light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-            blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-            work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets)
-    return blended
+class _Sums:
+    """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`. Spectra are computed once for all three sums."""
 
+    def __init__(self, scene: LayeredScene, kind: TileKind, grid: Grid) -> None:
+        lost = scene.psfs.shape[-1] - 1
+        offset = 0 if scene.compositing == "scatter" else lost  # of a tile in its window
+        self.grid, self.lost = grid, lost
+        self.plan = plan_blocks(scene.labels, len(scene.psfs), grid, kind, offset)
+        self.work = TileWorkspace(self.plan, scene.psfs.detach())
 
-@torch.no_grad()
-def gather_gradients(
-    plane: Tensor, psfs: Tensor, grad: Tensor, plan: BlockPlan, wanted: Sequence[bool]
-) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Return the gradients of gathered light with respect to plane, PSFs and layer weight, where they are wanted.
-
-    Args:
-        plane: (B, C, H + P - 1, W + P - 1) light, or larger.
-        psfs: (D, C, P, P).
-        grad: (B, C, H, W) gradient of the gathered light.
-        plan: tiles of the (B, H, W) pixels.
-        wanted: of plane, PSFs and layer weight.
-    """
-    work = TileWorkspace(plan, psfs)
-    gradients = TileGradients(wanted, plane, work)
-    full = work.tiled_plane(plane) if gradients.plane else None
-    for chunk in plan.chunks:
-        offsets = work.offsets(chunk)
-        for c in range(psfs.shape[1]):
-            if gradients.plane or gradients.psfs is not None:
-                own = torch.fft.fft2(work.scatter_to_planes(grad[:, c][chunk.pixels], offsets, chunk))
-            if gradients.layer_weight is not None or gradients.psfs is not None:
+    def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
+        work, spectra = self.work, self.work.conjugate if correlate else self.work.spectra
+        blended = plane.new_empty(*plane.shape[:2], self.grid.height, self.grid.width)
+        for chunk in self.plan.chunks:
+            offsets = work.offsets(chunk)
+            for c in range(plane.shape[1]):
                 light = torch.fft.fft2(work.windows(plane[:, c], chunk))
-            if gradients.layer_weight is not None:
-                blurred = torch.fft.ifft2(work.blur(light, work.spectra[c], chunk))
-                gradients.add_layer_weight(blurred, grad[:, c][chunk.pixels], offsets, chunk)
-            if gradients.psfs is not None:
-                gradients.add_psfs(light, own, chunk, c)
-            if full is not None:
-                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.conjugate[c], chunk)), chunk)
-    if full is not None:
-        full = full[..., : plane.shape[-2], : plane.shape[-1]]
-    return full, gradients.of_psfs(psfs, conjugate=False), gradients.layer_weight
+                blurred = torch.fft.ifft2(work.blur(light, spectra[c], chunk))
+                work.gather_from_planes(blended[:, c][chunk.pixels], blurred, offsets, weight_gradient=weight_gradient)
+        return blended
 
+    def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
+        work, spectra = self.work, self.work.conjugate if correlate else self.work.spectra
+        full = work.tiled_plane(pixels)
+        for chunk in self.plan.chunks:
+            offsets = work.offsets(chunk)
+            for c in range(pixels.shape[1]):
+                own = torch.fft.fft2(work.scatter_to_planes(pixels[:, c][chunk.pixels], offsets, chunk))
+                work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, spectra[c], chunk)), chunk)
+        return full[..., : self.grid.height + self.lost, : self.grid.width + self.lost]
 
-def _scatter(plane: Tensor, psfs: Tensor, plan: BlockPlan) -> Tensor:
-    work = TileWorkspace(plan, psfs)
-    full = work.tiled_plane(plane)
-    for chunk in plan.chunks:
-        offsets = work.offsets(chunk)
-        for c in range(psfs.shape[1]):
-            own = torch.fft.fft2(work.scatter_to_planes(plane[:, c][chunk.pixels], offsets, chunk))
-            work.add_windows(full[:, c], torch.fft.ifft2(work.sum_layers(own, work.spectra[c], chunk)), chunk)
-    return full[..., psfs.shape[-1] - 1 : plane.shape[-2], psfs.shape[-1] - 1 : plane.shape[-1]]
-
-
-@torch.no_grad()
-def _scatter_gradients(
-    plane: Tensor, psfs: Tensor, grad: Tensor, plan: BlockPlan, wanted: Sequence[bool]
-) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    work = TileWorkspace(plan, psfs)
-    gradients = TileGradients(wanted, plane, work)
-    gathered = torch.empty_like(plane) if gradients.plane else None
-    full = torch.nn.functional.pad(grad, (psfs.shape[-1] - 1,) * 4)
-    for chunk in plan.chunks:
-        offsets = work.offsets(chunk)
-        for c in range(psfs.shape[1]):
-            light = torch.fft.fft2(work.windows(full[:, c], chunk))
-            pixels = plane[:, c][chunk.pixels]
-            if gradients.psfs is not None:
-                own = torch.fft.fft2(work.scatter_to_planes(pixels, offsets, chunk))
-                gradients.add_psfs(light, own, chunk, c)
-            if gathered is not None or gradients.layer_weight is not None:
-                blurred = torch.fft.ifft2(work.blur(light, work.conjugate[c], chunk))
-                if gradients.layer_weight is not None:
-                    gradients.add_layer_weight(blurred, pixels, offsets, chunk)
-                if gathered is not None:
-                    work.gather_from_planes(gathered[:, c][chunk.pixels], blurred, offsets)
-    return gathered, gradients.of_psfs(psfs, conjugate=True), gradients.layer_weight
+    def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
+        work = self.work
+        sums = work.no_spectra()
+        for chunk in self.plan.chunks:
+            offsets = work.offsets(chunk)
+            for c in range(plane.shape[1]):
+                own = torch.fft.fft2(work.scatter_to_planes(pixels[:, c][chunk.pixels], offsets, chunk))
+                light = torch.fft.fft2(work.windows(plane[:, c], chunk))
+                work.correlate(sums[c], light, own, chunk)
+        return work.psfs_of(sums.conj() if correlate else sums)

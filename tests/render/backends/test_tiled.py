@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, tile_grid
-from kornia_tidy.render.backends.tile_workspace import TileGradients, TileWorkspace
+from kornia_tidy.render.backends.tile_workspace import TileWorkspace
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
@@ -173,13 +173,13 @@ class TestTiledRender(RenderTester):
         results = []
         for by_slices in (True, False):
             work = TileWorkspace(replace(plan, by_slices=by_slices), bank.psfs)
-            gradients, found = TileGradients((False, True, False), plane, work), []
+            sums, found = work.no_spectra(), []
             for chunk, c in product(plan.chunks, range(2)):
                 light = torch.fft.fft2(work.windows(plane[:, c], chunk))
                 pairs = work.blur(light, work.spectra[c], chunk)
-                gradients.add_psfs(light, pairs, chunk, c)
+                work.correlate(sums[c], light, pairs, chunk)
                 found += [pairs.clone(), work.sum_layers(pairs.clone(), work.conjugate[c], chunk).clone()]
-            results.append([*found, gradients.of_psfs(bank.psfs, conjugate=False)])
+            results.append([*found, work.psfs_of(sums)])
         for one, other in zip(*results, strict=True):
             self.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
