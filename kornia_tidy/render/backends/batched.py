@@ -51,7 +51,7 @@ class _Sums:
     """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`."""
 
     def __init__(self, scene: LayeredScene) -> None:
-        self.psfs, self.side = scene.psfs.detach(), scene.psfs.shape[-1]
+        self.psfs, self.side, self.scatters = scene.psfs.detach(), scene.psfs.shape[-1], scene.compositing == "scatter"
         self.index, weight = scene.sorted_layers
         self.weight = None if weight is None else weight.detach()
 
@@ -70,7 +70,8 @@ class _Sums:
         return found[0] if len(found) == 1 else torch.cat(found)
 
     def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        size, found = (pixels.shape[-2] + self.side - 1, pixels.shape[-1] + self.side - 1), []
+        rim, found = 0 if self.scatters else self.side - 1, []  # of a capture it would be cut
+        size = pixels.shape[-2] + rim, pixels.shape[-1] + rim
         psfs = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
         for part in self._parts(pixels, size):
             spectra = to_spectrum(self._own(pixels, part), size) * psfs

@@ -35,7 +35,7 @@ class LayerSums(Protocol):
         ...
 
     def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        """Return (B, C, h + P - 1, w + P - 1) of pixels (B, C, h, w)."""
+        """Return (B, C, h + P - 1, w + P - 1) of pixels (B, C, h, w); of a scattered capture its middle is enough."""
         ...
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
