@@ -99,7 +99,7 @@ class LinearCamera(nn.Module):
     def _scene(self, channels: int, dtype: torch.dtype) -> tuple[list[Any], list[Any]]:
         """Return defocus, nodes, PSFs and stray light, and the options of the renderer."""
         dtype = torch.promote_types(dtype, torch.float64 if self.optics.fidelity.double else torch.float32)
-        now = self.optics.snapshot(dtype)
+        now = self.optics
         defocus = now.defocus(self.depth.to(dtype))
         bank: PSFBank = now.psf_model.scene_bank(channels, dtype, defocus)
         fidelity = now.psf_model.fidelity

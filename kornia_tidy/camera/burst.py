@@ -88,11 +88,11 @@ def burst(
         torch.Size([2, 3, 80, 80])
     """
     sample = read_sample(image, depth, optics)
-    now, shots = optics.snapshot(sample.dtype), []  # all shots see the masks of one moment
-    for k, share in enumerate(burst_shares(_dwell_shares(now, sample.dtype), dead_time, exposure)):
-        shot = now.through_moment(k).irradiance(sample)
+    shots = []
+    for k, share in enumerate(burst_shares(_dwell_shares(optics, sample.dtype), dead_time, exposure)):
+        shot = optics.through_moment(k).irradiance(sample)
         shot = shot * share.to(shot)
-        shots.append(shot if now.sensor is None else _sensor_for(now.sensor, share)(shot, generator=generator))
+        shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1).to(sample.image.dtype)
     return stack if sample.batched else stack[0]
 

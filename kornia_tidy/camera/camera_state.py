@@ -32,7 +32,7 @@ from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
+from kornia_tidy.runtime.mode import refuse_torchscript
 
 _SUBMODULES = ("masks", "camera", "modulator")
 COLOR_SPACES = ("srgb", "linear", "paper")
@@ -99,13 +99,11 @@ class CameraState(nn.Module):
         if name not in _SUBMODULES:
             super().__setattr__(name, value)
             return
-        with self.psf_model.lock:
-            self._swap(**{name: value})
-            super().__setattr__(name, value)
+        self._swap(**{name: value})
+        super().__setattr__(name, value)
 
     def _swap(self, **parts: Any) -> None:
-        with self.psf_model.lock:
-            self.psf_model = self.psf_model.replace(**parts)
+        self.psf_model = self.psf_model.replace(**parts)
 
     @abstractmethod
     def _replace(self, **attributes: Any) -> Self:
@@ -131,9 +129,8 @@ class CameraState(nn.Module):
             The side in pixels: at most ``fidelity.max_window``, or as wide as the lens's defocus disc; with a warning
             if that does not hold the share.
         """
-        with self.psf_model.lock:
-            self.psf_model = self.psf_model.with_window(None)
-            return self.psf_model.fitted.side
+        self.psf_model = self.psf_model.with_window(None)
+        return self.psf_model.fitted.side
 
     @overload
     def psf_bank(
@@ -174,13 +171,9 @@ class CameraState(nn.Module):
             defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
             states: return the PSFs of each state that the modulator shows, with their weights, not the average.
         """
-        model = self.psf_model
-        if not torch_mode() & Mode.TRACED:
-            with model.lock:  # the window and the masks of one moment
-                model = self.psf_model.snapshot(model.bank_dtype(dtype))
         if states:
-            return model.psf_bank(channels, dtype, defocus, states=True)
-        return model.psf_bank(channels, dtype, defocus)
+            return self.psf_model.psf_bank(channels, dtype, defocus, states=True)
+        return self.psf_model.psf_bank(channels, dtype, defocus)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
@@ -273,11 +266,10 @@ class CameraState(nn.Module):
 
     def get_extra_state(self) -> Tensor:
         """Return settings and window, uint8."""
-        with self.psf_model.lock:
-            window, fixed = self.psf_model.fitted, self.fidelity.window
-            return write_settings(
-                {**self.settings(), "window": window.side, "light_held": window.held, "fixed_window": fixed}
-            )
+        window, fixed = self.psf_model.fitted, self.fidelity.window
+        return write_settings(
+            {**self.settings(), "window": window.side, "light_held": window.held, "fixed_window": fixed}
+        )
 
     def set_extra_state(self, state: Tensor) -> None:
         """Take the window of a saved camera that has these settings.
@@ -320,15 +312,14 @@ class CameraState(nn.Module):
             >>> optics.load_state_dict(saved, take_over=True), optics.camera.pixel_pitch
             (<All keys matched successfully>, 9e-06)
         """
-        with self.psf_model.lock:  # captures of other threads see the camera before or after it
-            if take_over:
-                if EXTRA_STATE not in state_dict:
-                    raise ValueError(
-                        f"there are no settings to take over: the state has no entry {EXTRA_STATE!r}, only "
-                        f"{', '.join(state_dict) or 'nothing'}"
-                    )
-                self._take_over(read_settings(state_dict[EXTRA_STATE]))
-            return super().load_state_dict(state_dict, strict, assign)
+        if take_over:
+            if EXTRA_STATE not in state_dict:
+                raise ValueError(
+                    f"there are no settings to take over: the state has no entry {EXTRA_STATE!r}, only "
+                    f"{', '.join(state_dict) or 'nothing'}"
+                )
+            self._take_over(read_settings(state_dict[EXTRA_STATE]))
+        return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(
         self,

@@ -75,7 +75,6 @@ def moving_capture(
     if not batched:
         images, depths = images[None], depths[None]
     dtype = compute_dtype(images.dtype, optics.fidelity, images.device)
-    optics = optics.snapshot(dtype)  # every moment is of the same masks
     with torch.autocast(images.device.type, enabled=False):
         durations = optics.timeline(dtype).durations
         for name, scenes in (("images", images), ("depths", depths)):
@@ -90,7 +89,7 @@ def moving_capture(
             light = optics.through_moment(moment).irradiance(sample) * share
             total = light if moment == 0 else total + light
             clamped += optics.clamped_pixels
-        optics.notes.of_thread.clamped = clamped
+        optics.notes.clamped = clamped
         if optics.sensor is not None:
             total = optics.sensor(total, params=params, generator=generator)
         coded = optics.encode(total).to(images.dtype)

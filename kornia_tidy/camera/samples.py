@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -23,11 +22,23 @@ from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.runtime.precision import widest
-from kornia_tidy.runtime.threads import CaptureNotes
 
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
 ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
+
+
+@dataclass(eq=False)
+class Notes:
+    """What a camera remembers of its captures, and shares with the views of it that :meth:`with_fidelity` makes.
+
+    Args:
+        told: keys of the warnings that were given.
+        clamped: number of pixels of the last capture beyond the range of defocus.
+    """
+
+    told: set[Hashable] = field(default_factory=set)
+    clamped: Tensor | int = 0
 
 
 class Watchful(Protocol):
@@ -37,7 +48,7 @@ class Watchful(Protocol):
     check_inputs: bool
     holes: str
     color_space: str
-    notes: CaptureNotes
+    notes: Notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +189,7 @@ def check_light(image: Tensor, camera: Watchful) -> None:
     if camera.check_inputs and Mode.GRAPH not in torch_mode():
         said = check_image(image, encoded=camera.color_space != "linear")
         if said is not None:
-            tell_once(camera.notes, "image", said, stacklevel=7)
+            tell_once(camera.notes.told, "image", said, stacklevel=7)
 
 
 def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
@@ -230,7 +241,7 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
             lowest, highest = torch.minimum(lowest, extremes[0]), torch.maximum(highest, extremes[1])
         extremes = torch.stack([lowest, highest])
         pixels += own.numel()
-    camera.notes.of_thread.clamped = clamped
+    camera.notes.clamped = clamped
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
         tell_of_defocus(extremes, camera, pixels, int(clamped))
     return DefocusSpan(extremes if reach is None else reach, clamped)
@@ -255,7 +266,7 @@ def survey_scene(sample: Sample, defocus: Tensor, camera: Any) -> Tensor:
         span = survey_defocus([defocus], camera)
         return span.reach if fixed is None else torch.tensor(fixed, requires_grad=defocus.requires_grad)
     own, (lo, hi) = defocus.detach(), lens.defocus_range
-    camera.notes.of_thread.clamped = ((own < lo - ROUNDING) | (own > hi + ROUNDING)).sum() if own.numel() else 0
+    camera.notes.clamped = ((own < lo - ROUNDING) | (own > hi + ROUNDING)).sum() if own.numel() else 0
     if fixed is not None or not own.numel():
         return torch.tensor(fixed or (lo, hi), requires_grad=defocus.requires_grad)
     states, weights = camera.psf_model.states(sample.dtype)
@@ -289,12 +300,14 @@ def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped
     lens = camera.psf_model.camera
     said = misread_depth(lens, *extremes)
     if said is not None:
-        tell_once(camera.notes, "depth", said, stacklevel=7)
-    elif clamped and camera.notes.first_time("depths beyond the camera's range"):
+        tell_once(camera.notes.told, "depth", said, stacklevel=7)
+    elif clamped:
         (lo, hi), (lowest, highest) = lens.defocus_range, extremes.tolist()
-        warnings.warn(
+        tell_once(
+            camera.notes.told,
+            "depths beyond the camera's range",
             f"{clamped} of {pixels} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "
             f"the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
             f"ThinLensCamera.for_scene, or its depth_range)",
-            stacklevel=6,
+            stacklevel=7,
         )

@@ -13,6 +13,7 @@ from kornia_tidy.camera.advice import explain_capture, plan_capture
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.dataset_transform import DatasetTransform
 from kornia_tidy.camera.samples import (
+    Notes,
     Sample,
     check_light,
     compute_dtype,
@@ -35,7 +36,6 @@ from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.render.exposure import Rendering, render_pieces
 from kornia_tidy.runtime.mode import Mode, torch_mode, values_unread
-from kornia_tidy.runtime.threads import CaptureNotes
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.sensor.sensor import Sensor, check_sensor
 from kornia_tidy.systems.presets import published_system
@@ -106,8 +106,9 @@ class TiDyOptics(CameraState):
         - Noise comes from the global generator, from ``generator=``, or from ``params=`` drawn before by
           :meth:`draw`. ``eval()`` does not switch it off: a camera has noise at test time too.
         - The capture is detached inside a DataLoader's worker, and only there; see :meth:`as_transform`.
-        - Threads may share a camera: each capture sees masks, parts and window as they are at one moment. The order in
-          which threads draw from the global generator is open: give each capture its ``generator=``.
+        - Threads may share a camera while its masks and parts stand still. Where they change meanwhile, as in training,
+          give each thread its own copy (``copy.deepcopy``). The order in which threads draw from the global generator
+          is open: give each capture its ``generator=``.
         - ``state_dict()`` holds settings and PSF window too; see :class:`~kornia_tidy.camera.camera_state.CameraState`.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023.
@@ -167,7 +168,7 @@ class TiDyOptics(CameraState):
         self.check_inputs = check_inputs
         self.holes = holes
         self.memory_budget = memory_budget
-        self.notes = CaptureNotes()  # shared with cameras made by _replace
+        self.notes = Notes()  # shared with cameras made by _replace
 
     @classmethod
     def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
@@ -219,11 +220,10 @@ class TiDyOptics(CameraState):
         sample = read_sample(image, depth, self, generator, deferred=True)
         device, dtype = sample.image.device, sample.image.dtype
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
-            now = self.snapshot(sample.dtype)
             coded: Any = None
-            for rows, irradiance in now.strips(sample):
-                seen = now.encode(now.expose(irradiance, params, generator, rows)).to(dtype)
-                coded = seen if rows is None else placed(coded, seen, rows, now.height(sample))
+            for rows, irradiance in self.strips(sample):
+                seen = self.encode(self.expose(irradiance, params, generator, rows)).to(dtype)
+                coded = seen if rows is None else placed(coded, seen, rows, self.height(sample))
             return sample.coded(coded)
 
     def strips(self, sample: Sample) -> Iterator[tuple[slice | None, Tensor]]:
@@ -298,22 +298,8 @@ class TiDyOptics(CameraState):
         """Take a picture of an image and its depth. See :meth:`forward`."""
         return self.forward(image, depth, params, generator)
 
-    def snapshot(self, dtype: torch.dtype) -> Self:
-        """Return the camera as it is now, for one capture; later changes by other threads reach the next one.
-
-        Masks that another thread changes in place, as an optimiser does, are copied until they stand still. The parts
-        themselves are shared. The compiler sees the camera itself.
-
-        Args:
-            dtype: float32 or float64, in which the masks are needed.
-        """
-        if torch_mode() & Mode.TRACED:
-            return self
-        with self.psf_model.lock:
-            return self._replace(psf_model=self.psf_model.snapshot(dtype))
-
     def _replace(self, **attributes: Any) -> Self:
-        """Return a camera with other attributes. Parts, notes, lock and remembered PSFs are shared."""
+        """Return a camera with other attributes. Parts, notes and remembered PSFs are shared."""
         other = object.__new__(type(self))
         modules, parameters, buffers = dict(self._modules), dict(self._parameters), dict(self._buffers)
         vars(other).update(vars(self), _modules=modules, _parameters=parameters, _buffers=buffers, **attributes)
@@ -443,8 +429,8 @@ class TiDyOptics(CameraState):
     def clamped_pixels(self) -> int:
         """Pixels of the last capture whose defocus lay outside the camera's range and was clamped to its end.
 
-        Of a burst, those of one shot; of a moving scene, those of all its moments. Each thread sees those of the last
-        capture that it took itself, be it with this camera or with a view of it such as ``with_fidelity`` returns.
+        Of a burst, those of one shot; of a moving scene, those of all its moments. A capture by a view of this camera,
+        such as ``with_fidelity`` returns, or in another thread counts too.
         """
         return int(self.notes.clamped)
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Self, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_part, described, printed
-
-READS = 100  # attempts to read masks while another thread changes them; then the last reading is taken
+from kornia_tidy.runtime.mode import refuse_torchscript
 
 
 class Timeline(NamedTuple):
@@ -49,12 +47,6 @@ class Timeline(NamedTuple):
         """Fraction of the exposure's light in each state, (S,)."""
         return self.durations if self.mixture is None else (self.durations[:, None] * self.mixture).sum(0)
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> Timeline:
-        """Return the timeline with a function applied to each of its tensors."""
-        mixture = None if self.mixture is None else function(self.mixture)
-        middles = None if self.middles is None else function(self.middles)
-        return Timeline(function(self.states), function(self.durations), mixture, middles)
-
     def moment(self, index: int) -> tuple[Tensor, Tensor]:
         """Return the states of one moment, (S', N, N), and their weights, (S',), which sum to one."""
         if self.mixture is None:
@@ -90,46 +82,9 @@ def timeline_of(modulator: nn.Module, phase: Tensor) -> Timeline:
             its states follow one another in their order.
         phase: masks, (K, N, N) radians.
     """
+    if torch.jit.is_tracing():
+        refuse_torchscript()
     return modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
-
-
-def settled_timeline(masks: nn.Module, modulator: nn.Module, dtype: torch.dtype) -> Timeline:
-    """Return a copy of what a modulator shows of masks, read while no other thread changes their parameters.
-
-    Where other threads run, the parameters are compared before and after, and the states read again if they differ.
-
-    Args:
-        masks: the phase masks: a module with the property ``phase``.
-        modulator: turns their phase into states and weights.
-        dtype: float32 or float64.
-
-    Returns:
-        States in radians at 530 nm, and when they are shown. Gradients reach masks and modulator.
-
-    Convention:
-        - A thread that is halted in the middle of writing a parameter cannot be told from one that is done. Where that
-          matters, let it write through ``load_state_dict`` of the camera, or assign new masks: both are one step.
-
-    Example:
-        >>> from kornia_tidy import PixelwiseMask
-        >>> shown = settled_timeline(PixelwiseMask(2), DwellTimes(), torch.float64)
-        >>> shown.states.shape, shown.weights
-        (torch.Size([2, 23, 23]), tensor([0.5000, 0.5000], dtype=torch.float64))
-    """
-    # An accelerator makes one change after the other, so that no read of it is torn.
-    watched = () if threading.active_count() == 1 else (masks, modulator)
-    for _ in range(READS):
-        before = [x.detach().clone() for part in watched for x in part.parameters() if x.device.type == "cpu"]
-        phase = cast("Tensor", masks.phase).to(dtype)
-        shown = modulator.timeline(phase) if isinstance(modulator, Modulator) else Timeline(*modulator(phase))
-        if shown.mixture is None and shown.middles is None:
-            shown = Timeline(shown.states.clone(), shown.durations.clone())
-        else:
-            shown = shown.map(Tensor.clone)
-        after = [x for part in watched for x in part.parameters() if x.device.type == "cpu"]
-        if all(map(torch.equal, before, after)):
-            break
-    return shown
 
 
 class Modulator(nn.Module):

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.runtime.threads import CaptureNotes
 
 if TYPE_CHECKING:
     from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
@@ -27,19 +26,21 @@ FARTHEST = 1e5  # m; a farther pixel is sky, whose value no depth map in millime
 UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"))
 FAR_WHOLE = 500.0  # m; nearer depths may well be stored as whole numbers of several metres each
 
-_NOTES = CaptureNotes()  # warnings that were given in this process
+_TOLD: set[Hashable] = set()  # warnings that were given in this process
 
 
-def tell_once(notes: CaptureNotes | None, key: Hashable, sentence: str, stacklevel: int = 3) -> None:
-    """Give a warning the first time that its key occurs. It is safe to call from several threads.
+def tell_once(told: set[Hashable] | None, key: Hashable, sentence: str, stacklevel: int = 3) -> None:
+    """Give a warning the first time that its key occurs.
 
     Args:
-        notes: keys that were warned of before, kept by a camera. None: those of the whole process.
+        told: keys that were warned of before, to which this one is added. None: those of the whole process.
         key: identifies the warning.
         sentence: text of the warning.
         stacklevel: as for ``warnings.warn``.
     """
-    if (_NOTES if notes is None else notes).first_time(key):
+    told = _TOLD if told is None else told
+    if key not in told:
+        told.add(key)
         warnings.warn(sentence, stacklevel=stacklevel)
 
 

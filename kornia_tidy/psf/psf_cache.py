@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.runtime.threads import SharedLock
 
 KINDS = 4  # banks remembered side by side: of RGB and of grey images, in float32 and in float64
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among them, which are no plain attributes
@@ -25,14 +24,13 @@ class _Remembered:
     weights: Tensor
     psfs: dict[float, Tensor] = field(default_factory=dict)
     last: tuple[Hashable, PSFBank] | None = None  # the bank asked for last, ready to be rendered through
-    lock: SharedLock = field(default_factory=SharedLock)
 
 
 class BankMemory:
     """Remembers PSFs by their defocus: of each kind of bank those for one setting of masks and camera at a time.
 
     The masks are compared by value, so a PSF that no longer holds is never given out, however they were changed.
-    For use without gradients, by any number of threads: one computes a PSF, others that need it wait for it.
+    For use without gradients, by any number of threads: what they put here is not changed, but replaced at once.
 
     Example:
         >>> asked = []
@@ -47,7 +45,6 @@ class BankMemory:
     """
 
     def __init__(self) -> None:
-        self._lock = SharedLock()
         self._banks: dict[Hashable, _Remembered] = {}  # the one used last stands last
 
     def recall(
@@ -65,7 +62,7 @@ class BankMemory:
         Args:
             kind: of bank, such as its spectrum. Banks of another kind, data type or device are remembered beside it.
             setting: whatever else the PSFs depend on, compared by equality.
-            states: phases shown, (S, N, N), which no other thread changes meanwhile.
+            states: phases shown, (S, N, N).
             weights: share of the exposure of each, (S,).
             defocus: nodes in radians.
             build: makes a bank of these states, before anything is done about stray light, for some nodes.
@@ -74,29 +71,26 @@ class BankMemory:
         """
         with torch.inference_mode(False), torch.no_grad():  # remembered PSFs serve in training too
             kind = (kind, states.dtype, states.device)
-            with self._lock:
-                known = self._banks.pop(kind, None)
-                if (
-                    known is None
-                    or known.setting != setting
-                    or not (torch.equal(known.states, states) and torch.equal(known.weights, weights))
-                ):
-                    known = _Remembered(setting, states.clone(), weights.clone())
-                    while len(self._banks) >= KINDS:
-                        del self._banks[next(iter(self._banks))]
-                self._banks[kind] = known
-            with known.lock:  # other kinds need not wait for it
-                if stray_light is not None and known.last is not None and known.last[0] == (defocus, stray_light):
-                    return known.last[1]
-                missing = tuple(psi for psi in defocus if psi not in known.psfs)
-                if missing:
-                    known.psfs.update(zip(missing, build(missing).psfs, strict=True))
-                psfs = torch.stack([known.psfs[psi] for psi in defocus])
-                bank = PSFBank(psfs, psfs.new_tensor(defocus), psfs.sum((2, 3)))
-                if stray_light is not None:
-                    bank = bank.with_stray_light(*stray_light)
-                    known.last = (defocus, stray_light), bank
-                return bank
+            known = self._banks.get(kind)
+            if (
+                known is None
+                or known.setting != setting
+                or not (torch.equal(known.states, states) and torch.equal(known.weights, weights))
+            ):
+                known = _Remembered(setting, states.clone(), weights.clone())
+            others = [(other, bank) for other, bank in self._banks.items() if other != kind]
+            self._banks = {**dict(others[1 - KINDS :]), kind: known}
+            if stray_light is not None and (last := known.last) is not None and last[0] == (defocus, stray_light):
+                return last[1]
+            missing = tuple(psi for psi in defocus if psi not in known.psfs)
+            if missing:
+                known.psfs.update(zip(missing, build(missing).psfs, strict=True))
+            psfs = torch.stack([known.psfs[psi] for psi in defocus])
+            bank = PSFBank(psfs, psfs.new_tensor(defocus), psfs.sum((2, 3)))
+            if stray_light is not None:
+                bank = bank.with_stray_light(*stray_light)
+                known.last = (defocus, stray_light), bank
+            return bank
 
 
 def plain_attributes(*parts: nn.Module) -> list[Any]:

@@ -16,7 +16,7 @@ from kornia_tidy.checks import check_finite, check_part
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, central_square
 from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.modulator.modulator import DwellTimes, Timeline, settled_timeline, timeline_of
+from kornia_tidy.modulator.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.aperture import check_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
@@ -41,8 +41,7 @@ from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur, blurs_widely, wide_blur, window_of
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
-from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
-from kornia_tidy.runtime.threads import SharedLock
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 EACH = -1  # in the place of a state: all of them, each for itself, in one bank
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
@@ -95,8 +94,6 @@ class PSFModel:
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
     measured_cut: bool  # whether measured PSFs are zero somewhere
-    shown: Timeline | None  # what a snapshot shows, which masks that change leave alone
-    lock: SharedLock  # held while masks are read, and by whoever changes several of them at once
 
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _derived: Derived
@@ -113,8 +110,7 @@ class PSFModel:
         spectrum: Spectrum | None = None,
         aperture: Tensor | None = None,
     ) -> None:
-        unset = dict.fromkeys(("measured", "state", "moment", "shown"))
-        vars(self).update(unset, measured_cut=False, lock=SharedLock(), _memories={})
+        vars(self).update(measured=None, state=None, moment=None, measured_cut=False, _memories={})
         parts = self.replace(
             fidelity=Fidelity.of(fidelity),
             masks=PixelwiseMask() if masks is None else masks,
@@ -162,12 +158,10 @@ class PSFModel:
             fidelity, spectrum = parts.get("fidelity") or self.fidelity, parts.get("spectrum") or self.spectrum
             most = fidelity.wavelengths
             parts["_sampled"] = spectrum if most is None else bin_spectrum(spectrum, most)
-        if "masks" in parts or "modulator" in parts:
-            parts["shown"] = None
         return self._replace(_derived=Derived(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
-        """Return a model with other fields. What is not replaced is shared: parts, lock and remembered PSFs."""
+        """Return a model with other fields. What is not replaced is shared: parts and remembered PSFs."""
         other = object.__new__(type(self))
         vars(other).update(vars(self), **fields)
         return other
@@ -221,12 +215,11 @@ class PSFModel:
                 raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
             bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
-        now = self.snapshot(dtype)
-        nodes, stray_light = now.defocus_nodes if defocus is None else tuple(defocus), now.fidelity.stray_light
+        nodes, stray_light = self.defocus_nodes if defocus is None else tuple(defocus), self.fidelity.stray_light
         if not states:
-            return now._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(stray_light)
-        weights = now.state_weights(dtype)
-        banks = [now._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
+            return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(stray_light)
+        weights = self.state_weights(dtype)
+        banks = [self._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
         return StateBank.of([bank.with_stray_light(stray_light) for bank in banks], weights)
 
     def bank_dtype(self, dtype: torch.dtype | None) -> torch.dtype:
@@ -299,8 +292,7 @@ class PSFModel:
         states, weights = self.states(dtype)
         if state is not None and state != EACH:
             states, weights = states[state : state + 1], torch.ones_like(weights[:1])
-        derived = self._derived
-        side, grid = self.window if derived.window is None else derived.window.side, 1
+        side, grid = self.window, 1
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
@@ -367,7 +359,7 @@ class PSFModel:
 
     def states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Return the phase of each state over the pupil, (S, N, N) radians, and its share of the exposure, (S,)."""
-        shown = self.timeline(dtype) if self.shown is None or self.shown.states.dtype != dtype else self.shown
+        shown = timeline_of(self.modulator, self.masks.phase.to(dtype))
         if self.moment is not None:
             states, weights = shown.moment(self.moment)
         else:
@@ -378,32 +370,7 @@ class PSFModel:
 
     def timeline(self, dtype: torch.dtype) -> Timeline:
         """Return what the modulator shows of the masks during one exposure, and when."""
-        if torch.jit.is_tracing():
-            refuse_torchscript()
-        if self.shown is not None:
-            return self.shown.map(lambda part: part.to(dtype))
         return timeline_of(self.modulator, self.masks.phase.to(dtype))
-
-    def snapshot(self, dtype: torch.dtype) -> Self:
-        """Return this model with its masks as they are now, for one capture: later changes are seen by the next one.
-
-        Masks that another thread changes in place, as an optimiser does, are copied until they stand still. The parts
-        themselves are shared; memories too. The compiler sees the model itself.
-
-        Args:
-            dtype: float32 or float64, in which the masks are needed.
-        """
-        if torch.jit.is_tracing():
-            refuse_torchscript()
-        if self.shown is not None or torch_mode() & Mode.TRACED:
-            return self
-        with self.lock:
-            shown, derived = settled_timeline(self.masks, self.modulator, dtype), self._derived
-            if derived.blur is not None and not is_flat(shown.states):  # masks that were flat have been learnt
-                derived.blur, derived.window = None, None
-            if derived.window is None:
-                _ = self.fitted, self.pupil  # found here, once for all threads
-            return self._replace(shown=shown)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
@@ -541,11 +508,12 @@ class PSFModel:
     @property
     def fitted(self) -> FittedWindow:
         """The window and the share of the light in it, measured with the masks as they were at the first look."""
-        with self.lock:
-            if self._derived.window is None:
-                self._derived.window = self._fitted_window()
-                self._derived.window.warn_if_small(self.fidelity, stacklevel=3)
-            return self._derived.window
+        _ = self.wide_blur  # which drops the window of flat masks that have been learnt since
+        derived = self._derived
+        if derived.window is None:
+            derived.window = self._fitted_window()
+            derived.window.warn_if_small(self.fidelity, stacklevel=3)
+        return derived.window
 
     def _fitted_window(self) -> FittedWindow:
         if self.measured is not None:
@@ -633,8 +601,12 @@ class PSFModel:
         Found with the masks as they were at the first look, and dropped as soon as they are no longer flat.
         """
         derived = self._derived
-        if not derived.blur_known and Mode.GRAPH not in torch_mode():
+        if (derived.blur is None and derived.blur_known) or Mode.GRAPH in torch_mode():
+            return derived.blur
+        if not derived.blur_known:
             derived.blur, derived.blur_known = self._find_wide_blur(), True
+        elif not is_flat(self.states(torch.float32)[0]):
+            derived.blur, derived.window = None, None
         return derived.blur
 
     def _find_wide_blur(self) -> WideBlur | None:

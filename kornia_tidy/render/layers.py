@@ -69,13 +69,14 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         >>> index.flatten().tolist(), weight.flatten().tolist()
         ([0, 1, 1, 1], [0.0, 0.125, 0.75, 1.0])
     """
-    check_choice("layers", mode, LAYER_MODES)
+    if mode not in LAYER_MODES:
+        check_choice("layers", mode, LAYER_MODES)
     check_float_tensor("nodes", nodes, 1, "(D,)")
-    if nodes.device.type == "cpu":
-        check_nodes(nodes)
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
     spacing = None if Mode.TRANSFORM in torch_mode() else _even_spacing(nodes)
+    if spacing is None and nodes.device.type == "cpu":
+        check_nodes(nodes)
     if mode == "nearest" and spacing is not None:
         steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
         return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
@@ -85,8 +86,8 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
         return index, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
     if spacing is not None:
         steps = (defocus - nodes[0]).div_(spacing).clamp_(0, len(nodes) - 1)
-        index = steps.detach().floor().clamp_(max=len(nodes) - 2)
-        return index.long(), steps - index
+        index = steps.detach().long().clamp_(max=len(nodes) - 2)
+        return index, steps - index
     clamped = defocus.clamp(nodes[0], nodes[-1])
     # Inner nodes only: the end nodes belong to the first and last interval.
     index = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
@@ -104,7 +105,7 @@ def check_nodes(nodes: Tensor) -> None:
 
 
 def _even_spacing(nodes: Tensor) -> Tensor | None:
-    """Return the distance between nodes if it is the same everywhere, to rounding: a search takes ten times as long.
+    """Return the distance between ascending nodes if it is the same, to rounding: a search takes ten times as long.
 
     None too where nodes are learnt, or on a device that one would have to wait for.
     """
@@ -113,7 +114,7 @@ def _even_spacing(nodes: Tensor) -> Tensor | None:
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
     even = nodes[0] + spacing * torch.arange(len(nodes), dtype=nodes.dtype)
     rounding = 4 * torch.finfo(nodes.dtype).eps * nodes.abs().max()
-    return spacing if bool(((nodes - even).abs() <= rounding).all()) else None
+    return spacing if bool((((nodes - even).abs() <= rounding) & (spacing > 2 * rounding)).all()) else None
 
 
 def weight_of_layer(layer_index: Tensor, layer_weight: Tensor | None, layer: int | Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from kornia_tidy.render.dispatch import (
     scene_gradients,
 )
 from kornia_tidy.render.layers import check_nodes
-from kornia_tidy.render.scene import SceneArguments, assigned_scene, check_scene, layered_scene, remembered_scene
+from kornia_tidy.render.scene import assigned_scene, check_scene, layered_scene
 from kornia_tidy.runtime.mode import Mode, recording_in_operator, torch_mode
 
 _SCENE = (
@@ -92,7 +92,7 @@ def _render(*arguments: Any) -> Tensor:
     if not len(image):
         return _render_fake(*arguments)
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
-        scene = remembered_scene(SceneArguments._make(arguments[:-1]))
+        scene = assigned_scene(*arguments[:-1])
         return render_unrecorded(choose(scene, method), scene).contiguous()
 
 
@@ -106,10 +106,10 @@ def _gradients(*arguments: Any) -> list[Tensor]:
     tensors, options, (method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:-3], arguments[-3:]
     if not len(gradient):
         return [torch.zeros_like(x) for x, want in zip(tensors, wanted, strict=True) if want and x is not None]
-    own = leaves_of(tensors, wanted)
+    own: list[Any] = leaves_of(tensors, wanted)
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
-        scene = assigned_scene(SceneArguments._make((*own, *options)))
+        scene = assigned_scene(*own, *options)
         found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
     return [
         torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
@@ -137,8 +137,8 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     rest = [None] * len(ctx.options)
     if torch.is_grad_enabled():  # it is differentiated in turn
 
-        def render(*tensors: Tensor | None) -> Tensor:
-            return render_unrecorded(DenseBackend(), assigned_scene(SceneArguments._make((*tensors, *options))))
+        def render(*tensors: Any) -> Tensor:
+            return render_unrecorded(DenseBackend(), assigned_scene(*tensors, *options))
 
         with torch.autocast(gradient.device.type, enabled=False):
             return *differentiable_gradients(render, tensors, gradient, wanted), *rest

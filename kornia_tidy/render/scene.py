@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +13,6 @@ from kornia_tidy.render.borders import BORDERS, check_border, pad_border, padded
 from kornia_tidy.render.layers import assign_layers, check_nodes
 
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
-LARGEST_REMEMBERED = 1 << 20  # pixels of a defocus map: some 24 MB with their layers
 
 
 @dataclass(frozen=True)
@@ -121,20 +119,6 @@ class LayeredScene:
         return self.found["sampled_layers"]
 
 
-class SceneArguments(NamedTuple):
-    """The arguments of :func:`layered_scene` in one value, in the order of the renderer's operator."""
-
-    image: Tensor
-    defocus: Tensor
-    nodes: Tensor
-    psfs: Tensor
-    stray_light: Tensor | None
-    compositing: str
-    layers: str
-    border: str
-    correlate: bool
-
-
 def layered_scene(
     image: Tensor,
     defocus: Tensor,
@@ -177,14 +161,21 @@ def layered_scene(
     check_scene(image, defocus, nodes, psfs, stray_light, border)
     if nodes.device.type != "cpu":
         check_nodes(nodes)
-    return assigned_scene(
-        SceneArguments(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
-    )
+    return assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
 
 
-def assigned_scene(given: SceneArguments) -> LayeredScene:
+def assigned_scene(
+    image: Tensor,
+    defocus: Tensor,
+    nodes: Tensor,
+    psfs: Tensor,
+    stray_light: Tensor | None,
+    compositing: str,
+    layers: str,
+    border: str,
+    correlate: bool,
+) -> LayeredScene:
     """Return the scene of :func:`layered_scene`, whose tensors were checked before."""
-    image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate = given
     dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
     index, weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
     return scene_of_layers(
@@ -196,51 +187,6 @@ def assigned_scene(given: SceneArguments) -> LayeredScene:
         border,
         compositing,
         image.dtype,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Remembered:
-    """The layers of a scene, for a defocus map and the layers' nodes."""
-
-    options: tuple[Hashable, ...]
-    defocus: Tensor
-    nodes: Tensor
-    scene: LayeredScene
-
-
-_last: dict[str, _Remembered] = {}
-
-
-def remembered_scene(given: SceneArguments) -> LayeredScene:
-    """Return the scene of :func:`assigned_scene`; layers are assigned once for a defocus map that comes again.
-
-    The map is compared value by value. Only the last one is remembered, up to :data:`LARGEST_REMEMBERED` pixels and on
-    a processor. For use without gradients.
-    """
-    image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate = given
-    if defocus.device.type != "cpu" or defocus.numel() > LARGEST_REMEMBERED:
-        return assigned_scene(given)
-    options = compositing, layers, border, image.shape, psfs.shape, torch.get_num_threads()
-    options += image.dtype, psfs.dtype, defocus.dtype, nodes.dtype
-    last = _last.get("scene")  # another thread may put in another one meanwhile
-    if (
-        last is None
-        or last.options != options
-        or not (torch.equal(last.defocus, defocus) and torch.equal(last.nodes, nodes))
-    ):
-        scene = assigned_scene(given)
-        nothing = image.new_empty(0)
-        kept = replace(scene, image=nothing, psfs=nothing, stray_light=None, found={})
-        _last["scene"] = _Remembered(options, defocus.clone(), nodes.clone(), kept)
-        return scene
-    dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
-    return replace(
-        last.scene,
-        image=image.to(dtype),
-        psfs=(psfs.flip((-2, -1)) if correlate else psfs).to(dtype),
-        stray_light=None if stray_light is None else stray_light.to(dtype),
-        found={},
     )
 
 

@@ -1,5 +1,4 @@
-"""Runtime support: locks for cameras shared by threads, signals, and how torch runs.
+"""Runtime support: how torch runs, precision of devices, signals, and where imports look for code.
 
-It contains no optics. ``mode.py`` tells how torch runs, ``threads.py`` has the locks, ``signals.py`` Ctrl-C and SIGTERM
-of the command.
+It contains no optics. ``mode.py`` tells how torch runs, ``signals.py`` has Ctrl-C and SIGTERM of the command.
 """

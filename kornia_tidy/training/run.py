@@ -157,7 +157,7 @@ def _train(
     )
     assert module.settings is not None
     if settings.data in PAINTED:
-        module.optics.notes.first_time("depth")  # painted in metres: a far scene is no sign of another unit
+        module.optics.notes.told.add("depth")  # painted in metres: a far scene is no sign of another unit
     if masks_from is not None and checkpoint is None:
         load_masks(masks_from, module.optics)
         module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -64,16 +63,9 @@ def calls(request) -> list[Call]:
     if request.param == "leaves":
         leaves = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
         image, depth = (part[None] for part in leaves)
-    done = threading.Event()
-    beside = threading.Thread(target=done.wait)  # with other threads a capture takes care that no mask is half written
-    beside.start()
-    try:
-        with torch.no_grad():
-            optics(image, depth)
-            return calls_of(lambda: optics(image, depth))
-    finally:
-        done.set()
-        beside.join()
+    with torch.no_grad():
+        optics(image, depth)
+        return calls_of(lambda: optics(image, depth))
 
 
 class TestCallBudget(BaseTester):
