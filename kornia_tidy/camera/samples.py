@@ -30,7 +30,7 @@ ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as bey
 
 @dataclass(eq=False)
 class Notes:
-    """What a camera remembers of its captures, and shares with the views of it that :meth:`with_fidelity` makes.
+    """Warnings that a camera has given, and clamped pixels of its last capture. Views of the camera share them.
 
     Args:
         told: keys of the warnings that were given.

@@ -169,12 +169,8 @@ def mutual_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     """
     weights = weights.to(field.real.dtype)
     constant = not (torch.is_grad_enabled() and (weights.requires_grad or kernels.requires_grad))
-    if (
-        constant
-        and not torch_mode() & Mode.TRACED
-        and field.device.type == "cpu"
-        and goes_in_c(kernels.shape[1], weights.dtype)
-    ):
+    here = field.device.type == "cpu" and not torch_mode() & Mode.TRACED
+    if here and constant and goes_in_c(kernels.shape[1], weights.dtype):
         return mutual_intensity_energies(field, weights, kernels)
     window, order, cells = kernels.shape[1:]
     numbers = window * (4 * order * len(field) * cells + cells**2)

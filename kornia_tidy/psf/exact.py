@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections import OrderedDict
-from collections.abc import Callable, Generator, Hashable, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -25,50 +24,29 @@ _MOST_BYTES = 256 * 2**20
 
 
 class _Memory:
-    """Tensors of each depth, by all that they depend on: of those used last so many bytes."""
+    """Tensors of each depth, by all that they depend on: of those used last so many bytes. Any thread may ask."""
 
     def __init__(self) -> None:
         self.held: OrderedDict[Hashable, tuple[Tensor, ...]] = OrderedDict()
 
     def recall(self, keys: Sequence[Hashable], make: Callable[[list[int]], tuple[Tensor, ...]]) -> list[Tensor]:
         """Return the tensors of all keys, stacked; ``make`` gives those of missing keys, by their places."""
-        if missing := [place for place, key in enumerate(keys) if key not in self.held]:
+        known = [self.held.pop(key, None) for key in keys]
+        if missing := [place for place, own in enumerate(known) if own is None]:
             with torch.inference_mode(False), torch.no_grad():
                 made = zip(*(tensor.unbind() for tensor in make(missing)), strict=True)
-            self.held.update(zip([keys[place] for place in missing], made, strict=True))
-        for key in keys:
-            self.held.move_to_end(key)
-        found = [torch.stack(tensors) for tensors in zip(*(self.held[key] for key in keys), strict=True)]
-        one = sum(tensor.nbytes for tensor in self.held[keys[-1]])
+            for place, own in zip(missing, made, strict=True):
+                known[place] = own
+        found = cast("list[tuple[Tensor, ...]]", known)
+        self.held.update(zip(keys, found, strict=True))
+        one = sum(tensor.nbytes for tensor in found[-1])
         while len(self.held) * one > _MOST_BYTES and len(self.held) > len(keys):
             self.held.popitem(last=False)
-        return found
+        return [torch.stack(tensors) for tensors in zip(*found, strict=True)]
 
 
 _kernel_memory = _Memory()
 _matrix_memory = _Memory()  # of accelerators
-
-
-class _Thread(threading.local):
-    forgets = False
-
-
-_thread = _Thread()
-
-
-@contextmanager
-def without_kernel_cache() -> Generator[None]:
-    """Keep no sensor kernels in this thread that are computed meanwhile: some hundred KiB for each depth and colour.
-
-    Example:
-        >>> with without_kernel_cache():
-        ...     pass
-    """
-    before, _thread.forgets = _thread.forgets, True
-    try:
-        yield
-    finally:
-        _thread.forgets = before
 
 
 def exact_psf_bank(
@@ -83,6 +61,7 @@ def exact_psf_bank(
     tolerance: float = 1e-2,
     chromatic_defocus: Sequence[float] | None = None,
     each_state: bool = False,
+    remember: bool = True,
 ) -> PSFBank:
     r"""Return the PSFs of a mask sequence with every mask pixel and sensor pixel integrated.
 
@@ -102,6 +81,7 @@ def exact_psf_bank(
         chromatic_defocus: for each wavelength, what it has more of defocus than the nodes, in radians at 530 nm.
             Default: nothing, a lens corrected for colour.
         each_state: return the PSFs of each mask, not their average: (D, K C, P, P), those of a mask follow each other.
+        remember: keep the sensor kernels, some hundred KiB for each depth and colour, for the next PSFs of this lens.
 
     Returns:
         A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
@@ -130,7 +110,7 @@ def exact_psf_bank(
     def kernels_of(psi: Sequence[float], w: int, device: torch.device) -> Tensor:
         scale = REFERENCE_WAVELENGTH / spectrum.wavelengths[w]
         at = tuple((p + shifts[w]) * scale for p in psi)
-        return _kernels(at, pixel_step / spectrum.wavelengths[w], geometry, gaps, device, dtype)
+        return _kernels(at, pixel_step / spectrum.wavelengths[w], geometry, gaps, device, dtype, remember)
 
     if phase.device.type != "cpu" and not torch_mode() & Mode.TRACED and isinstance(pixel_step, float):
         columns = cells if gaps is None else 2 * cells
@@ -156,7 +136,8 @@ def exact_psf_bank(
             return PSFBank(psfs, nodes, psfs.sum((2, 3)))
     if each_state:
         rest = pupil, spectrum, dispersion, defocus, pixel_step, window, tolerance, chromatic_defocus
-        banks = [exact_psf_bank(own[None], torch.ones_like(weights[:1]), *rest) for own in phase]
+        one = torch.ones_like(weights[:1])
+        banks = [exact_psf_bank(own[None], one, *rest, remember=remember) for own in phase]
         psfs, energies = (torch.cat(own, 1) for own in zip(*((b.psfs, b.energy) for b in banks), strict=True))
         return PSFBank(psfs, banks[0].defocus, energies)
 
@@ -200,17 +181,17 @@ def _kernels(
     gaps: Gaps,
     device: torch.device,
     dtype: torch.dtype,
+    remember: bool,
 ) -> Tensor:
     """Return the sensor kernels, remembered where the geometry is fixed: they depend on nothing else."""
     spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
     if not has_float64(device):
         cpu = torch.device("cpu")
-        return _kernels(defocus, step.to(cpu) if isinstance(step, Tensor) else step, geometry, gaps, cpu, dtype).to(
-            device
-        )
+        step = step.to(cpu) if isinstance(step, Tensor) else step
+        return _kernels(defocus, step, geometry, gaps, cpu, dtype, remember).to(device)
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
-    if torch_mode() & Mode.TRACED or _thread.forgets:
+    if torch_mode() & Mode.TRACED or not remember:
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
     keys = [(psi, step, geometry, gaps, device, dtype, torch.get_num_threads()) for psi in defocus]
 

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from kornia_tidy.kernels.window_sides import next_fast_size
 from kornia_tidy.psf.defocus_interpolation import nodes_around
-from kornia_tidy.psf.exact import without_kernel_cache
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import EACH, PSFModel
 from kornia_tidy.psf.wide_blur import WideBlur
@@ -106,9 +105,8 @@ def pieces_of(
     bytes_at_most = _MOST_COPIES * channels * dtype.itemsize * model.most_samples
     if blur is None and budget is not None and bytes_at_most > budget // 2:
         most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
-    make = partial(model.scene_bank, channels, dtype, device=device or reach.device)
-    if not remembered:
-        make = partial(_forgotten, model, channels, dtype)
+    source = model if remembered else model.without_memory()
+    make = partial(source.scene_bank, channels, dtype, device=device or reach.device)
     if compositing == "occlusion" and (blur is not None or model.measured_cut):  # discs of rays end
         make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
@@ -183,11 +181,6 @@ def _most_layers(
     if layers * (psfs + work) <= allowed:
         return whole
     return max(2, allowed // (psfs + work)), layers * psfs <= allowed
-
-
-def _forgotten(model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, state: int | None = None) -> PSFBank:
-    with without_kernel_cache():
-        return model.without_memory().scene_bank(channels, dtype, reach, state)
 
 
 def _with_tails(make: Callable[..., PSFBank], *given: Any) -> PSFBank:

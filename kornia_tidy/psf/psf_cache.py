@@ -30,7 +30,8 @@ class BankMemory:
     """Remembers PSFs by their defocus: of each kind of bank those for one setting of masks and camera at a time.
 
     The masks are compared by value, so a PSF that no longer holds is never given out, however they were changed.
-    For use without gradients, by any number of threads: what they put here is not changed, but replaced at once.
+    For use without gradients. Any number of threads may use it at once; those that meet on their first capture may each
+    compute the same PSF.
 
     Example:
         >>> asked = []

@@ -98,8 +98,8 @@ class PSFModel:
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _derived: Derived
     _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
-    # For each moment and state, for their averages, for each number of threads and each grid.
-    _memories: dict[tuple[int | None, int | None, int, int], BankMemory]
+    # For each moment and state, for their averages, for each number of threads and each grid; None remembers no PSFs.
+    _memories: dict[tuple[int | None, int | None, int, int], BankMemory] | None
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class PSFModel:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: no PSFs."""
-        return {**vars(self), "_memories": {}}
+        return {**vars(self), "_memories": None if self._memories is None else {}}
 
     def replace(self, **parts: Any) -> Self:
         """Return this model with other parts. Its window is measured when it is first asked for.
@@ -308,7 +308,8 @@ class PSFModel:
             shares = [sum(row) for row in spectrum.plane_weights]
             lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
-        if learning or traced or Mode.UNREAD in torch_mode() or next(self.camera.parameters(), None) is not None:
+        memories, unread = self._memories, Mode.UNREAD in torch_mode()
+        if memories is None or learning or traced or unread or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
         fill_factor = getattr(self.modulator, "fill_factor", 1.0)
@@ -316,7 +317,7 @@ class PSFModel:
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
         key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), grid
-        memory = self._memories.get(key) or self._memories.setdefault(key, BankMemory())
+        memory = memories.get(key) or memories.setdefault(key, BankMemory())
         return memory.recall(spectrum, setting, states, weights, nodes, build, stray_light)
 
     def _exact_psfs(
@@ -347,7 +348,8 @@ class PSFModel:
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
         tolerance = self.fidelity.pixel_tolerance if tolerance is None else tolerance
         lens = pupil, spectrum, dispersion, nodes, self.pixel_step * grid, window, tolerance, shift
-        return computed_psf_bank(states, weights, *lens, each_state=each_state)
+        remember = self._memories is not None
+        return computed_psf_bank(states, weights, *lens, each_state=each_state, remember=remember)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)
@@ -387,13 +389,13 @@ class PSFModel:
         return self.replace(fidelity=Fidelity.of(fidelity))
 
     def without_memory(self) -> Self:
-        """Return this model without remembered PSFs; those that the copy computes are freed with it. Parts are shared.
+        """Return this model without memory of PSFs and of what they are computed with. Parts are shared.
 
         Example:
             >>> PSFModel().without_memory().psf_bank(defocus=[0.0]).psfs.shape[:2]
             torch.Size([1, 3])
         """
-        return self._replace(_memories={})
+        return self._replace(_memories=None)
 
     def through_state(self, state: int) -> Self:
         """Return this model with one state of its modulator shown all the time. The parts and the window are shared.

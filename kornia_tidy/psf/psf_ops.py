@@ -47,6 +47,7 @@ def computed_psf_bank(
     chromatic_defocus: Sequence[float],
     *,
     each_state: bool = False,
+    remember: bool = True,
 ) -> PSFBank:
     """Return the bank of :func:`kornia_tidy.psf.exact.exact_psf_bank`, by the operator while compiling.
 
@@ -64,6 +65,7 @@ def computed_psf_bank(
         tolerance: as there.
         chromatic_defocus: as there.
         each_state: as there.
+        remember: as there.
 
     Example:
         >>> flat, pupil = torch.zeros(1, 23, 23), Pupil(torch.ones(23, 23), 0.1)
@@ -74,7 +76,8 @@ def computed_psf_bank(
     lens = pupil, spectrum, dispersion, defocus
     if torch_mode() == Mode.GRAPH and not (isinstance(pixel_step, Tensor) or each_state):
         return operator_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus)
-    return exact_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus, each_state)
+    lens = *lens, pixel_step, window, tolerance, chromatic_defocus
+    return exact_psf_bank(phase, weights, *lens, each_state, remember)
 
 
 def operator_psf_bank(

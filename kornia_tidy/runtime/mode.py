@@ -2,6 +2,10 @@
 
 Tracing needs plain operations of torch throughout. C kernels, caches and branches on tensor values are disabled under
 tracing. Each time a value of an accelerator is read the host waits for it, so a capture reads what it needs at once.
+
+Torch keeps its modes for each thread, and so does :func:`values_unread`, the only state of a thread in the package. An
+argument cannot carry it: the checks that it skips are in the lens, the PSF model and the renderer, of which some are
+reached through methods that users write and operators of torch.
 """
 
 from __future__ import annotations

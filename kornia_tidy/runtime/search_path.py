@@ -20,7 +20,7 @@ from typing import Any
 ROOT = os.path.abspath(os.sep)  # working folder of processes that need none
 _STANDARD = os.path.dirname(os.path.abspath(os.__file__))
 _SAFE = "PYTHONSAFEPATH"  # a process with this in its environment does not put the current folder on its path
-_LOCK = RLock()
+_LOCK = RLock()  # sys.path and the environment belong to the process, so one thread at a time changes them
 try:
     _START = os.getcwd()  # an absolute entry of the path with -m, and for "." in PYTHONPATH
 except FileNotFoundError:

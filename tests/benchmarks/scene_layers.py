@@ -57,7 +57,8 @@ def works(compositing: str, image: Tensor, psi: Tensor) -> dict[str, Callable[[]
 
     def psfs() -> None:
         with torch.no_grad():
-            optics.psf_model.without_memory().scene_bank(3, torch.float32, psi)
+            optics.psf_model._memories.clear()
+            optics.psf_model.scene_bank(3, torch.float32, psi)
 
     found: dict[str, Callable[[], object]] = {
         f"{compositing}, capture": capture,

@@ -17,6 +17,7 @@ from torch import Tensor
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.masks import NoMask
+from kornia_tidy.psf import exact
 from kornia_tidy.psf import psf_model as module
 from tests.base import BaseTester
 
@@ -119,6 +120,24 @@ class TestThreads(BaseTester):
             for one, other in zip(chain(*found), chain(*expected), strict=True):
                 assert torch.equal(one, other)
             assert torch.equal(optics(*SAMPLES[0]), before)
+
+    def test_feature_lenses_that_evict_what_others_remember(self, monkeypatch):
+        """Kernels of PSFs are remembered for the process: here so few that each lens drops those of the others."""
+        monkeypatch.setattr(exact, "_MOST_BYTES", 1 << 16)
+        with one_thread_each(), torch.no_grad():
+            lenses = [ThinLensCamera(focus_distance=0.5 + 0.1 * i) for i in range(THREADS)]
+
+            def captures(index: int) -> list[Tensor]:
+                optics, found = camera(masks=PixelwiseMask(1, initial="flat"), camera=lenses[index]), []
+                optics.check_inputs = False
+                for _ in range(4):
+                    optics.masks.phase[:, :4].add_(1)
+                    found.append(optics(*SAMPLES[0]))
+                return found
+
+            expected = [captures(index) for index in range(THREADS)]
+            for one, other in zip(chain(*in_threads(captures)), chain(*expected), strict=True):
+                assert torch.equal(one, other)
 
     @torch.no_grad()
     def test_feature_rgb_and_grey_by_turns_do_not_evict_each_other(self, monkeypatch):
