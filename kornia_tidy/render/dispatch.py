@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,16 +13,15 @@ from kornia_tidy.checks import check_choice
 from kornia_tidy.render.backend import Backend, GradientPairs, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.compiled import CompiledBackend
-from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
+from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
-from kornia_tidy.render.scene import LayeredScene, scene_of_layers
+from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.mode import Mode, torch_mode
 
 BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DenseBackend(), CompiledBackend(), TiledBackend(), BatchedBackend())
 }
-METHODS = ("auto", *BACKENDS)
 RENAMED = {"direct": "compiled", "overlap": "compiled", "triton": "batched"}  # what method= took before
 # Where dense is the faster one: occlusion in C takes P^2 operations a pixel, and tiles of a small image through large
 # PSFs are as large as it. It is taken while an image with all channels has few bytes in float64.
@@ -31,29 +29,16 @@ LARGEST_OCCLUSION, LARGEST_SHARE, LARGEST_PLANE = 65, 1 / 4, 32 << 20
 MOST_SAMPLES = 1 << 28  # of all layers: beyond, transforms take longer than launches, and tiles skip absent layers
 
 
-def render_scene(scene: LayeredScene, method: str | Backend = "auto") -> Tensor:
-    """Render a layered scene by the backend that :func:`choose` takes, or by one that is given.
+def render_unrecorded(backend: Backend, scene: LayeredScene) -> Tensor:
+    """Render a layered scene without the gradients that backends make.
 
     Args:
+        backend: from :func:`choose`.
         scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-        method: ``"auto"``, ``"dense"``, ``"compiled"``, ``"tiled"`` or ``"batched"``, or a backend.
 
     Returns:
-        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says. It has gradients
-        with respect to image, layer weight, PSFs and stray light. The backend makes them; those that are differentiated
-        in turn are made by the dense one.
-
-    Raises:
-        ValueError: if the method is not known, or does not support the scene.
+        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says.
     """
-    backend = choose(scene, method) if isinstance(method, str) else method
-    if Mode.TRANSFORM in torch_mode():
-        return render_unrecorded(backend, scene)
-    return _Rendered.apply(backend, scene, scene.image, scene.layer_weight, scene.psfs, scene.stray_light)
-
-
-def render_unrecorded(backend: Backend, scene: LayeredScene) -> Tensor:
-    """Render a layered scene without the gradients that backends make."""
     with torch.autocast(scene.image.device.type, enabled=False):
         coded = backend.render(scene)
         if scene.stray_light is not None and scene.compositing != "occlusion":
@@ -91,35 +76,6 @@ def chain_gradients(pairs: GradientPairs, leaves: list[Tensor]) -> list[Tensor |
     return list(torch.autograd.grad(tensors, leaves, gradients, allow_unused=True))
 
 
-class _Rendered(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, backend: Backend, scene: LayeredScene, *tensors: Tensor | None) -> Tensor:
-        ctx.backend, ctx.scene = backend, scene
-        ctx.save_for_backward(*tensors)
-        return render_unrecorded(backend, scene)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), wanted, given = grad_outputs, ctx.needs_input_grad[2:], ctx.scene
-
-        def scene_of(*tensors: Any) -> LayeredScene:
-            image, weight, psfs, stray_light = tensors
-            rest = given.border, given.compositing, given.dtype
-            return scene_of_layers(image, given.layer_index, weight, psfs, stray_light, *rest)
-
-        if torch.is_grad_enabled():  # it is differentiated in turn
-
-            def render(*tensors: Tensor | None) -> Tensor:
-                return render_unrecorded(BACKENDS["dense"], scene_of(*tensors))
-
-            return None, None, *differentiable_gradients(render, ctx.saved_tensors, gradient, wanted)
-        own = leaves_of(ctx.saved_tensors, wanted)
-        leaves = [x for x in own if x is not None and x.requires_grad]
-        with torch.enable_grad():
-            found = iter(chain_gradients(scene_gradients(ctx.backend, scene_of(*own), gradient), leaves))
-        return None, None, *(next(found) if x is not None and x.requires_grad else None for x in own)
-
-
 def leaves_of(tensors: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
     """Return tensors in which gradients end, that require them where they are wanted."""
     return [None if x is None else x.detach().requires_grad_(want) for x, want in zip(tensors, wanted, strict=True)]
@@ -137,7 +93,7 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         method: ``"auto"``, or the name of the backend.
 
     Raises:
-        ValueError: as :func:`render_scene`.
+        ValueError: if the method is not known, or does not support the scene.
     """
     if method != "auto":
         return _named(scene, method)
@@ -164,7 +120,7 @@ def _keeps_little(scene: LayeredScene) -> bool:
 def _named(scene: LayeredScene, method: str) -> Backend:
     if method in RENAMED:
         raise ValueError(f"method {method!r} is now {RENAMED[method]!r}, or 'auto' for the backend that suits a scene")
-    check_choice("method", method, METHODS)
+    check_choice("method", method, ("auto", *BACKENDS))
     if (why := refusal(BACKENDS[method], scene)) is not None:
         raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
     return BACKENDS[method]

@@ -18,7 +18,6 @@ from kornia_tidy.render.dispatch import (
     chain_gradients,
     choose,
     leaves_of,
-    render_scene,
     render_unrecorded,
     scene_gradients,
 )
@@ -78,7 +77,7 @@ def render_layers(
     if Mode.TRANSFORM in torch_mode():
         options = {"compositing": compositing, "layers": layers, "border": border}
         scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
-        return render_scene(scene, method)
+        return render_unrecorded(choose(scene, method), scene)
     check_scene(image, defocus, nodes, psfs, stray_light, border)
     if nodes.device.type != "cpu" and Mode.UNREAD not in torch_mode():
         check_nodes(nodes)

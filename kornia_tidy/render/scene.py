@@ -131,7 +131,7 @@ def layered_scene(
     border: str = "reflect",
     correlate: bool = False,
 ) -> LayeredScene:
-    """Check a scene and assign its pixels to layers, for :func:`kornia_tidy.render.dispatch.render_scene`.
+    """Check a scene and assign its pixels to layers, for :func:`kornia_tidy.render.dispatch.choose`.
 
     Args:
         image: (B, C, H, W) linear light.

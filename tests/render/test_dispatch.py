@@ -11,7 +11,7 @@ from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.render import dispatch
 from kornia_tidy.render.compositing import COMPOSITING, render
-from kornia_tidy.render.dispatch import BACKENDS, METHODS, choose, explain, render_scene
+from kornia_tidy.render.dispatch import BACKENDS, choose, explain, render_unrecorded
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
@@ -73,7 +73,7 @@ class TestChoose(BaseTester):
         monkeypatch.setattr(dispatch, "LARGEST_PLANE", 8 * scene.image.numel() - 1)
         assert choose(scene).name != "dense"
 
-    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("method", ["auto", *BACKENDS])
     @over_compositing
     def test_feature_the_named_backend_renders(self, compositing, method):
         bank = make_bank(6, 3, 9, dtype=torch.float32)
@@ -82,7 +82,7 @@ class TestChoose(BaseTester):
         expected = explain(scene).backend if method == "auto" else method
         if (why := BACKENDS[expected].refusal(scene)) is not None:
             pytest.skip(why)
-        coded = render_scene(scene, BACKENDS[expected])
+        coded = render_unrecorded(BACKENDS[expected], scene)
         assert torch.equal(render(image, defocus, bank, compositing, method=method), coded)
 
     def test_exception_unknown_method(self):
