@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.backend import Backend, GradientPairs, Work, wants_gradient
+from kornia_tidy.render.backend import Backend, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.compiled import CompiledBackend
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.scene import LayeredScene
-from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.mode import Mode, torch_mode
 
 BACKENDS: dict[str, Backend] = {
@@ -27,58 +24,6 @@ RENAMED = {"direct": "compiled", "overlap": "compiled", "triton": "batched"}  # 
 # PSFs are as large as it. It is taken while an image with all channels has few bytes in float64.
 LARGEST_OCCLUSION, LARGEST_SHARE, LARGEST_PLANE = 65, 1 / 4, 32 << 20
 MOST_SAMPLES = 1 << 28  # of all layers: beyond, transforms take longer than launches, and tiles skip absent layers
-
-
-def render_unrecorded(backend: Backend, scene: LayeredScene) -> Tensor:
-    """Render a layered scene without the gradients that backends make.
-
-    Args:
-        backend: from :func:`choose`.
-        scene: from :func:`kornia_tidy.render.scene.layered_scene`.
-
-    Returns:
-        (B, C, h, w) light in the scene's dtype, computed in float32 or better, whatever autocast says.
-    """
-    with torch.autocast(scene.image.device.type, enabled=False):
-        coded = backend.render(scene)
-        if scene.stray_light is not None and scene.compositing != "occlusion":
-            coded = coded + stray_light_of(scene)
-    return coded.to(scene.dtype)
-
-
-@torch.enable_grad()
-def scene_gradients(backend: Backend, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-    """Return the gradients of tensors that were made of the scene's, where they require gradients.
-
-    Args:
-        backend: makes them.
-        scene: tensors that autograd records.
-        gradient: (B, C, h, w) gradient of the rendered light.
-    """
-    pairs = backend.gradients(scene, gradient.to(scene.image.dtype))
-    if scene.stray_light is not None and scene.compositing != "occlusion":
-        stray_light = stray_light_of(scene)
-        if stray_light.requires_grad:
-            pairs.append((stray_light, gradient.to(stray_light.dtype).sum_to_size(stray_light.shape)))
-    return pairs
-
-
-def chain_gradients(pairs: GradientPairs, leaves: list[Tensor]) -> list[Tensor | None]:
-    """Return the gradients of leaves from those of tensors that were made of them.
-
-    Args:
-        pairs: from :func:`scene_gradients`.
-        leaves: tensors that the scene was made of; each has its gradient, or None.
-    """
-    if not pairs or not leaves:
-        return [None] * len(leaves)
-    tensors, gradients = zip(*pairs, strict=True)
-    return list(torch.autograd.grad(tensors, leaves, gradients, allow_unused=True))
-
-
-def leaves_of(tensors: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
-    """Return tensors in which gradients end, that require them where they are wanted."""
-    return [None if x is None else x.detach().requires_grad_(want) for x, want in zip(tensors, wanted, strict=True)]
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:

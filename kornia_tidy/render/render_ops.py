@@ -7,22 +7,18 @@ arguments are kept between the two.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
-from kornia_tidy.render.dispatch import (
-    chain_gradients,
-    choose,
-    leaves_of,
-    render_unrecorded,
-    scene_gradients,
-)
+from kornia_tidy.render.backends.dense import differentiable_gradients
+from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.layers import check_nodes
-from kornia_tidy.render.scene import assigned_scene, check_scene, layered_scene
+from kornia_tidy.render.scene import assigned_scene, check_scene
+from kornia_tidy.render.stray_light import stray_light_of
 from kornia_tidy.runtime.mode import Mode, recording_in_operator, torch_mode
 
 _SCENE = (
@@ -74,25 +70,24 @@ def render_layers(
     """
     if compositing not in COMPOSITINGS:
         check_choice("compositing", compositing, COMPOSITINGS)
-    if Mode.TRANSFORM in torch_mode():
-        options = {"compositing": compositing, "layers": layers, "border": border}
-        scene = layered_scene(image, defocus, nodes, psfs, stray_light, correlate=correlate, **options)
-        return render_unrecorded(choose(scene, method), scene)
     check_scene(image, defocus, nodes, psfs, stray_light, border)
-    if nodes.device.type != "cpu" and Mode.UNREAD not in torch_mode():
+    mode = torch_mode()
+    if nodes.device.type != "cpu" and Mode.UNREAD not in mode:
         check_nodes(nodes)
-    return torch.ops.kornia_tidy.render_layers(
-        image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method
-    )
+    render = _rendered if Mode.TRANSFORM in mode else torch.ops.kornia_tidy.render_layers
+    return render(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method)
 
 
-def _render(*arguments: Any) -> Tensor:
+def _rendered(*arguments: Any) -> Tensor:
     image, method = arguments[0], arguments[-1]
     if not len(image):
         return _render_fake(*arguments)
-    with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
+    with torch.autocast(image.device.type, enabled=False):
         scene = assigned_scene(*arguments[:-1])
-        return render_unrecorded(choose(scene, method), scene).contiguous()
+        light = choose(scene, method).render(scene)
+        if scene.stray_light is not None and scene.compositing != "occlusion":
+            light = light + stray_light_of(scene)
+        return light.to(scene.dtype).contiguous()
 
 
 def _render_fake(*arguments: Any) -> Tensor:
@@ -105,11 +100,20 @@ def _gradients(*arguments: Any) -> list[Tensor]:
     tensors, options, (method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:-3], arguments[-3:]
     if not len(gradient):
         return [torch.zeros_like(x) for x, want in zip(tensors, wanted, strict=True) if want and x is not None]
-    own: list[Any] = leaves_of(tensors, wanted)
+    given = zip(tensors, wanted, strict=True)
+    own: list[Any] = [None if x is None else x.detach().requires_grad_(want) for x, want in given]
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
         scene = assigned_scene(*own, *options)
-        found = chain_gradients(scene_gradients(choose(scene, method), scene, gradient), leaves)
+        pairs = choose(scene, method).gradients(scene, gradient.to(scene.image.dtype))
+        if scene.stray_light is not None and scene.compositing != "occlusion":
+            stray_light = stray_light_of(scene)
+            if stray_light.requires_grad:
+                pairs.append((stray_light, gradient.to(stray_light.dtype).sum_to_size(stray_light.shape)))
+        found: Sequence[Tensor | None] = [None] * len(leaves)
+        if pairs:
+            made, gradients = zip(*pairs, strict=True)
+            found = torch.autograd.grad(made, leaves, gradients, allow_unused=True)
     return [
         torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
         for x, leaf in zip(found, leaves, strict=True)
@@ -137,7 +141,7 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     if torch.is_grad_enabled():  # it is differentiated in turn
 
         def render(*tensors: Any) -> Tensor:
-            return render_unrecorded(DenseBackend(), assigned_scene(*tensors, *options))
+            return _rendered(*tensors, *options, "dense")
 
         with torch.autocast(gradient.device.type, enabled=False):
             return *differentiable_gradients(render, tensors, gradient, wanted), *rest
@@ -147,7 +151,7 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return *(next(found) if want else None for want in wanted), *rest
 
 
-torch.library.impl("kornia_tidy::render_layers", "default", _render)
+torch.library.impl("kornia_tidy::render_layers", "default", torch.no_grad()(_rendered))
 torch.library.register_fake("kornia_tidy::render_layers", _render_fake)
 torch.library.register_autograd("kornia_tidy::render_layers", _backward, setup_context=_keep)
 torch.library.impl("kornia_tidy::render_layers_gradients", "default", _gradients)

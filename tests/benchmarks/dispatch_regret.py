@@ -28,7 +28,7 @@ import torch
 from kornia_tidy.commands.info import _processor_name
 from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.render.backends import compiled
-from kornia_tidy.render.dispatch import BACKENDS, choose, refusal, render_unrecorded
+from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
 from kornia_tidy.render.scene import LayeredScene, layered_scene
 
 GOOD, BAD = 1.15, 2.0
@@ -130,7 +130,7 @@ def time_once(scene: LayeredScene, method: str) -> float:
         time.thread_time if torch.get_num_threads() == 1 else time.perf_counter,
     )
     start = clock()
-    render_unrecorded(choose(fresh, method), fresh)
+    choose(fresh, method).render(fresh)
     return clock() - start
 
 

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.render.backend import Backend
-from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS
 from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.compositing import render
-from kornia_tidy.render.dispatch import chain_gradients, leaves_of, render_unrecorded, scene_gradients
-from kornia_tidy.render.scene import LayeredScene, layered_scene, scene_of_layers
+from kornia_tidy.render.dispatch import BACKENDS
 from tests.base import BaseTester
 from tests.render.scenes import Bank
 
@@ -33,37 +30,8 @@ def render_by(
     """Render by a backend, given itself or by its name."""
     if isinstance(method, str):
         return render(image, defocus, bank, compositing, method=method, **options)
-    scene = layered_scene(image, defocus, bank.defocus, bank.psfs, bank.veil, compositing=compositing, **options)
-    return _Rendered.apply(method, scene, scene.image, scene.layer_weight, scene.psfs, scene.stray_light)
-
-
-class _Rendered(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, backend: Backend, scene: LayeredScene, *tensors: Tensor | None) -> Tensor:
-        ctx.backend, ctx.scene = backend, scene
-        ctx.save_for_backward(*tensors)
-        return render_unrecorded(backend, scene)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), wanted, given = grad_outputs, ctx.needs_input_grad[2:], ctx.scene
-
-        def scene_of(*tensors: Any) -> LayeredScene:
-            image, weight, psfs, stray_light = tensors
-            rest = given.border, given.compositing, given.dtype
-            return scene_of_layers(image, given.layer_index, weight, psfs, stray_light, *rest)
-
-        if torch.is_grad_enabled():  # it is differentiated in turn
-
-            def render(*tensors: Tensor | None) -> Tensor:
-                return render_unrecorded(DenseBackend(), scene_of(*tensors))
-
-            return None, None, *differentiable_gradients(render, ctx.saved_tensors, gradient, wanted)
-        own = leaves_of(ctx.saved_tensors, wanted)
-        leaves = [x for x in own if x is not None and x.requires_grad]
-        with torch.enable_grad():
-            found = iter(chain_gradients(scene_gradients(ctx.backend, scene_of(*own), gradient), leaves))
-        return None, None, *(next(found) if x is not None and x.requires_grad else None for x in own)
+    BACKENDS["given"] = method  # until the test ends, as gradients ask for it again
+    return render(image, defocus, bank, compositing, method="given", **options)
 
 
 class RenderTester(BaseTester):

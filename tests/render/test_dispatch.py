@@ -11,7 +11,7 @@ from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.render import dispatch
 from kornia_tidy.render.compositing import COMPOSITING, render
-from kornia_tidy.render.dispatch import BACKENDS, choose, explain, render_unrecorded
+from kornia_tidy.render.dispatch import BACKENDS, choose, explain
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
@@ -82,7 +82,7 @@ class TestChoose(BaseTester):
         expected = explain(scene).backend if method == "auto" else method
         if (why := BACKENDS[expected].refusal(scene)) is not None:
             pytest.skip(why)
-        coded = render_unrecorded(BACKENDS[expected], scene)
+        coded = BACKENDS[expected].render(scene).to(image.dtype)
         assert torch.equal(render(image, defocus, bank, compositing, method=method), coded)
 
     def test_exception_unknown_method(self):

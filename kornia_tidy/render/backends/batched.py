@@ -14,7 +14,7 @@ from kornia_tidy.render.backend import GradientPairs, Work
 from kornia_tidy.render.backends.batched_occlusion import occlude_batched, occlusion_gradients
 from kornia_tidy.render.backends.dense import dense_work
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.layer_sums import blend, blend_gradients
+from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
 from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
@@ -38,7 +38,10 @@ class BatchedBackend:
         """Return the rendered light, for occlusion in float64 where the device has it."""
         if scene.compositing == "occlusion":
             return occlude_batched(occlusion_planes(scene), PART_BYTES)
-        return blend(scene, _Sums(scene))
+        sums = _Sums(scene)
+        if scene.compositing == "gather":
+            return sums.gather(scene.plane)
+        return seen(scene, sums.scatter(scene.plane))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the planes, of the PSFs and of the layers' weights."""

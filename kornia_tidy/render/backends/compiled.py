@@ -20,7 +20,7 @@ from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.layer_sums import blend, blend_gradients
+from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
 from kornia_tidy.render.backends.tile_plan import WINDOWS, Grid, tile_grid
 from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
@@ -69,7 +69,10 @@ class CompiledBackend:
         if scene.compositing == "occlusion":
             light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
             return occlusion_direct(light, psfs, index, weight, mean, stray_light, inside)
-        return blend(scene, _Sums(scene))
+        sums = _Sums(scene)
+        if scene.compositing == "gather":
+            return sums.gather(scene.plane)
+        return seen(scene, sums.scatter(scene.plane))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the padded planes, of the PSFs and of the layer weight."""

@@ -43,17 +43,15 @@ class LayerSums(Protocol):
         ...
 
 
-def blend(scene: LayeredScene, sums: LayerSums) -> Tensor:
-    """Return gathered or scattered light, (B, C, h, w).
+def seen(scene: LayeredScene, spread: Tensor) -> Tensor:
+    """Return the part of scattered light (B, C, H, W) that the sensor sees, without the rim.
 
     Args:
-        scene: to be rendered.
-        sums: of the scene.
+        scene: that was scattered.
+        spread: from :meth:`LayerSums.scatter`.
     """
-    plane, lost = scene.plane, scene.psfs.shape[-1] - 1
-    if scene.compositing == "gather":
-        return sums.gather(plane)
-    return sums.scatter(plane)[..., lost : plane.shape[-2], lost : plane.shape[-1]]
+    lost = scene.psfs.shape[-1] - 1
+    return spread[..., lost : scene.plane.shape[-2], lost : scene.plane.shape[-1]]
 
 
 def blend_gradients(scene: LayeredScene, sums: LayerSums, gradient: Tensor) -> GradientPairs:

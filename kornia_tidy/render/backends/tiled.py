@@ -15,7 +15,7 @@ from kornia_tidy.render.backend import GradientPairs, Work, transform_operations
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.block_plan import plan_blocks
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.layer_sums import blend, blend_gradients
+from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
 from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS, Grid, TileKind, tile_grid
 from kornia_tidy.render.backends.tile_workspace import TileWorkspace
 from kornia_tidy.render.backends.tiled_occlusion import occlude_tiled, occlusion_gradients
@@ -48,7 +48,10 @@ class TiledBackend:
         kind, grid = self.tiles(scene)
         if scene.compositing == "occlusion":
             return occlude_tiled(occlusion_planes(scene), scene.labels, grid, kind)
-        return blend(scene, _Sums(scene, kind, grid))
+        sums = _Sums(scene, kind, grid)
+        if scene.compositing == "gather":
+            return sums.gather(scene.plane)
+        return seen(scene, sums.scatter(scene.plane))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the padded planes and of the PSFs."""
