@@ -209,13 +209,21 @@ class TestChecks(BaseTester):
 
 
 class TestCounts:
-    """Bounds that hold for any scene; the benchmark prints the counts at full size."""
+    """Counts that no change may raise; those of occlusion vary with the scene. The benchmark prints them at full size."""
 
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize(("compositing", "launches"), [("gather", 200), ("scatter", 200), ("occlusion", 300)])
-    @pytest.mark.parametrize("fixed", [False, True])
-    def test_feature_a_training_step_launches_little_and_waits_once(self, compositing, launches, fixed):
-        first, second = step_counts(compositing, fixed=fixed, batch=1, side=48, window=15)
+    @pytest.mark.parametrize(
+        ("compositing", "fixed", "launches"),
+        [
+            ("gather", False, 181),
+            ("gather", True, 175),
+            ("scatter", False, 191),
+            ("scatter", True, 185),
+            ("occlusion", False, 300),
+            ("occlusion", True, 284),
+        ],
+    )
+    def test_feature_a_training_step_launches_no_more_than_before_and_waits_once(self, compositing, fixed, launches):
+        first, second = step_counts(compositing, fixed=fixed, batch=1, side=24, window=15)
         assert second.launches <= first.launches <= launches
         assert first.waits == second.waits == (0 if fixed else 1)
         assert not fixed or second.uploads == 0

@@ -55,7 +55,7 @@ def by_depth_interpolation(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
     weight, padded = bank.psfs.flip((-2, -1)).transpose(0, 1)[:, :, None], pad(image, (radius,) * 4, mode="reflect")
     blurred = torch.stack([conv2d(padded[:, c : c + 1], weight[c]) for c in range(3)], 1)
     step = bank.defocus[1] - bank.defocus[0]
-    layers = torch.arange(len(bank.defocus))[:, None, None]
+    layers = torch.arange(len(bank.defocus), device=psi.device)[:, None, None]
     shares = (1 - ((psi - bank.defocus[0]) / step - layers).abs()).clamp(min=0)
     return (blurred * shares.unsqueeze(1)).sum(2)
 

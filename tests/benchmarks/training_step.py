@@ -38,21 +38,27 @@ def scenes(size: int) -> dict[str, Tensor]:
     return {name: torch.stack([sample[name] for sample in samples]) for name in ("image", "depth")}
 
 
-def clocked_step(optics: TiDyOptics, head: nn.Module, adam: torch.optim.Optimizer, batch: dict[str, Tensor]) -> Any:
-    """Take a step; return the seconds of the optics forward, the optics backward, and of all."""
-    clock = [time.process_time()]
+def clocked_step(
+    optics: TiDyOptics,
+    head: nn.Module,
+    adam: torch.optim.Optimizer,
+    batch: dict[str, Tensor],
+    now: Callable[[], float] = time.process_time,
+) -> Any:
+    """Take a step; return the seconds of the optics forward, the optics backward, and of all, by a clock."""
+    clock = [now()]
     adam.zero_grad()
     sample = optics(batch)
-    clock.append(time.process_time())
+    clock.append(now())
     coded = sample["image"].detach().requires_grad_()  # the step stops here on its way back, to look at the clock
     estimate = head(coded)
     truth = sample["all_in_focus"][:, : estimate.shape[1]]
     (estimate - truth).square().mean().backward()
-    clock.append(time.process_time())
+    clock.append(now())
     sample["image"].backward(coded.grad)
-    clock.append(time.process_time())
+    clock.append(now())
     adam.step()
-    clock.append(time.process_time())
+    clock.append(now())
     return clock[1] - clock[0], clock[3] - clock[2], clock[4] - clock[0]
 
 
