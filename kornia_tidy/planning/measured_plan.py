@@ -10,7 +10,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_positive
 from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.planning.rendering_cost import rendering_work
-from kornia_tidy.psf.defocus_interpolation import nodes_around
+from kornia_tidy.psf.psf_cache import nodes_around
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,11 @@ fine layers from them, which a pixel mixes linearly.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 TAPS = {"cubic": 4, "bandlimited": 10}
 SHARE_OF_NYQUIST = 0.7  # distance of samples over pi / band up to which ten taps interpolate
@@ -178,15 +174,3 @@ def interpolated_bank(
     matrix = fine_layer_matrix(nodes[0], spacing, len(nodes), targets, band)
     psfs = (bank.psfs.new_tensor(matrix) @ bank.psfs.flatten(1)).unflatten(1, bank.psfs.shape[1:])
     return PSFBank(psfs, psfs.new_tensor(targets), psfs.sum((2, 3)))
-
-
-def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
-    """Return the nodes that a defocus map lies between; all of them where it is empty or cannot be looked at."""
-    if Mode.GRAPH in torch_mode() or not defocus.numel():
-        return nodes
-    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
-    # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.
-    extra = int(defocus.requires_grad or Mode.TRANSFORM in torch_mode())
-    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
-    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
-    return nodes[min(first, last) : last + 1]

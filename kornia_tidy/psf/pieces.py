@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.window_sides import next_fast_size
-from kornia_tidy.psf.defocus_interpolation import nodes_around
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.psf.psf_model import EACH, PSFModel
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes

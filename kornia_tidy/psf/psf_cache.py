@@ -1,7 +1,8 @@
-"""A cache of PSFs: while masks and camera stay as they are, each depth is computed once."""
+"""Which PSFs a scene needs, and a cache of them: while masks and camera stay as they are, each is computed once."""
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.runtime.mode import Mode, torch_mode
 
 KINDS = 4  # banks remembered side by side: of RGB and of grey images, in float32 and in float64
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among them, which are no plain attributes
@@ -92,6 +94,18 @@ class BankMemory:
                 bank = bank.with_stray_light(*stray_light)
                 known.last = (defocus, stray_light), bank
             return bank
+
+
+def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
+    """Return the nodes that a defocus map lies between; all of them where it is empty or cannot be looked at."""
+    if Mode.GRAPH in torch_mode() or not defocus.numel():
+        return nodes
+    lowest, highest = torch.stack(torch.aminmax(defocus.detach())).tolist()
+    # On a node the next layer has no weight but a gradient: where depth is learnt it must be there.
+    extra = int(defocus.requires_grad or Mode.TRANSFORM in torch_mode())
+    first = max(0, bisect_right(nodes, lowest) - 1 - extra)
+    last = min(len(nodes) - 1, max(0, bisect_left(nodes, highest) + extra))
+    return nodes[min(first, last) : last + 1]
 
 
 def plain_attributes(*parts: nn.Module) -> list[Any]:

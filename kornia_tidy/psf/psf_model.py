@@ -27,13 +27,12 @@ from kornia_tidy.psf.defocus_interpolation import (
     fine_nodes,
     interpolable_spacing,
     interpolated_bank,
-    nodes_around,
 )
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, check_layer_spacing
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import BankMemory, plain_attributes
+from kornia_tidy.psf.psf_cache import BankMemory, nodes_around, plain_attributes
 from kornia_tidy.psf.psf_ops import computed_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
@@ -292,11 +291,11 @@ class PSFModel:
         states, weights = self.states(dtype)
         if state is not None and state != EACH:
             states, weights = states[state : state + 1], torch.ones_like(weights[:1])
-        side, grid = self.window, 1
+        traced = torch_mode() & Mode.TRACED
+        side, grid = self.window if traced else self.fitted.side, 1  # the light in it is measured at the first PSFs
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        traced = torch_mode() & Mode.TRACED
         exact = partial(self._exact_psfs, spectrum, grid)
         build = partial(exact, states, weights, window=side, each_state=state == EACH)
         if (blur := self.wide_blur) is not None and not traced and state != EACH:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_tidy.psf.defocus_interpolation import nodes_around
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur, window_of
 
