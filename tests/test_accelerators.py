@@ -209,7 +209,7 @@ class TestChecks(BaseTester):
 
 
 class TestCounts:
-    """Counts that no change may raise; those of occlusion vary with the scene. The benchmark prints them at full size."""
+    """Counts that no change may raise; those of occlusion vary with the scene. The benchmark prints them in full."""
 
     @pytest.mark.parametrize(
         ("compositing", "fixed", "launches"),
