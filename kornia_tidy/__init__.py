@@ -1,4 +1,7 @@
-"""kornia_tidy: a differentiable camera with programmable phase masks that change during the exposure."""
+"""kornia_tidy: a differentiable camera with programmable phase masks that change during the exposure.
+
+The names below are imported when they are first asked for, so that the help of the command comes at once.
+"""
 
 from __future__ import annotations
 
@@ -7,24 +10,25 @@ from kornia_tidy.runtime.signals import end_on_signals, is_command
 if is_command():
     end_on_signals()  # during the imports that follow, which take seconds
 
+from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
-
-from kornia_tidy.camera.burst import burst
-from kornia_tidy.camera.motion import moving_capture
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks.fresnel import FresnelLens
-from kornia_tidy.masks.no_mask import NoMask
-from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.modulator.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
-from kornia_tidy.modulator.switching import Switching
-from kornia_tidy.optics.spectrum import Spectrum
-from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.sensor.noise import SensorNoise
 
 if TYPE_CHECKING:
     from kornia_tidy.augmentation.arrays import reconstruct, simulate
+    from kornia_tidy.camera.burst import burst
+    from kornia_tidy.camera.motion import moving_capture
+    from kornia_tidy.camera.tidy_optics import TiDyOptics
+    from kornia_tidy.fidelity import Fidelity
+    from kornia_tidy.masks.fresnel import FresnelLens
+    from kornia_tidy.masks.no_mask import NoMask
+    from kornia_tidy.masks.pixelwise import PixelwiseMask
+    from kornia_tidy.modulator.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator
+    from kornia_tidy.modulator.switching import Switching
+    from kornia_tidy.optics.spectrum import Spectrum
+    from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
+    from kornia_tidy.psf.psf_bank import PSFBank
+    from kornia_tidy.sensor.noise import SensorNoise
 
 __version__ = "0.1.0"
 
@@ -49,11 +53,36 @@ __all__ = [
     "simulate",
 ]
 
+_MODULES = {
+    "augmentation.arrays": ("reconstruct", "simulate"),
+    "camera.burst": ("burst",),
+    "camera.motion": ("moving_capture",),
+    "camera.tidy_optics": ("TiDyOptics",),
+    "fidelity": ("Fidelity",),
+    "masks.fresnel": ("FresnelLens",),
+    "masks.no_mask": ("NoMask",),
+    "masks.pixelwise": ("PixelwiseMask",),
+    "modulator.modulator": ("DwellTimes", "LearnableDwellTimes", "SpatialLightModulator"),
+    "modulator.switching": ("Switching",),
+    "optics.spectrum": ("Spectrum",),
+    "optics.thin_lens": ("DefocusRange", "ThinLensCamera"),
+    "psf.psf_bank": ("PSFBank",),
+    "sensor.noise": ("SensorNoise",),
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+
 
 def __getattr__(name: str) -> Any:
-    """Import the functions on arrays when they are first asked for: they need much of the package."""
-    if name not in {"reconstruct", "simulate"}:
+    """Import a public name, or a package, when it is first asked for."""
+    if name in _HOMES:
+        value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    elif not name.startswith("_") and find_spec(f"{__name__}.{name}"):
+        value = import_module(f"{__name__}.{name}")
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from kornia_tidy.augmentation import arrays  # noqa: PLC0415
+    globals()[name] = value
+    return value
 
-    return getattr(arrays, name)
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

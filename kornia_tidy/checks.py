@@ -6,12 +6,12 @@ separate from checks of shapes and types.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
-from torch import Tensor
+if TYPE_CHECKING:  # settings check their values too, and a command's help does not wait for torch
+    from torch import Tensor
 
 
 def check_choice(name: str, value: Any, allowed: Collection[Any]) -> None:
@@ -46,6 +46,7 @@ def check_part(name: str, value: Any, kind: type | tuple[type, ...], example: st
     """Raise ``TypeError`` unless ``value`` has a type and, if given, an attribute.
 
     Example:
+        >>> import torch
         >>> check_part("masks", 5, torch.nn.Module, "phase masks such as PixelwiseMask(5)")
         Traceback (most recent call last):
         TypeError: masks must be phase masks such as PixelwiseMask(5), got the number 5
@@ -61,12 +62,14 @@ def unmasked(name: str, value: Any) -> Any:
         ValueError: if a value is masked.
 
     Example:
+        >>> import numpy as np
         >>> unmasked("image", np.ma.masked_equal([[3, 9]], 9))
         Traceback (most recent call last):
         ValueError: image must be known at every pixel, and 1 of its 2 values are masked: fill them first, such as \
 with image.filled(0)
     """
-    if not isinstance(value, np.ma.MaskedArray):
+    np = sys.modules.get("numpy")
+    if np is None or not isinstance(value, np.ma.MaskedArray):
         return value
     if masked := np.ma.count_masked(value):
         raise ValueError(
@@ -78,6 +81,8 @@ with image.filled(0)
 
 def check_generator(generator: Any) -> None:
     """Raise ``TypeError`` unless ``generator`` is None or a torch.Generator."""
+    import torch  # noqa: PLC0415
+
     if generator is not None and not isinstance(generator, torch.Generator):
         seed = generator if type(generator) is int else 0
         raise TypeError(
@@ -99,6 +104,7 @@ def printed(value: Tensor, digits: int = 3) -> str:
     """Return the numbers of a tensor in short, for the description of a module; the meta device has none.
 
     Example:
+        >>> import torch
         >>> printed(torch.tensor(0.0301)), printed(torch.tensor([0.5, 0.25])), printed(torch.ones(2, device="meta"))
         ('0.0301', '(0.5, 0.25)', 'unset')
     """
@@ -110,7 +116,9 @@ def printed(value: Tensor, digits: int = 3) -> str:
 
 def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
     """Raise ``TypeError`` unless ``value`` is a floating-point tensor, ``ValueError`` unless it has this rank."""
-    if not isinstance(value, Tensor):
+    import torch  # noqa: PLC0415
+
+    if not isinstance(value, torch.Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
     if not value.is_floating_point():
         raise TypeError(
@@ -137,6 +145,8 @@ def _as_float(name: str, value: Tensor) -> str:
     """Return the hint for converting an integer tensor to floating point."""
     if name.startswith("depth"):
         return f": convert it with {name}.float() * 0.001 if it is in millimetres"
+    import torch  # noqa: PLC0415
+
     if name.startswith("image") and value.dtype not in (torch.bool, torch.complex64, torch.complex128):
         return f": convert it with {name}.float() / {255 if value.dtype == torch.uint8 else 65535}"
     return ""
@@ -144,6 +154,8 @@ def _as_float(name: str, value: Tensor) -> str:
 
 def check_finite(name: str, value: Tensor) -> None:
     """Raise ``ValueError`` if a value is NaN or infinite. Waits for the device."""
+    import torch  # noqa: PLC0415
+
     if not value.numel():
         return
     check_values(name, value)

@@ -2,39 +2,57 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 import os
 import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
+from importlib import import_module
 from typing import Any, TextIO
 
-import torch
-
 import kornia_tidy
-from kornia_tidy.app import command as app
-from kornia_tidy.commands import (
-    demo,
-    design,
-    evaluate,
-    info,
-    masks,
-    psf,
-    raw,
-    render,
-    simulate,
-    systems,
-    trade,
-    train,
-)
+from kornia_tidy.commands.parser import Parser, read
 from kornia_tidy.runtime.signals import Stopped, ignore_interruption, raised_signals, status_and_sentence
+from kornia_tidy.settings import documented
 
-# Each has add_parser(subparsers), which sets run(args).
-COMMANDS = (simulate, demo, design, systems, psf, masks, raw, train, evaluate, render, trade, app, info)
+Commands = Mapping[str, "str | Commands"]
+
+COMMANDS: Commands = {
+    "simulate": "commands.simulate:Simulate",
+    "demo": "commands.demo:Demo",
+    "design": "commands.design:Design",
+    "systems": "commands.systems:Systems",
+    "psf": "commands.psf:Psf",
+    "masks": {
+        "show": "commands.masks:ShowMasks",
+        "export": "commands.masks:ExportMasks",
+        "import": "commands.masks:ImportMasks",
+    },
+    "raw": {
+        "info": "commands.raw_info:InfoOfRaw",
+        "develop": "commands.raw_develop:DevelopRaw",
+        "reconstruct": "commands.raw_reconstruct:ReconstructRaw",
+        "calibrate-noise": "commands.raw_calibrate_noise:CalibrateNoise",
+        "calibrate-psf": "commands.raw_calibrate_psf:CalibratePsf",
+        "simulate": "commands.raw_simulate:SimulateRaw",
+    },
+    "train": "commands.train:Train",
+    "evaluate": "commands.evaluate:Evaluate",
+    "render": "commands.render:Render",
+    "trade": "commands.trade:Trade",
+    "app": "app.command:App",
+    "info": "commands.info:Info",
+}
+"""Commands by name: module and class, or the commands of a group."""
+ABOUT = {
+    "masks": "Masks -> SLM frames, heights, STL; and back.",
+    "raw": "Camera raw files: what they hold, pictures of them, calibrations, reconstructions.",
+}
+"""What the groups do."""
 
 # Exit statuses; 70 is EX_SOFTWARE of sysexits.h, 141 is 128 and the number of SIGPIPE.
 DONE, CANNOT, BUG, NOBODY_READS = 0, 2, 70, 141
@@ -76,8 +94,8 @@ def _run(argv: Sequence[str] | None) -> int:
     """Run the command line; return its exit status."""
     try:
         try:
-            args = build_parser().parse_args(argv)
-            args.run(args)
+            command = read_command(sys.argv[1:] if argv is None else argv)
+            command.run()
         except SystemExit:
             sys.stdout.flush()  # of --help
             raise
@@ -147,28 +165,50 @@ def _told(error: Exception) -> int:
 
 def _is_out_of_memory(error: Exception) -> bool:
     """Return whether an error means exhausted memory, also for generic errors of PyTorch and OpenCV on the CPU."""
-    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+    torch = sys.modules.get("torch")
+    if isinstance(error, MemoryError) or (torch is not None and isinstance(error, torch.OutOfMemoryError)):
         return True
     text = str(error)
     return (isinstance(error, RuntimeError) and "allocate memory" in text) or "Insufficient memory" in text
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose help does not vanish without a word where nothing can be written."""
+def read_command(argv: Sequence[str]) -> Any:
+    """Return the command that the arguments ask for, with its settings.
 
-    def _print_message(self, message: str, file: Any = None) -> None:
-        if message:
-            (file or sys.stderr).write(message)
+    Raises:
+        SystemExit: after ``--help``, or arguments that cannot be read.
+        ValueError: if a value is not allowed.
+    """
+    commands, prog, words = COMMANDS, "kornia-tidy", list(argv)
+    while True:
+        name = words[0] if words else ""
+        if name not in commands:
+            parser = _overview(commands, prog)
+            if name and not name.startswith("-"):
+                meant = get_close_matches(name, commands, 1)
+                parser.error(f"there is no command {name}" + (f": did you mean {meant[0]}?" if meant else ""))
+            parser.parse_args(words)
+        chosen, prog, words = commands[name], f"{prog} {name}", words[1:]
+        if isinstance(chosen, str):
+            return read(_class(chosen), words, prog)
+        commands = chosen
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command and all its subcommands."""
-    parser = _Parser(prog="kornia-tidy", description=DESCRIPTION)
-    parser.add_argument("--version", action="version", version=f"kornia-tidy {kornia_tidy.__version__}")
-    subparsers = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
-    for command in COMMANDS:
-        command.add_parser(subparsers)
+def _overview(commands: Commands, prog: str) -> Parser:
+    """Return a parser that lists commands, and refuses to be without one."""
+    parser = Parser(prog=prog, description=ABOUT.get(prog.rsplit(maxsplit=1)[-1], DESCRIPTION))
+    if commands is COMMANDS:
+        parser.add_argument("--version", action="version", version=f"kornia-tidy {kornia_tidy.__version__}")
+    actions = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+    for name, chosen in commands.items():
+        actions.add_parser(name, help=ABOUT[name] if isinstance(chosen, dict) else documented(_class(chosen))[0])
     return parser
+
+
+def _class(path: str) -> type:
+    """Return the class of a command."""
+    module, _, name = path.partition(":")
+    return getattr(import_module(f"kornia_tidy.{module}"), name)
 
 
 def _sentence(error: BaseException) -> str:

@@ -113,7 +113,7 @@ def real(most: int, size: int) -> list[dict[str, Any]]:
 
     Depths are stretched over the range of :data:`REFERENCE`; the middle of each picture is kept.
     """
-    from kornia_tidy.commands.demo import stretched  # noqa: PLC0415
+    from kornia_tidy.inference.tasks import stretched  # noqa: PLC0415
     from tests.scenes import ENTRIES, load_scene  # noqa: PLC0415
 
     scenes = []

@@ -14,13 +14,12 @@ from torch import Tensor
 from kornia_tidy.app.scenes import chart, read_files
 from kornia_tidy.app.settings import AS_SYSTEM, FILES, FLAT, OWN, Settings
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.commands.demo import stretched
-from kornia_tidy.commands.options import middle_depths
 from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data.depth_range import middle_depths
 from kornia_tidy.data.photographic_leaves import photographic_leaves
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.tasks import normalised_inverse_depth, split_maps
+from kornia_tidy.inference.tasks import normalised_inverse_depth, split_maps, stretched
 from kornia_tidy.inference.trained import TrainedSystem, update_psfs
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask

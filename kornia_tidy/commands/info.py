@@ -1,59 +1,49 @@
-"""`kornia-tidy info`: versions, processor, compiler and compiled code of this machine, for bug reports."""
+"""`kornia-tidy info`: the environment of the library."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import re
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from pathlib import Path
-from typing import Any
-
-import torch
-
-import kornia_tidy
-from kornia_tidy.commands.report import tell
-from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops, srgb_ops
-from kornia_tidy.kernels.build import REALS, build, cache_folder, vector_bytes
-from kornia_tidy.kernels.compiler import Compiler, find_compiler
-
-DESCRIPTION = """\
-Print the environment of kornia_tidy: versions of packages, processor and threads, the C
-compiler, and the compiled kernels: those of the wheel, with their level of processors, or
-those compiled here, with their cache folder. Kernels that are not compiled yet are compiled,
-which takes some seconds. Please include this in bug reports.
-"""
 
 PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
     *("lightning", "matplotlib", "h5py", "OpenEXR"),
 )
-SOURCES = tuple(ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, srgb_ops))
 
 
-def add_parser(subparsers: Any) -> None:
-    """Describe the command to argparse."""
-    parser = subparsers.add_parser(
-        "info",
-        help="versions, processor, compiler and compiled code, for bug reports",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
+@dataclass(frozen=True, kw_only=True)
+class Info:
+    """Versions, processor, compiler and compiled code of this machine, for bug reports.
 
+    The compiled kernels are those of the wheel, with their level of processors, or those
+    compiled here, with their cache folder. Kernels that are not compiled yet are compiled,
+    which takes some seconds. Please include this in bug reports.
+    """
 
-def run(_: argparse.Namespace) -> None:
-    """Print the report line by line."""
-    for topic, text in lines():
-        tell(topic, _without_home(text))
+    def run(self) -> None:
+        """Print the report line by line."""
+        from kornia_tidy.commands.report import tell
+
+        for topic, text in lines():
+            tell(topic, _without_home(text))
 
 
 def lines() -> Iterator[tuple[str, str]]:
     """Yield the lines of the report as topics and texts."""
+    import torch
+
+    import kornia_tidy
+    from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops, srgb_ops
+    from kornia_tidy.kernels.build import REALS, build, vector_bytes
+
+    sources = (ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, srgb_ops))
     yield "package", f"kornia_tidy {kornia_tidy.__version__}, Python {platform.python_version()}"
     yield "uses", ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
     yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}"
@@ -64,7 +54,7 @@ def lines() -> Iterator[tuple[str, str]]:
         f"MKL {'yes' if torch.backends.mkl.is_available() else 'no'}, accelerator {_accelerator()}",
     )
     yield "compiler", _compiler()
-    for source, dtype in product(SOURCES, REALS):
+    for source, dtype in product(sources, REALS):
         name = f"{source.name}, {str(dtype).removeprefix('torch.')}"
         built = build(source, dtype)
         if built.path is None or built.library is None:
@@ -93,20 +83,26 @@ def _processor_name() -> str:
 
 
 def _accelerator() -> str:
+    import torch
+
     if torch.cuda.is_available():
         return ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
     return "mps" if torch.backends.mps.is_available() else "none"
 
 
 def _compiler() -> str:
+    from kornia_tidy.kernels.compiler import find_compiler
+
     try:
-        compiler: Compiler = find_compiler()
+        compiler = find_compiler()
     except RuntimeError as error:
         return str(error)
     return f"{' '.join((*compiler.program, *compiler.options))}: {compiler.version}"
 
 
 def _cache() -> str:
+    from kornia_tidy.kernels.build import cache_folder
+
     try:
         folder = cache_folder()
     except OSError as error:

@@ -2,92 +2,86 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from kornia_tidy.commands.raw_options import add_dump_options, check_outputs, open_raw
-from kornia_tidy.commands.report import Stages, tell
+from kornia_tidy.commands.parser import Optional
+from kornia_tidy.commands.raw_options import Dump, RawFiles
+from kornia_tidy.commands.shared import File, check_outputs
+from kornia_tidy.settings import Unit
 
 if TYPE_CHECKING:
     from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
-
-DESCRIPTION = """\
-Measure a camera's noise at one ISO setting by photon transfer: a fit of the variance
-of the counts over their level gives the electrons per count (gain) and the noise
-without light (read noise). FILES are
-  flats     two or more captures of each exposure, in any order, of a static scene:
-            best an evenly lit sheet out of focus, from dark to nearly saturated.
-            Differences of captures are measured, so that scene and fixed pattern
-            cancel
-  one file  any scene with smooth areas of different brightness. Noise is separated
-            from texture block by block; the printed error shows how reliably
-Pictures that do not allow a calibration are refused with the reason.
-"""
-
-EXAMPLES = """\
-examples:
-  Pairs of flats at ISO 800, with two captures under the lens cap:
-    kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json --plot
-
-  From a single picture:
-    kornia-tidy raw calibrate-noise street.cr2 -o noise.json
-
-In Python:
-  from kornia_tidy.calibration.noise.photon_transfer import read_json
-  sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
-"""
 
 STRAIGHT = 0.99  # R² above which the curve is reported as a straight line
 DOTS_PER_INCH = 150
 
 
-def add_parser(subparsers: Any) -> None:
-    """Describe the subcommand to argparse."""
-    parser = subparsers.add_parser(
-        "calibrate-noise",
-        help="measure gain and read noise",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
-    parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files of one camera and ISO")
-    parser.add_argument(
-        "--dark", nargs="+", default=[], metavar="FILES", help="captures without light: black is measured in them"
-    )
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.json", help="where the calibration goes")
-    parser.add_argument(
-        "--plot",
-        nargs="?",
-        const="",
-        metavar="OUT.png",
-        help="draw the photon-transfer curve (default: OUT.png beside OUT.json)",
-    )
-    add_dump_options(parser)
+@dataclass(frozen=True, kw_only=True)
+class CalibrateNoise:
+    """Measure gain and read noise.
 
+    At one ISO setting, by photon transfer: a fit of the variance of the counts over their
+    level gives the electrons per count (gain) and the noise without light (read noise).
+    FILES are
+      flats     two or more captures of each exposure, in any order, of a static scene:
+                best an evenly lit sheet out of focus, from dark to nearly saturated.
+                Differences of captures are measured, so that scene and fixed pattern
+                cancel
+      one file  any scene with smooth areas of different brightness. Noise is separated
+                from texture block by block; the printed error shows how reliably
+    Pictures that do not allow a calibration are refused with the reason.
 
-def run(args: argparse.Namespace) -> None:
-    """Calibrate, write the results, and print a summary."""
-    output = Path(args.output)
-    plot = None if args.plot is None else Path(args.plot or output.with_suffix(".png"))
-    _check_outputs(output, plot, [*args.files, *args.dark])
-    from kornia_tidy.calibration.noise.photon_transfer import photon_transfer, write_json  # noqa: PLC0415
+    Args:
+        files: camera raw files of one camera and ISO.
+        output: where the calibration goes, OUT.json.
+        dark: captures without light: black is measured in them.
+        plot: draw the photon-transfer curve, without a name as OUT.png beside OUT.json. None: it is not drawn.
+        dump: what a headerless file holds.
+    """
 
-    stages = Stages()
-    with stages("read"):
-        captures, darks = ([open_raw(path, args) for path in paths] for paths in (args.files, args.dark))
-    with stages("measure"):
-        result = photon_transfer(captures, darks)
-    with stages("write"):
-        write_json(output, result)
-        if plot is not None:
-            _draw(result, plot)
-    for topic, text in in_words(result):
-        tell(topic, text)
-    tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
-    tell("time", stages.summary())
+    files: RawFiles
+    output: Annotated[str, Unit("OUT.json")]
+    dark: tuple[File, ...] = ()
+    plot: Annotated[str, Optional("OUT.png")] | None = None
+    dump: Dump = field(default_factory=Dump)
+
+    notes: ClassVar = """\
+In Python:
+  from kornia_tidy.calibration.noise.photon_transfer import read_json
+  sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
+"""
+    examples: ClassVar = """\
+  Pairs of flats at ISO 800, with two captures under the lens cap:
+    kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json --plot
+
+  From a single picture:
+    kornia-tidy raw calibrate-noise street.cr2 -o noise.json
+"""
+
+    def run(self) -> None:
+        """Calibrate, write the results, and print a summary."""
+        output = Path(self.output)
+        plot = None if self.plot is None else Path(self.plot or output.with_suffix(".png"))
+        _check_outputs(output, plot, [*self.files, *self.dark])
+        from kornia_tidy.calibration.noise.photon_transfer import photon_transfer, write_json
+        from kornia_tidy.commands.report import Stages, tell
+
+        stages = Stages()
+        with stages("read"):
+            captures, darks = ([self.dump.open(path) for path in paths] for paths in (self.files, self.dark))
+        with stages("measure"):
+            result = photon_transfer(captures, darks)
+        with stages("write"):
+            write_json(output, result)
+            if plot is not None:
+                _draw(result, plot)
+        for topic, text in in_words(result):
+            tell(topic, text)
+        tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
+        tell("time", stages.summary())
 
 
 def in_words(result: PhotonTransfer) -> list[tuple[str, str]]:
@@ -116,8 +110,8 @@ def in_words(result: PhotonTransfer) -> list[tuple[str, str]]:
 
 
 def _draw(result: PhotonTransfer, path: Path) -> None:
-    from kornia_tidy.figures.transfer import draw_transfer  # noqa: PLC0415
-    from kornia_tidy.files import write_bytes  # noqa: PLC0415
+    from kornia_tidy.figures.transfer import draw_transfer
+    from kornia_tidy.files import write_bytes
 
     picture = BytesIO()
     draw_transfer(result).savefig(picture, dpi=DOTS_PER_INCH, format=path.suffix[1:])
@@ -127,8 +121,8 @@ def _draw(result: PhotonTransfer, path: Path) -> None:
 def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:
     """Check before any work that outputs can be written and do not replace captures."""
     if plot is not None:
-        from kornia_tidy.checks import check_choice  # noqa: PLC0415
-        from kornia_tidy.figures.style import require_matplotlib  # noqa: PLC0415
+        from kornia_tidy.checks import check_choice
+        from kornia_tidy.figures.style import require_matplotlib
 
         require_matplotlib()
         check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))

@@ -2,39 +2,64 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import torch
-from torch import Tensor
+from kornia_tidy.choices import ADAPTATIONS, DEMOSAIC, HIGHLIGHTS
+from kornia_tidy.commands.raw_options import Dump, RawFiles, WhiteBalance, for_each_file, white_balance
+from kornia_tidy.commands.shared import Folder
+from kornia_tidy.settings import one_of
 
-from kornia_tidy.commands.raw_options import add_dump_options, for_each_file, open_raw
-from kornia_tidy.commands.report import Stages, tell
-from kornia_tidy.data.image_files import write_image
-from kornia_tidy.raw.capture import RawCapture
-from kornia_tidy.raw.color import ADAPTATIONS, ASSUMED_CAMERA
-from kornia_tidy.raw.demosaic import METHODS
-from kornia_tidy.raw.develop import (
-    HIGHLIGHTS,
-    WHITE_BALANCES,
-    balance_factors,
-    default_method,
-    develop,
-    encode,
-    matrix_origin,
-)
+if TYPE_CHECKING:
+    from torch import Tensor
 
-DESCRIPTION = """\
-Develop raw files into pictures: black and white levels, white balance, demosaicing,
-colour conversion to sRGB, upright orientation and square pixels. Nothing is
-brightened, sharpened or denoised. Each FILE becomes FOLDER/FILE.png, 16 bits, and a
-preview FOLDER/FILE.jpg. Files are written atomically.
-"""
+    from kornia_tidy.raw.capture import RawCapture
 
-EXAMPLES = """\
-examples:
+SUFFIXES = {"png": ".png", "tiff": ".tif"}
+Format = Annotated[str, one_of(("png", "tiff"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DevelopRaw:
+    """Make pictures of raw files.
+
+    Black and white levels, white balance, demosaicing, colour conversion to sRGB, upright
+    orientation and square pixels. Nothing is brightened, sharpened or denoised. Each FILE
+    becomes FOLDER/FILE.png, 16 bits, and a preview FOLDER/FILE.jpg. Files are written
+    atomically. Exit status 2 if any file failed; the others are developed all the same.
+
+    Args:
+        files: camera raw files.
+        output: where to; made if it is not there.
+        format: of the 16-bit picture.
+        no_preview: no JPEG beside it.
+        resume: keep pictures that are there, develop the others.
+        demosaic: method. None: LibRaw's AHD for Bayer, Markesteijn's for X-Trans, else bilinear.
+        white_balance: as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour.
+            None: as shot, else daylight, else none.
+        highlights: clip all channels where the first saturates, or keep what others saw above.
+        adaptation: chromatic adaptation of eyes. None: only the white balance, as LibRaw.
+        linear: linear light in the 16-bit picture, not encoded as sRGB.
+        sensor_grid: pixels as on the sensor: neither turned nor stretched.
+        dump: what a headerless file holds.
+    """
+
+    files: RawFiles
+    output: Folder
+    format: Format = "png"
+    no_preview: bool = False
+    resume: bool = False
+    demosaic: Annotated[str, one_of(DEMOSAIC)] | None = None
+    white_balance: WhiteBalance = ()
+    highlights: Annotated[str, one_of(HIGHLIGHTS)] = "clip"
+    adaptation: Annotated[str, one_of(ADAPTATIONS)] | None = None
+    linear: bool = False
+    sensor_grid: bool = False
+    dump: Dump = field(default_factory=Dump)
+
+    examples: ClassVar = """\
   All files of a folder; if interrupted, go on with --resume:
     kornia-tidy raw develop shots/*.dng -o pictures
 
@@ -47,108 +72,71 @@ examples:
   A headerless dump of counts, with factors for red, green and blue:
     kornia-tidy raw develop dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520 \\
         --white-balance 1.9 1 1.5 -o pictures
-
-The first one in Python:
+"""
+    notes: ClassVar = """\
+The first example in Python:
   from kornia_tidy.data.image_files import write_image
   from kornia_tidy.raw.capture import RawCapture
   write_image("pictures/shot.png", develop(RawCapture.open("shots/shot.dng")), bits=16)
-
-Exit status 2 if any file failed; the others are developed all the same.
 """
 
-SUFFIXES = {"png": ".png", "tiff": ".tif"}
+    def run(self) -> None:
+        """Develop raw files."""
+        import torch
 
+        from kornia_tidy.commands.report import Stages, tell
+        from kornia_tidy.data.image_files import write_image
+        from kornia_tidy.raw.develop import develop, encode
 
-def add_parser(subparsers: Any) -> None:
-    """Describe the subcommand to argparse."""
-    parser = subparsers.add_parser(
-        "develop",
-        help="make pictures of raw files",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
-    parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files")
-    parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="where to; made if it is not there")
-    parser.add_argument("--format", choices=tuple(SUFFIXES), default="png", help="of the 16-bit picture (default: png)")
-    parser.add_argument("--no-preview", action="store_true", help="no JPEG beside it")
-    parser.add_argument("--resume", action="store_true", help="keep pictures that are there, develop the others")
+        balance = white_balance(self.white_balance)
+        folder = Path(self.output)
+        suffixes = [SUFFIXES[self.format], *([] if self.no_preview else [".jpg"])]
+        outputs = output_paths(self.files, folder, suffixes)
+        folder.mkdir(parents=True, exist_ok=True)
+        done = {"developed": 0, "kept": 0}
+        stages = Stages()
 
-    look = parser.add_argument_group("developing")
-    look.add_argument(
-        "--demosaic",
-        choices=METHODS,
-        metavar="METHOD",
-        help=f"{', '.join(METHODS)} (default: LibRaw's AHD for Bayer, Markesteijn's for X-Trans, else bilinear)",
-    )
-    add_white_balance_option(look)
-    look.add_argument(
-        "--highlights",
-        choices=HIGHLIGHTS,
-        default="clip",
-        help="clip all channels where the first saturates, or keep what others saw above (default: clip)",
-    )
-    look.add_argument(
-        "--adaptation",
-        choices=ADAPTATIONS,
-        help="chromatic adaptation of eyes (default: none but the white balance, as LibRaw)",
-    )
-    look.add_argument("--linear", action="store_true", help="linear light in the 16-bit picture, not encoded as sRGB")
-    look.add_argument(
-        "--sensor-grid", action="store_true", help="pixels as on the sensor: neither turned nor stretched"
-    )
-    add_dump_options(parser)
-
-
-def run(args: argparse.Namespace) -> None:
-    """Develop raw files."""
-    white_balance = parse_white_balance(args.white_balance)
-    folder = Path(args.output)
-    suffixes = [SUFFIXES[args.format], *([] if args.no_preview else [".jpg"])]
-    outputs = output_paths(args.files, folder, suffixes)
-    folder.mkdir(parents=True, exist_ok=True)
-    done = {"developed": 0, "kept": 0}
-    stages = Stages()
-
-    def work(path: str) -> None:
-        place = f"{list(outputs).index(path) + 1}/{len(outputs)}"
-        paths = outputs[path]
-        if args.resume and all(output.exists() for output in paths):
-            done["kept"] += 1
-            tell(place, f"{path}: kept {paths[0]}")
-            return
-        with stages("decode"):
-            raw = open_raw(path, args)
-        with stages("develop"), torch.no_grad():
-            image = develop(
-                raw,
-                args.demosaic,
-                white_balance=white_balance,
-                highlights=args.highlights,
-                adaptation=args.adaptation,
-                encoded=False,
-                square_pixels=not args.sensor_grid,
-                upright=not args.sensor_grid,
+        def work(path: str) -> None:
+            place = f"{list(outputs).index(path) + 1}/{len(outputs)}"
+            paths = outputs[path]
+            if self.resume and all(output.exists() for output in paths):
+                done["kept"] += 1
+                tell(place, f"{path}: kept {paths[0]}")
+                return
+            with stages("decode"):
+                raw = self.dump.open(path)
+            with stages("develop"), torch.no_grad():
+                image = develop(
+                    raw,
+                    self.demosaic,
+                    white_balance=balance,
+                    highlights=self.highlights,
+                    adaptation=self.adaptation,
+                    encoded=False,
+                    square_pixels=not self.sensor_grid,
+                    upright=not self.sensor_grid,
+                )
+                clipped = clipped_in_words(image)
+                encoded = encode(image.clamp_(0, 1))
+            with stages("write"):
+                for output in reversed(paths):  # the preview is written first, so that a picture means that both exist
+                    if output.suffix == ".jpg":
+                        write_image(output, encoded)
+                    else:
+                        write_image(output, image if self.linear else encoded, bits=16)
+            done["developed"] += 1
+            tell(
+                place,
+                f"{path}: {image.shape[-1]} x {image.shape[-2]} px, {colors_in_words(raw, self.demosaic, balance)}",
             )
-            clipped = clipped_in_words(image)
-            encoded = encode(image.clamp_(0, 1))
-        with stages("write"):
-            for output in reversed(paths):  # the preview is written first, so that a picture means that both exist
-                if output.suffix == ".jpg":
-                    write_image(output, encoded)
-                else:
-                    write_image(output, image if args.linear else encoded, bits=16)
-        done["developed"] += 1
-        tell(place, f"{path}: {image.shape[-1]} x {image.shape[-2]} px, {colors_in_words(raw, args, white_balance)}")
-        tell("", f"{clipped}; wrote {paths[0]}")
+            tell("", f"{clipped}; wrote {paths[0]}")
 
-    try:
-        for_each_file(list(outputs), work)
-    finally:
-        missing = len(outputs) - sum(done.values())
-        tell("files", f"{done['developed']} developed, {done['kept']} kept, {missing} failed or left")
-        tell("time", stages.summary())
+        try:
+            for_each_file(list(outputs), work)
+        finally:
+            missing = len(outputs) - sum(done.values())
+            tell("files", f"{done['developed']} developed, {done['kept']} kept, {missing} failed or left")
+            tell("time", stages.summary())
 
 
 def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) -> dict[str, list[Path]]:
@@ -172,54 +160,29 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
     return outputs
 
 
-def add_white_balance_option(group: Any) -> None:
-    """Add the option read by :func:`parse_white_balance`."""
-    group.add_argument(
-        "--white-balance",
-        nargs="+",
-        metavar="WB",
-        help="as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour "
-        "(default: as shot, else daylight, else none)",
-    )
-
-
-def parse_white_balance(words: Sequence[str] | None) -> str | Tensor | None:
-    """Return the white balance of the arguments: a name, factors, or None for the default.
-
-    Example:
-        >>> parse_white_balance(["as-shot"]), parse_white_balance(["2", "1", "1.5"])
-        ('as shot', tensor([2.0000, 1.0000, 1.5000]))
-    """
-    if words is None:
-        return None
-    if len(words) == 1 and words[0].replace("-", " ") in WHITE_BALANCES:
-        return words[0].replace("-", " ")
-    try:
-        return torch.tensor([float(word) for word in words])
-    except ValueError:
-        names = ", ".join(name.replace(" ", "-") for name in WHITE_BALANCES)
-        raise ValueError(f"--white-balance is {names}, or factors, got {' '.join(words)}") from None
-
-
-def colors_in_words(raw: RawCapture, args: argparse.Namespace, white_balance: str | Tensor | None) -> str:
+def colors_in_words(raw: RawCapture, demosaic: str | None, balance: str | Tensor | None) -> str:
     """Describe the colour matrix and the white balance of a picture."""
+    from kornia_tidy.raw.color import ASSUMED_CAMERA
+    from kornia_tidy.raw.develop import balance_factors, default_method, matrix_origin
+
     if not raw.colors:
         return "monochrome"
-    factors = balance_factors(raw, white_balance)
-    balance = " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, factors.tolist(), strict=True))
-    method = "no filter array" if raw.pattern is None else args.demosaic or default_method(raw)
+    factors = balance_factors(raw, balance)
+    shown = " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, factors.tolist(), strict=True))
+    method = "no filter array" if raw.pattern is None else demosaic or default_method(raw)
     matrix = {
         "file": "the file's matrix",
         "model": "LibRaw's matrix of the camera",
         "assumed": f"no matrix: that of {ASSUMED_CAMERA} is assumed",
     }[matrix_origin(raw)]
-    return f"{method}, white balance {balance}, {matrix}"
+    return f"{method}, white balance {shown}, {matrix}"
 
 
 def clipped_in_words(image: Tensor) -> str:
     """Describe the share of a linear picture that a file of [0, 1] clips.
 
     Example:
+        >>> import torch
         >>> clipped_in_words(torch.tensor([[[-0.1, 0.5, 1.0, 1.2]]]))
         '25 % of its values lie above white and 25 % below black, and are clipped'
     """

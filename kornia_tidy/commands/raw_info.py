@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from torch import Tensor
+from kornia_tidy.commands.raw_options import Dump, RawFiles, for_each_file
 
-from kornia_tidy.commands.raw_options import add_dump_options, for_each_file, open_raw
-from kornia_tidy.commands.report import tell
-from kornia_tidy.raw.capture import RawCapture, RawInfo
+if TYPE_CHECKING:
+    from torch import Tensor
 
-DESCRIPTION = """\
-Print the properties of raw files: camera, lens and exposure; size and filter array of
-the visible area; black and white levels and the range of the counts; white balance as
-shot, colour matrices and orientation; opcodes of a DNG that are not applied. Every file is
-decoded completely, so a file that is listed can be developed.
-"""
-
-EXAMPLES = """\
-examples:
-  All files of a folder, those that fail are named at the end:
-    kornia-tidy raw info shots/*.dng
-
-  For a script, one object a file:
-    kornia-tidy raw info --json shots/*.dng > shots.json
-
-  A bare dump of counts, 16 bits each:
-    kornia-tidy raw info dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520
-
-Exit status 2 if any file failed.
-"""
+    from kornia_tidy.raw.capture import RawCapture, RawInfo
 
 FLIPS = {
     0: "is upright",
@@ -45,44 +25,61 @@ FLIPS = {
 }
 
 
-def add_parser(subparsers: Any) -> None:
-    """Describe the subcommand to argparse."""
-    parser = subparsers.add_parser(
-        "info",
-        help="properties of raw files",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files")
-    parser.add_argument("--json", action="store_true", help="print one JSON array, an object for each file")
-    add_dump_options(parser)
-    parser.set_defaults(run=run)
+@dataclass(frozen=True, kw_only=True)
+class InfoOfRaw:
+    """Properties of raw files.
 
+    Printed are camera, lens and exposure; size and filter array of the visible area; black
+    and white levels and the range of the counts; white balance as shot, colour matrices and
+    orientation; opcodes of a DNG that are not applied. Every file is decoded completely, so
+    a file that is listed can be developed. Exit status 2 if any file failed.
 
-def run(args: argparse.Namespace) -> None:
-    """Print the properties of raw files."""
-    objects: list[dict[str, Any]] = []
+    Args:
+        files: camera raw files.
+        json: print one JSON array, an object for each file.
+        dump: what a headerless file holds.
+    """
 
-    def look(path: str) -> None:
-        objects.append({"file": path})
+    files: RawFiles
+    json: bool = False
+    dump: Dump = field(default_factory=Dump)
+
+    examples: ClassVar = """\
+  All files of a folder, those that fail are named at the end:
+    kornia-tidy raw info shots/*.dng
+
+  For a script, one object a file:
+    kornia-tidy raw info --json shots/*.dng > shots.json
+
+  A bare dump of counts, 16 bits each:
+    kornia-tidy raw info dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520
+"""
+
+    def run(self) -> None:
+        """Print the properties of raw files."""
+        from kornia_tidy.commands.report import tell
+
+        objects: list[dict[str, Any]] = []
+
+        def look(path: str) -> None:
+            objects.append({"file": path})
+            try:
+                raw = self.dump.open(path)
+            except (OSError, ValueError) as error:
+                objects[-1]["error"] = str(error)
+                raise
+            objects[-1].update(as_json(raw))
+            if not self.json:
+                tell("file", path)
+                for topic, text in in_words(raw):
+                    tell(topic, text)
+                print(flush=True)
+
         try:
-            raw = open_raw(path, args)
-        except (OSError, ValueError) as error:
-            objects[-1]["error"] = str(error)
-            raise
-        objects[-1].update(as_json(raw))
-        if not args.json:
-            tell("file", path)
-            for topic, text in in_words(raw):
-                tell(topic, text)
-            print(flush=True)
-
-    try:
-        for_each_file(args.files, look)
-    finally:
-        if args.json:
-            print(json.dumps(objects, indent=2), flush=True)
+            for_each_file(self.files, look)
+        finally:
+            if self.json:
+                print(json.dumps(objects, indent=2), flush=True)
 
 
 def in_words(raw: RawCapture) -> list[tuple[str, str]]:
@@ -90,6 +87,7 @@ def in_words(raw: RawCapture) -> list[tuple[str, str]]:
 
     Example:
         >>> import torch
+        >>> from kornia_tidy.raw.capture import RawCapture
         >>> for line in in_words(RawCapture.from_counts(torch.tensor([[[64, 164], [264, 1023]]]), "RGGB", 64, 1023)):
         ...     print(*line)
         camera unknown

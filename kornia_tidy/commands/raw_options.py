@@ -1,79 +1,114 @@
-"""Shared options of the raw subcommands: headerless dumps, checks of outputs, and a loop over files."""
+"""Settings of the raw commands: headerless dumps, and a loop over files."""
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
-from kornia_tidy.files import check_writable
-from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.choices import WHITE_BALANCES
+from kornia_tidy.commands.parser import Argument, Parsed
+from kornia_tidy.settings import Unit, one_of
 
-DUMP_OPTIONS = ("size", "pattern", "black", "white", "dtype", "byte_order")
+if TYPE_CHECKING:
+    from torch import Tensor
 
+    from kornia_tidy.raw.capture import RawCapture
 
-def add_dump_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that describe a headerless dump of counts."""
-    group = parser.add_argument_group(
-        "bare dumps of counts",
-        "A headerless file needs a description: give --size, --pattern, --black\n"
-        "and --white, and all FILES are read as such dumps, row by row.",
-    )
-    group.add_argument("--size", type=size, metavar="WxH", help="columns x rows, such as 768x512")
-    group.add_argument(
-        "--pattern",
-        type=str.upper,
-        metavar="LETTERS",
-        help="colours of the filter array's tile, by rows: RGGB, GMYC, 36 letters for X-Trans; NONE for monochrome",
-    )
-    group.add_argument("--black", type=float, nargs="+", metavar="N", help="count without light, one or one a place")
-    group.add_argument(
-        "--white", type=float, metavar="N", help="saturation count; for raw files, replaces that of the file"
-    )
-    group.add_argument("--dtype", choices=("uint8", "uint16"), help="of a count (default: uint16)")
-    group.add_argument("--byte-order", choices=("little", "big"), help="of a count (default: little)")
+RawFiles = Annotated[tuple[str, ...], Argument("FILES")]
 
 
-def open_raw(path: str, args: argparse.Namespace) -> RawCapture:
-    """Open a raw file, or the dump that the options describe.
+def size(text: str) -> tuple[int, int]:
+    """Return rows and columns of WIDTHxHEIGHT.
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it cannot be read, or the options do not describe a dump.
+    Example:
+        >>> size("768x512")
+        (512, 768)
     """
-    if args.size is None:
-        for name in DUMP_OPTIONS:
-            if name != "white" and getattr(args, name) is not None:
-                raise ValueError(f"--{name.replace('_', '-')} is for bare dumps of counts: give --size too")
-        return RawCapture.open(path, white=args.white)
-    for name in ("pattern", "black", "white"):
-        if getattr(args, name) is None:
-            raise ValueError(f"a bare dump of counts needs --{name}")
-    return RawCapture.open_dump(
-        path,
-        args.size,
-        None if args.pattern == "NONE" else args.pattern,
-        args.black,
-        args.white,
-        args.dtype or "uint16",
-        args.byte_order or "little",
-    )
+    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+    if match is None:
+        raise ValueError(f"must be WIDTHxHEIGHT in pixels, such as 768x512, got {text!r}")
+    return int(match[2]), int(match[1])
 
 
-def check_outputs(outputs: Sequence[str | Path | None], inputs: Sequence[str | Path | None]) -> None:
-    """Check before any work that outputs can be written and do not replace inputs; None is skipped.
+Size = Annotated[tuple, Parsed("WxH", "pixels", read=size)]
+Pattern = Annotated[str, Parsed("LETTERS", read=str.upper)]
 
-    Raises:
-        FileNotFoundError: if a folder does not exist.
-        ValueError: if an output is a folder or an input.
+
+@dataclass(frozen=True, kw_only=True)
+class Dump:
+    """Bare dumps of counts.
+
+    A headerless file needs a description: give --size, --pattern, --black
+    and --white, and all FILES are read as such dumps, row by row.
+
+    Args:
+        size: columns x rows, such as 768x512.
+        pattern: colours of the filter array's tile, by rows: RGGB, GMYC, 36 letters for X-Trans; NONE for monochrome.
+        black: count without light, one or one a place.
+        white: saturation count; for raw files, replaces that of the file.
+        dtype: of a count. None: uint16.
+        byte_order: of a count. None: little.
     """
-    there = [Path(other) for other in inputs if other is not None and Path(other).exists()]
-    for path in (Path(output) for output in outputs if output is not None):
-        check_writable(path)
-        if path.exists() and any(path.samefile(other) for other in there):
-            raise ValueError(f"cannot write {path}: it is an input")
+
+    size: Size | None = None
+    pattern: Pattern | None = None
+    black: tuple[Annotated[float, Unit("N", "counts")], ...] = ()
+    white: Annotated[float, Unit("N", "counts")] | None = None
+    dtype: Annotated[str, one_of(("uint8", "uint16"))] | None = None
+    byte_order: Annotated[str, one_of(("little", "big"))] | None = None
+
+    def open(self, path: str) -> RawCapture:
+        """Open a raw file, or the dump that the options describe.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it cannot be read, or the options do not describe a dump.
+        """
+        from kornia_tidy.raw.capture import RawCapture
+
+        if self.size is None:
+            for name in ("pattern", "black", "dtype", "byte_order"):
+                if getattr(self, name) not in (None, ()):
+                    raise ValueError(f"--{name.replace('_', '-')} is for bare dumps of counts: give --size too")
+            return RawCapture.open(path, white=self.white)
+        for name in ("pattern", "black", "white"):
+            if getattr(self, name) in (None, ()):
+                raise ValueError(f"a bare dump of counts needs --{name}")
+        return RawCapture.open_dump(
+            path,
+            self.size,
+            None if self.pattern == "NONE" else self.pattern,
+            self.black,
+            self.white,
+            self.dtype or "uint16",
+            self.byte_order or "little",
+        )
+
+
+def white_balance(words: Sequence[str]) -> str | Tensor | None:
+    """Return the white balance of ``--white-balance``: a name, factors, or None for the default.
+
+    Example:
+        >>> white_balance(["as-shot"]), white_balance(["2", "1", "1.5"])
+        ('as shot', tensor([2.0000, 1.0000, 1.5000]))
+    """
+    import torch
+
+    if not words:
+        return None
+    if len(words) == 1 and words[0].replace("-", " ") in WHITE_BALANCES:
+        return words[0].replace("-", " ")
+    try:
+        return torch.tensor([float(word) for word in words])
+    except ValueError:
+        names = ", ".join(name.replace(" ", "-") for name in WHITE_BALANCES)
+        raise ValueError(f"--white-balance is {names}, or factors, got {' '.join(words)}") from None
+
+
+WhiteBalance = Annotated[tuple[str, ...], Unit("WB")]
 
 
 def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
@@ -94,11 +129,3 @@ def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
             print(f"kornia-tidy: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
     if failed:
         raise ValueError(f"{failed} of {len(paths)} files failed")
-
-
-def size(text: str) -> tuple[int, int]:
-    """Return rows and columns of WIDTHxHEIGHT."""
-    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
-    if match is None:
-        raise argparse.ArgumentTypeError(f"a size is WIDTHxHEIGHT in pixels, such as 768x512, got {text!r}")
-    return int(match[2]), int(match[1])

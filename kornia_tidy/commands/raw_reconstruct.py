@@ -2,63 +2,103 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import torch
-from kornia.color import rgb_to_linear_rgb
-from torch import Tensor
-
-from kornia_tidy.checks import check_positive
-from kornia_tidy.commands.file_jobs import Row, table, work_on_all
-from kornia_tidy.commands.options import add_noise_option, add_psfs_option, read_noise
-from kornia_tidy.commands.raw_develop import SUFFIXES, add_white_balance_option, output_paths, parse_white_balance
-from kornia_tidy.commands.raw_options import DUMP_OPTIONS, add_dump_options, open_raw
-from kornia_tidy.commands.report import tell
-from kornia_tidy.commands.system_options import CLOSED_FORM, digests, load_system
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import read_image, write_image
-from kornia_tidy.figures.depth import draw_depth
-from kornia_tidy.figures.style import require_matplotlib
-from kornia_tidy.files import parse_json, remove_leftovers, write_bytes
-from kornia_tidy.inference.heads import CLOSED_FORMS
-from kornia_tidy.inference.pretrained import PRETRAINED
-from kornia_tidy.inference.tasks import MAPS
-from kornia_tidy.raw.capture import RawCapture
-from kornia_tidy.raw.develop import develop
-from kornia_tidy.raw.developed_noise import developed_noise
-from kornia_tidy.reconstruction.head import takes_noise
-from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
-from kornia_tidy.reconstruction.tiled import OVERLAP
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.choices import ORIENTATIONS, PRETRAINED
+from kornia_tidy.commands.raw_develop import SUFFIXES, Format, output_paths
+from kornia_tidy.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
+from kornia_tidy.commands.shared import File, Folder, Noise, read_noise
+from kornia_tidy.inference.head_names import CLOSED_FORMS
+from kornia_tidy.settings import Count, Metres, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
     from kornia_tidy.inference.trained import TrainedSystem
+    from kornia_tidy.sensor.noise import SensorNoise
 
-DESCRIPTION = """\
-Reconstruct captures of any size with a trained network, or with the closed form of a
-camera that was measured, tile by tile within a memory budget and without visible seams.
-FILES are camera raw files or pictures (PNG, TIFF, JPEG, NPY). For each FILE, FOLDER gets
-  FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
-  FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
-  FILE_depth.pfm, .npy    depth in metres, float32, infinity kept
-  FILE_depth_colors.png   depth in colours, with a scale in metres
-  FILE_deviation.png      uncertainty of the depth: its standard deviation, in multiples
-  FILE_deviation.pfm      of --depth-unit or in metres; 65535 or infinity where nothing
-  FILE_deviation.npy      bounds the distance: far away, or depth unknown
-as far as the network estimates them, and FILE.json with the settings, which is written
-last. Files are written atomically. A network that tells the uncertainty (trained with
---depth-classes) also makes FILE_depth_colors.png grey where the depth is unknown, as on
-blank walls.
+PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".pam", ".bmp", ".webp"}
+PREVIEW_DPI = 150
+SMALLEST_DEVIATION = 1e-9  # m
 
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructRaw:
+    """All-in-focus pictures and depth of captures.
+
+    By a trained network, or by the closed form of a camera that was measured, tile by tile
+    within a memory budget and without visible seams.
+    FILES are camera raw files or pictures (PNG, TIFF, JPEG, NPY). For each FILE, FOLDER gets
+      FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
+      FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
+      FILE_depth.pfm, .npy    depth in metres, float32, infinity kept
+      FILE_depth_colors.png   depth in colours, with a scale in metres
+      FILE_deviation.png      uncertainty of the depth: its standard deviation, in multiples
+      FILE_deviation.pfm      of --depth-unit or in metres; 65535 or infinity where nothing
+      FILE_deviation.npy      bounds the distance: far away, or depth unknown
+    as far as the network estimates them, and FILE.json with the settings, which is written
+    last. Files are written atomically. A network that tells the uncertainty (trained with
+    --depth-classes) also makes FILE_depth_colors.png grey where the depth is unknown, as on
+    blank walls.
+
+    Exit status 2 if any file failed; the others are reconstructed all the same.
+
+    Args:
+        files: camera raw files, or pictures.
+        output: where to; made if it is not there.
+        head: a shipped system, or a checkpoint of a training (best.safetensors), or, with PSFs, a closed form. None:
+            with PSFs wiener-bilateral.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, by which captures are deconvolved.
+        noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
+            calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
+            sensor.
+        resume: skip files whose results are there and still right.
+        format: of the 16-bit picture.
+        depth_unit: of FILE_depth.png.
+        linear: FILES that are pictures hold linear light, not sRGB.
+        white_balance: as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour.
+            None: as shot, else daylight, else none.
+        jobs: files at a time.
+        memory: for the network's tiles, of all jobs.
+        overlap: of a tile that is discarded at each cut; with 144 shipped networks are within 0.0002 of the result for
+            the whole picture; 1000 or all else that is farther than a network sees is exact.
+        orientations: of its input over which a network that begins with the closed form is averaged: with 8 the images
+            of edof systems are about 0.1 dB better, the depth of joint-uncertain 2 % less wrong, in 6 to 7 times the
+            time.
+        device: where the network runs, such as cuda.
+        dump: what a headerless file holds.
+    """
+
+    files: RawFiles
+    output: Folder
+    head: Annotated[str, one_of((*PRETRAINED, *CLOSED_FORMS), others=True)] | None = None
+    psfs: File | None = None
+    noise: Noise | None = None
+    resume: bool = False
+    format: Format = "png"
+    depth_unit: Metres = 1e-3
+    linear: bool = False
+    white_balance: WhiteBalance = ()
+    jobs: Count = 1
+    memory: Annotated[int, Unit("MIB", "MiB", 1)] = 512
+    overlap: Pixels = 144
+    orientations: Annotated[int, one_of(ORIENTATIONS)] = 1
+    device: Annotated[str, Unit("DEVICE")] = "cpu"
+    dump: Dump = field(default_factory=Dump)
+
+    basic: ClassVar = (
+        *("files", "output", "head", "psfs", "noise", "resume", "format", "depth_unit", "linear", "white_balance"),
+        *("jobs", "memory", "orientations", "device"),
+    )
+    notes: ClassVar = """\
 A network fits the camera that it was trained with, so HEAD must be trained with the
 masks and lens of the captures. The library includes, for a 50 mm lens and pixels of 8 um
   edof-5, edof-1, edof-0      picture: five masks, one, a Fresnel element; f/17.6, at 0.6 m
@@ -68,9 +108,7 @@ masks and lens of the captures. The library includes, for a 50 mm lens and pixel
   joint-5, joint-1, joint-0   picture and depth, by small networks; f/17.6, at 0.6 m
 A network that begins with the closed form, and the closed form itself, take the noise of
 each pixel: as --noise says, or of raw files with a noise profile (DNG) from it.
-"""
 
-EXAMPLES = """\
 Processing of a raw file: black and white levels, white balance, demosaicing, conversion
 to linear sRGB clipped to [0, 1], on the pixel grid of the sensor with square pixels,
 since the PSFs are defined there. Then the encoding of the network's training is applied
@@ -78,8 +116,8 @@ since the PSFs are defined there. Then the encoding of the network's training is
 
 Memory: --memory for the tiles, about 40 bytes a pixel of each file at work, and 0.4 GiB
 for the program; in all 1.8 GiB for a file of 24 megapixels.
-
-examples:
+"""
+    examples: ClassVar = """\
   All files of a folder; if interrupted, go on with --resume:
     kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o sharp --resume
 
@@ -91,127 +129,125 @@ examples:
 
   A network of one's own; of two files, one is read and written while the other is computed:
     kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths --jobs 2
-
-Exit status 2 if any file failed; the others are reconstructed all the same.
 """
 
-PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".pam", ".bmp", ".webp"}
-PREVIEW_DPI = 150
-SMALLEST_DEVIATION = 1e-9  # m
+    def run(self) -> None:
+        """Reconstruct captures."""
+        import torch
 
+        from kornia_tidy.commands.file_jobs import Row, table, work_on_all
+        from kornia_tidy.commands.report import tell
+        from kornia_tidy.commands.system_options import digests, load_system
+        from kornia_tidy.figures.style import require_matplotlib
+        from kornia_tidy.files import remove_leftovers, write_bytes
+        from kornia_tidy.inference.light_head import LightHead, reconstruct_light, with_noise_of
+        from kornia_tidy.inference.measured import takes_psfs
+        from kornia_tidy.reconstruction.head import takes_noise
 
-def add_parser(subparsers: Any) -> None:
-    """Describe the subcommand to argparse."""
-    parser = subparsers.add_parser(
-        "reconstruct",
-        help="all-in-focus pictures and depth of captures",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
-    parser.add_argument("files", nargs="+", metavar="FILES", help="camera raw files, or pictures")
-    parser.add_argument(
-        "--head",
-        help=f"{', '.join(PRETRAINED)}, or a checkpoint of a training (best.safetensors); with --psfs also "
-        f"{', '.join(CLOSED_FORMS)} (default with --psfs: {CLOSED_FORM})",
-    )
-    add_psfs_option(parser, ", by which captures are deconvolved")
-    parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="where to; made if it is not there")
-    parser.add_argument("--format", choices=tuple(SUFFIXES), default="png", help="of the 16-bit picture (default: png)")
-    parser.add_argument(
-        "--depth-unit", type=float, default=1e-3, metavar="M", help="metres a unit of FILE_depth.png (default: 0.001)"
-    )
-    parser.add_argument("--linear", action="store_true", help="FILES that are pictures hold linear light, not sRGB")
-    add_white_balance_option(parser)
-    add_noise_option(parser, "by the noise profile of the raw file, else that of the network's simulated sensor")
-    parser.add_argument("--resume", action="store_true", help="skip files whose results are there and still right")
-    parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)")
-    parser.add_argument(
-        "--memory", type=_count, default=512, metavar="MIB", help="for the network's tiles, of all jobs (default: 512)"
-    )
-    parser.add_argument(
-        "--overlap",
-        type=_count,
-        default=OVERLAP,
-        metavar="PIXELS",
-        help=f"of a tile that are discarded at each cut (default: {OVERLAP}, with which shipped networks are within "
-        "0.0002 of the result for the whole picture; 1000 or all else that is farther than a network sees is exact)",
-    )
-    parser.add_argument(
-        "--orientations",
-        type=int,
-        choices=ORIENTATIONS,
-        default=1,
-        help="of its input over which a network that begins with the closed form is averaged: with 8 the images "
-        "of edof systems are about 0.1 dB better, the depth of joint-uncertain 2 %% less wrong, in 6 to 7 times the "
-        "time (default: 1)",
-    )
-    parser.add_argument("--device", default="cpu", help="where the network runs, such as cuda (default: cpu)")
-    add_dump_options(parser)
+        white_balance(self.white_balance)  # refuses what is none
+        if self.noise == 0:
+            raise ValueError("noise must be positive and finite in units of full scale, got 0.0")
+        sensor, calibration = read_noise(self.noise)
+        system = load_system(self.head, self.psfs, sensor)
+        if self.noise is not None and not takes_noise(system.head):
+            raise ValueError(f"--noise is for a network that takes it, and that of {self.head} does not")
+        if self.psfs is not None and not takes_psfs(system.head):
+            raise ValueError(f"--psfs is for a network that deconvolves captures, and that of {self.head} does not")
+        head = LightHead(system, orientations=self.orientations).to(torch.device(self.device))
+        suffixes = result_suffixes(system.settings.task, self.format, uncertain=head.uncertain)
+        if "_depth_colors.png" in suffixes:
+            require_matplotlib()
+        folder = Path(self.output)
+        outputs = output_paths(self.files, folder, suffixes)
+        made_by = {
+            "system": digests(self.head, self.psfs, self.noise),
+            "depth_unit": self.depth_unit,
+            "linear": self.linear,
+            "overlap": self.overlap,
+            "orientations": self.orientations,
+            "white_balance": self.white_balance,
+            "dump": vars(self.dump),
+        }
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.resume:
+            remove_leftovers(folder)
+        reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
+        name = self.head or self.psfs
+        tell("network", f"{name}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
 
+        def work(path: str, progress: Callable[[int, int], None]) -> Row:
+            start = time.perf_counter()
+            said = json.loads(json.dumps({"source": _identity(path), "made_by": made_by}))
+            paths = outputs[path]
+            if self.resume and is_finished(paths, said):
+                return Row(path, "kept")
+            light, upright, info, noise = self._light(path, sensor, calibration)
+            if self.psfs is not None:
+                _check_measured(path, len(light), noise, system)
+            own = with_noise_of(head, noise)  # no other thread's
+            budget = (self.memory << 20) // self.jobs
+            result = reconstruct_light(own, light, memory_budget=budget, overlap=self.overlap, progress=progress)
+            del light
+            size = write_results(paths, result, upright, info, head, self.depth_unit)
+            words = self._in_words(head) | ({} if noise is None else {"noise": noise.extra_repr()})
+            write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
+            return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
 
-def run(args: argparse.Namespace) -> None:
-    """Reconstruct captures."""
-    from kornia_tidy.inference.light_head import LightHead, reconstruct_light, with_noise_of  # noqa: PLC0415
-    from kornia_tidy.inference.measured import takes_psfs  # noqa: PLC0415
+        rows = work_on_all("reconstruct", list(outputs), work, self.jobs)
+        failed = sum(row.result not in {"done", "kept"} for row in rows)
+        for line in table(rows):
+            print(line)
+        tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
+        if failed:
+            raise ValueError(f"{failed} of {len(rows)} files failed")
 
-    parse_white_balance(args.white_balance)
-    if isinstance(args.noise, float):
-        check_positive("noise", args.noise, "in units of full scale")
-    sensor, calibration = read_noise(args.noise)
-    system = load_system(args.head, args.psfs, sensor)
-    if args.noise is not None and not takes_noise(system.head):
-        raise ValueError(f"--noise is for a network that takes it, and that of {args.head} does not")
-    if args.psfs is not None and not takes_psfs(system.head):
-        raise ValueError(f"--psfs is for a network that deconvolves captures, and that of {args.head} does not")
-    head = LightHead(system, orientations=args.orientations).to(torch.device(args.device))
-    suffixes = result_suffixes(system.settings.task, args.format, uncertain=head.uncertain)
-    if "_depth_colors.png" in suffixes:
-        require_matplotlib()
-    folder = Path(args.output)
-    outputs = output_paths(args.files, folder, suffixes)
-    made_by = {
-        "system": digests(args.head, args.psfs, args.noise),
-        "depth_unit": args.depth_unit,
-        "linear": args.linear,
-        "overlap": args.overlap,
-        "orientations": args.orientations,
-        "white_balance": args.white_balance,
-        "dump": {name: getattr(args, name) for name in DUMP_OPTIONS},
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    if args.resume:
-        remove_leftovers(folder)
-    reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
-    name = args.head or args.psfs
-    tell("network", f"{name}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
+    def _light(
+        self, path: str, sensor: SensorNoise | None = None, calibration: PhotonTransfer | None = None
+    ) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any], SensorNoise | None]:
+        """Read a capture as linear light, with its upright orientation, its camera and exposure data, and its noise.
 
-    def work(path: str, progress: Callable[[int, int], None]) -> Row:
-        start = time.perf_counter()
-        said = json.loads(json.dumps({"source": _identity(path), "made_by": made_by}))
-        paths = outputs[path]
-        if args.resume and is_finished(paths, said):
-            return Row(path, "kept")
-        light, upright, info, noise = read_light(path, args, sensor, calibration)
-        if args.psfs is not None:
-            _check_measured(path, len(light), noise, system)
-        own = with_noise_of(head, noise)  # no other thread's
-        budget = (args.memory << 20) // args.jobs
-        result = reconstruct_light(own, light, memory_budget=budget, overlap=args.overlap, progress=progress)
-        del light
-        size = write_results(paths, result, upright, info, head, args.depth_unit)
-        words = _in_words(head, args) | ({} if noise is None else {"noise": noise.extra_repr()})
-        write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
-        return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
+        Args:
+            path: of the file.
+            sensor: noise that was given. None: that of the noise profile of a raw file, if it has one.
+            calibration: measurement of the noise, whose sensor has the units of the raw file before it is developed.
+        """
+        import torch
+        from kornia.color import rgb_to_linear_rgb
 
-    rows = work_on_all("reconstruct", list(outputs), work, args.jobs)
-    failed = sum(row.result not in {"done", "kept"} for row in rows)
-    for line in table(rows):
-        print(line)
-    tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
-    if failed:
-        raise ValueError(f"{failed} of {len(rows)} files failed")
+        from kornia_tidy.data.image_files import read_image
+        from kornia_tidy.raw.develop import develop
+        from kornia_tidy.raw.developed_noise import developed_noise
+
+        if self.dump.size is None and Path(path).suffix.lower() in PICTURES:
+            picture = read_image(path)
+            light = picture if self.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1))[: len(picture)]
+            return light, _as_it_is, {}, sensor
+        raw = self.dump.open(path)
+        balance = white_balance(self.white_balance)
+        light = develop(raw, white_balance=balance, encoded=False, upright=False)
+        bare = replace(raw, counts=torch.empty(0))  # keeps the orientation without the counts
+        if calibration is not None:
+            calibration.check_taken_alike(raw, path)
+        noise = sensor if sensor is not None and calibration is None else developed_noise(raw, balance, sensor)
+        return light, bare.upright, vars(raw.info), noise
+
+    def _in_words(self, head: LightHead) -> dict[str, str]:
+        """Describe the results of a file for the summary."""
+        from kornia_tidy.commands.system_options import CLOSED_FORM
+        from kornia_tidy.inference.tasks import MAPS
+
+        unit, (near, far) = self.depth_unit, head.camera.depth_range
+        words = {"head": self.head or CLOSED_FORM}
+        if self.psfs is not None:
+            words["psfs"] = f"measured: {self.psfs}"
+        if "image" in MAPS[head.task]:
+            words["image"] = "all in focus, 16 bits, encoded as sRGB"
+        if "depth" in MAPS[head.task]:
+            words["depth_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or farther"
+            if head.uncertain:
+                words["deviation_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or more, or unbounded"
+            words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
+        return words
 
 
 def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list[str]:
@@ -226,35 +262,12 @@ def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list
         >>> result_suffixes("edof", "tiff")
         ['.tif', '.jpg', '.json']
     """
+    from kornia_tidy.inference.tasks import MAPS
+
     image = [SUFFIXES[picture], ".jpg"] if "image" in MAPS[task] else []
     depth = ["_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png"] if "depth" in MAPS[task] else []
     deviation = ["_deviation.png", "_deviation.pfm", "_deviation.npy"] if uncertain else []
     return [*image, *depth, *deviation, ".json"]
-
-
-def read_light(
-    path: str, args: argparse.Namespace, sensor: SensorNoise | None = None, calibration: PhotonTransfer | None = None
-) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any], SensorNoise | None]:
-    """Read a capture as linear light, with its upright orientation, its camera and exposure data, and its noise.
-
-    Args:
-        path: of the file.
-        args: how it is to be read.
-        sensor: noise that was given. None: that of the noise profile of a raw file, if it has one.
-        calibration: measurement of the noise, whose sensor has the units of the raw file before it is developed.
-    """
-    if args.size is None and Path(path).suffix.lower() in PICTURES:
-        picture = read_image(path)
-        light = picture if args.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1))[: len(picture)]
-        return light, _as_it_is, {}, sensor
-    raw: RawCapture = open_raw(path, args)
-    white_balance = parse_white_balance(args.white_balance)
-    light = develop(raw, white_balance=white_balance, encoded=False, upright=False)
-    bare = replace(raw, counts=torch.empty(0))  # keeps the orientation without the counts
-    if calibration is not None:
-        calibration.check_taken_alike(raw, path)
-    noise = sensor if sensor is not None and calibration is None else developed_noise(raw, white_balance, sensor)
-    return light, bare.upright, vars(raw.info), noise
 
 
 def write_results(
@@ -266,7 +279,11 @@ def write_results(
     depth_unit: float,
 ) -> tuple[int, int]:
     """Write pictures and depth with their suffixes; return columns and rows."""
-    from kornia_tidy.inference import light_head  # noqa: PLC0415
+    from kornia_tidy.data.depth_files import write_depth
+    from kornia_tidy.data.image_files import write_image
+    from kornia_tidy.figures.depth import draw_depth
+    from kornia_tidy.files import write_bytes
+    from kornia_tidy.inference import light_head
 
     image = None if result.image is None else upright(result.image)
     depth = None if result.depth is None else upright(result.depth)
@@ -295,6 +312,8 @@ def write_results(
 
 def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
     """Return whether all results of a file exist, made with the same settings."""
+    from kornia_tidy.files import parse_json
+
     if not all(path.is_file() for path in paths):
         return False
     try:
@@ -322,27 +341,5 @@ def _check_measured(path: str, colors: int, noise: SensorNoise | None, system: T
         raise ValueError(f"the noise of {path} is not known: give --noise")
 
 
-def _in_words(head: LightHead, args: argparse.Namespace) -> dict[str, str]:
-    """Describe the results of a file for the summary."""
-    unit, (near, far) = args.depth_unit, head.camera.depth_range
-    words = {"head": args.head or CLOSED_FORM}
-    if args.psfs is not None:
-        words["psfs"] = f"measured: {args.psfs}"
-    if "image" in MAPS[head.task]:
-        words["image"] = "all in focus, 16 bits, encoded as sRGB"
-    if "depth" in MAPS[head.task]:
-        words["depth_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or farther"
-        if head.uncertain:
-            words["deviation_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or more, or unbounded"
-        words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
-    return words
-
-
 def _as_it_is(image: Tensor) -> Tensor:
     return image
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is wanted, got {text!r}")
-    return int(text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -72,14 +71,6 @@ def light_in_words(bank: PSFBank, optics: TiDyOptics) -> str:
         f"{len(bank.defocus)} depths, window {bank.window} x {bank.window} px holds {', '.join(shares)} of a point's "
         f"light; {fate}"
     )
-
-
-def masks_in_words(args: argparse.Namespace, optics: TiDyOptics) -> str:
-    """Describe the masks of a camera of :func:`~kornia_tidy.commands.options.make_optics`."""
-    if args.psfs is not None:
-        return f"as they were when the PSFs of {args.psfs} were measured"
-    origin = args.masks if isinstance(args.masks, str) else f"noise of seed {args.mask_seed or 0}"
-    return f"{optics.masks.extra_repr()}, {origin}"
 
 
 def clamped_in_words(optics: TiDyOptics, depth: Tensor) -> str:

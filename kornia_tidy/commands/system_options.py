@@ -6,9 +6,10 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kornia_tidy.choices import PRETRAINED
 from kornia_tidy.files import read_bytes
-from kornia_tidy.inference.heads import CLOSED_FORMS
-from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED
+from kornia_tidy.inference.head_names import CLOSED_FORMS
+from kornia_tidy.inference.pretrained import FOLDER
 
 if TYPE_CHECKING:
     from kornia_tidy.inference.trained import TrainedSystem
@@ -46,9 +47,9 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
         ValueError: if neither a system nor PSFs are given, a file is of another kind, or the PSFs are not of the
             system's lens and depths.
     """
-    from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs  # noqa: PLC0415 (takes a second)
-    from kornia_tidy.inference.measured import closed_form_system, with_measurements  # noqa: PLC0415
-    from kornia_tidy.inference.trained import load_trained  # noqa: PLC0415
+    from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs
+    from kornia_tidy.inference.measured import closed_form_system, with_measurements
+    from kornia_tidy.inference.trained import load_trained
 
     if head is None and psfs is None:
         raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, or --psfs")

@@ -2,54 +2,75 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import torch
-from torch import Tensor
-from tqdm import tqdm
+from kornia_tidy.choices import KNOBS, Preset
+from kornia_tidy.commands.shared import CameraSettings, Folder, OwnScene, check_folder
+from kornia_tidy.settings import Count, Pixels, Seed, Unit, one_of
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice
-from kornia_tidy.commands.options import (
-    add_camera_options,
-    add_depth_options,
-    make_camera,
-    mask_count,
-    read_scene,
-    seed,
-)
-from kornia_tidy.commands.report import scene_in_words, tell
-from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.figures.style import require_matplotlib
-from kornia_tidy.files import write_bytes
-from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.render.borders import largest_window
-from kornia_tidy.tradeoff.conditions import Conditions
-from kornia_tidy.tradeoff.costs import DEVICES
-from kornia_tidy.tradeoff.figure import draw_trade
-from kornia_tidy.tradeoff.files import TradeRun, markdown, read_json, write_csv, write_json
-from kornia_tidy.tradeoff.measure import TradeRow, linear_light, missing, sweep
-from kornia_tidy.tradeoff.sweep_settings import PLAN, SWEEP_VALUES, Setting, planned, sweep_settings
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
-DESCRIPTION = """\
-Measure the speed-accuracy trade-off on one scene and this machine. Each setting of the
-fidelity is varied alone from a preset. The presets, and the plans for this scene within
-errors of 1e-1 to 1e-6, are measured too. For each point the table has the
-  error    of the noise-free capture in linear light, full scale 1, against the preset
-           'reference', which is rendered once
-  time     of a capture after a change of the masks (PSFs and rendering), and with
-           cached PSFs; median and interquartile range
-  memory   peak of the tensors of a capture
-Without --image and --depth the scene is generated (dead leaves).
-"""
+    from kornia_tidy.camera.tidy_optics import TiDyOptics
+    from kornia_tidy.data.rgbd import Scene
+    from kornia_tidy.tradeoff.conditions import Conditions
+    from kornia_tidy.tradeoff.files import TradeRun
+    from kornia_tidy.tradeoff.measure import TradeRow
+    from kornia_tidy.tradeoff.sweep_settings import Setting
 
-EPILOG = """\
+NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
+DOTS_PER_INCH = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trade:
+    """Measure speed against accuracy.
+
+    The speed-accuracy trade-off is measured on one scene and this machine. Each setting of
+    the fidelity is varied alone from a preset. The presets, and the plans for this scene
+    within errors of 1e-1 to 1e-6, are measured too. For each point the table has the
+      error    of the noise-free capture in linear light, full scale 1, against the preset
+               'reference', which is rendered once
+      time     of a capture after a change of the masks (PSFs and rendering), and with
+               cached PSFs; median and interquartile range
+      memory   peak of the tensors of a capture
+
+    Args:
+        output: made if missing.
+        size: side of the scene made here.
+        seed: of the scene made here.
+        knobs: settings that are varied. None: all of them.
+        base: preset of the other settings.
+        reference: preset to which errors refer; balanced is faster on a large scene.
+        training: captures with gradients to the masks too.
+        repeats: timed runs of each.
+        device: cpu, cuda or cuda:N.
+        scene: that is captured.
+        camera: lens and masks.
+    """
+
+    output: Folder = "outputs/trade"
+    size: Pixels = 512
+    seed: Seed = 0
+    knobs: tuple[Annotated[str, one_of(KNOBS)], ...] = ()
+    base: Preset = "balanced"
+    reference: Preset = "reference"
+    training: bool = False
+    repeats: Count = 5
+    device: Annotated[str, Unit("DEVICE")] = "cpu"
+    scene: OwnScene = field(default_factory=OwnScene)
+    camera: CameraSettings = field(default_factory=CameraSettings)
+
+    basic: ClassVar = (
+        *("output", "size", "seed", "knobs", "base", "reference", "training", "repeats", "device", "image", "depth"),
+        *("depth_scale", "masks", "depth_range", "f_number", "focus_distance", "fit_depth"),
+    )
+    notes: ClassVar = """\
 Results are written to FOLDER/trade.json and trade.csv after every point, and at the end a
 figure to trade.png and a table to the screen. After Ctrl-C the same command continues.
 Another scene, machine or version of the code starts anew.
@@ -59,160 +80,131 @@ base, --base reference, the error of each setting alone is measured.
 
 Times are reliable on an otherwise idle machine. PyTorch uses as many threads as the
 environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.
-
-examples:
+"""
+    examples: ClassVar = """\
   kornia-tidy trade                                 all settings, on a generated scene
+
   kornia-tidy trade --knobs window layers --training
+
   kornia-tidy trade --image rgb.png --depth depth.png --depth-scale 0.001 --device cuda
 """
 
-NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
-DOTS_PER_INCH = 150
-KNOBS = (*SWEEP_VALUES, PLAN)
+    def run(self) -> None:
+        """Measure the sweep, write files after every row, and print the table."""
+        folder = check_folder(self.output)
+        from tqdm import tqdm
 
+        from kornia_tidy.commands.report import scene_in_words, tell
+        from kornia_tidy.figures.style import require_matplotlib
+        from kornia_tidy.files import write_bytes
+        from kornia_tidy.tradeoff.conditions import Conditions
+        from kornia_tidy.tradeoff.figure import draw_trade
+        from kornia_tidy.tradeoff.files import TradeRun, markdown
+        from kornia_tidy.tradeoff.measure import missing, sweep
 
-def add_parser(subparsers: Any) -> None:
-    """Describe the command to argparse."""
-    parser = subparsers.add_parser(
-        "trade",
-        help="measure speed against accuracy",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
-    parser.add_argument("--image", metavar="IMAGE", help="picture of a scene (default: dead leaves, made here)")
-    parser.add_argument("--depth", metavar="DEPTH", help="its depth: PNG, TIFF, PGM, PFM, NPY, OpenEXR")
-    parser.add_argument(
-        "-o", "--output", default="outputs/trade", metavar="FOLDER", help="made if missing (default: outputs/trade)"
-    )
-    parser.add_argument("--size", type=int, default=512, metavar="PX", help="side of the scene made (default: 512)")
-    parser.add_argument("--masks", type=mask_count, default=5, metavar="K", help="masks in one exposure (default: 5)")
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of masks and scene (default: 0)")
+        require_matplotlib()
+        device = self._device()
+        scene = self._scene()
+        optics = self.camera.optics(scene).to(device)
+        image, depth = scene.image.to(device), scene.depth.to(device)
+        optics.check_scene(image, depth)  # warns once: the measured captures do not warn
+        name = f"dead leaves, seed {self.seed}" if self.scene.image is None else Path(self.scene.image).name
+        conditions = Conditions.here_and_now(name, optics, image, depth, self.reference)
+        settings = self._settings(optics, image, depth)
+        known, why = _known(folder / "trade.json", conditions)
 
-    measuring = parser.add_argument_group("what is measured")
-    measuring.add_argument(
-        "--knobs",
-        nargs="+",
-        choices=KNOBS,
-        default=list(KNOBS),
-        metavar="KNOB",
-        help=f"some of {', '.join(KNOBS)} (default: all)",
-    )
-    measuring.add_argument(
-        "--base", choices=tuple(PRESETS), default="balanced", help="preset of the other settings (default: balanced)"
-    )
-    measuring.add_argument(
-        "--reference",
-        choices=tuple(PRESETS),
-        default="reference",
-        help="preset to which errors refer; 'balanced' is faster on a large scene (default: reference)",
-    )
-    measuring.add_argument("--training", action="store_true", help="captures with gradients to the masks too")
-    measuring.add_argument("--repeats", type=int, default=5, metavar="N", help="timed runs of each (default: 5)")
-    measuring.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N (default: cpu)")
-    add_depth_options(parser)
-    add_camera_options(parser)
+        tell("scene", f"{name}, {scene_in_words(scene)}")
+        tell("camera", optics.camera.extra_repr())
+        tell("masks", self.camera.in_words(optics))
+        tell("machine", f"{conditions.device}, {conditions.threads} threads, PyTorch {conditions.torch}")
+        todo = len(missing(settings, known, self.repeats, self.training))
+        tell("settings", f"{len(settings)}, {todo} different ones to be measured{why}")
+        folder.mkdir(parents=True, exist_ok=True)
 
+        rows: list[TradeRow] = []
+        steps = sweep(
+            optics,
+            image,
+            depth,
+            settings,
+            repeats=self.repeats,
+            training=self.training,
+            reference=self.reference,
+            known=known,
+        )
+        with tqdm(
+            total=len(settings), desc="trade", file=sys.stderr, leave=False, unit="setting", disable=None
+        ) as progress:
+            try:
+                for setting in settings:
+                    step = f"{setting.knob} {setting.value}"
+                    progress.set_postfix_str(f"reference, then {step}" if todo and not rows else step)
+                    rows.append(next(steps))
+                    _write(folder, TradeRun(conditions, (*rows, *_others(known, rows))))
+                    progress.update()
+            except KeyboardInterrupt:
+                progress.close()
+                tell(
+                    "stopped",
+                    f"{len(rows)} of {len(settings)} settings are written; the same command goes on from there",
+                )
+                raise
 
-def run(args: argparse.Namespace) -> None:
-    """Measure the sweep, write files after every row, and print the table."""
-    device = _checked(args)
-    folder = Path(args.output)
-    scene = _scene(args)
-    optics = TiDyOptics(
-        PixelwiseMask(args.masks, generator=torch.Generator().manual_seed(args.seed)), make_camera(args, scene)
-    ).to(device)
-    image, depth = scene.image.to(device), scene.depth.to(device)
-    optics.check_scene(image, depth)  # warns once: the measured captures do not warn
-    name = f"dead leaves, seed {args.seed}" if args.image is None else Path(args.image).name
-    conditions = Conditions.here_and_now(name, optics, image, depth, args.reference)
-    settings = _settings(args, optics, image, depth)
-    known, why = _known(folder / "trade.json", conditions)
+        shown = TradeRun(conditions, tuple(rows))
+        picture = BytesIO()
+        draw_trade(shown).savefig(picture, dpi=DOTS_PER_INCH)
+        write_bytes(folder / "trade.png", picture.getvalue())
+        print(f"\n{markdown(rows)}\n")
+        tell("bold", "no other setting is both faster and closer to the reference")
+        tell("wrote", f"{folder / 'trade.png'}: look at this one")
+        for other in ("trade.json", "trade.csv"):
+            tell("", str(folder / other))
 
-    tell("scene", f"{name}, {scene_in_words(scene)}")
-    tell("camera", optics.camera.extra_repr())
-    tell("masks", f"{optics.masks.extra_repr()}, noise of seed {args.seed}")
-    tell("machine", f"{conditions.device}, {conditions.threads} threads, PyTorch {conditions.torch}")
-    todo = len(missing(settings, known, args.repeats, args.training))
-    tell("settings", f"{len(settings)}, {todo} different ones to be measured{why}")
-    folder.mkdir(parents=True, exist_ok=True)
+    def _device(self) -> torch.device:
+        """Return the device, or raise an error before any work."""
+        import torch
 
-    rows: list[TradeRow] = []
-    steps = sweep(
-        optics,
-        image,
-        depth,
-        settings,
-        repeats=args.repeats,
-        training=args.training,
-        reference=args.reference,
-        known=known,
-    )
-    with tqdm(
-        total=len(settings), desc="trade", file=sys.stderr, leave=False, unit="setting", disable=None
-    ) as progress:
+        from kornia_tidy.checks import check_choice
+        from kornia_tidy.tradeoff.costs import DEVICES
+
+        check_choice("--device", self.device.partition(":")[0], DEVICES)
+        if self.device.startswith("cuda") and not torch.cuda.is_available():
+            raise ValueError(f"--device {self.device}: PyTorch finds no CUDA GPU here")
         try:
-            for setting in settings:
-                step = f"{setting.knob} {setting.value}"
-                progress.set_postfix_str(f"reference, then {step}" if todo and not rows else step)
-                rows.append(next(steps))
-                _write(folder, TradeRun(conditions, (*rows, *_others(known, rows))))
-                progress.update()
-        except KeyboardInterrupt:
-            progress.close()
-            tell("stopped", f"{len(rows)} of {len(settings)} settings are written; the same command goes on from there")
-            raise
+            return torch.device(self.device)
+        except RuntimeError:
+            raise ValueError(f"--device must be cpu, cuda or cuda:N, got {self.device!r}") from None
 
-    shown = TradeRun(conditions, tuple(rows))
-    picture = BytesIO()
-    draw_trade(shown).savefig(picture, dpi=DOTS_PER_INCH)
-    write_bytes(folder / "trade.png", picture.getvalue())
-    print(f"\n{markdown(rows)}\n")
-    tell("bold", "no other setting is both faster and closer to the reference")
-    tell("wrote", f"{folder / 'trade.png'}: look at this one")
-    for other in ("trade.json", "trade.csv"):
-        tell("", str(folder / other))
+    def _scene(self) -> Scene:
+        import torch
 
+        from kornia_tidy.data.dead_leaves import dead_leaves
+        from kornia_tidy.data.rgbd import Scene
 
-def _checked(args: argparse.Namespace) -> torch.device:
-    """Check the arguments before any work, and return the device."""
-    if (args.image is None) != (args.depth is None):
-        raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
-    if args.repeats < 1:
-        raise ValueError(f"--repeats must be 1 or more, got {args.repeats}")
-    folder = Path(args.output)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write into {folder}: it is not a folder")
-    require_matplotlib()
-    check_choice("--device", args.device.partition(":")[0], DEVICES)
-    if args.device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"--device {args.device}: PyTorch finds no CUDA GPU here")
-    try:
-        return torch.device(args.device)
-    except RuntimeError:
-        raise ValueError(f"--device must be cpu, cuda or cuda:N, got {args.device!r}") from None
+        if (scene := self.scene.read()) is not None:
+            return scene
+        image, depth = dead_leaves(self.size, self.size, depth_range=(NEAR, FAR), seed=self.seed)
+        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
 
+    def _settings(self, optics: TiDyOptics, image: Tensor, depth: Tensor) -> list[Setting]:
+        """Return the points of the sweep and the plans, without windows wider than the border allows."""
+        from kornia_tidy.render.borders import largest_window
+        from kornia_tidy.tradeoff.measure import linear_light
+        from kornia_tidy.tradeoff.sweep_settings import PLAN, planned, sweep_settings
 
-def _scene(args: argparse.Namespace) -> Scene:
-    if args.image is not None:
-        return read_scene(args)
-    image, depth = dead_leaves(args.size, args.size, depth_range=(NEAR, FAR), seed=args.seed)
-    return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
-
-
-def _settings(args: argparse.Namespace, optics: TiDyOptics, image: Tensor, depth: Tensor) -> list[Setting]:
-    """Return the points of the sweep and the plans, without windows wider than the border allows."""
-    widest = largest_window(optics.border, *image.shape[-2:])
-    steps = sweep_settings(args.base, [knob for knob in args.knobs if knob != PLAN])
-    settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
-    if PLAN in args.knobs:
-        settings += planned(optics, linear_light(optics, image)[None], depth[None])
-    return settings
+        knobs = self.knobs or KNOBS
+        widest = largest_window(optics.border, *image.shape[-2:])
+        steps = sweep_settings(self.base, [knob for knob in knobs if knob != PLAN])
+        settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
+        if PLAN in knobs:
+            settings += planned(optics, linear_light(optics, image)[None], depth[None])
+        return settings
 
 
 def _known(path: Path, conditions: Conditions) -> tuple[tuple[TradeRow, ...], str]:
     """Return the valid rows of an earlier run, and a remark about them."""
+    from kornia_tidy.tradeoff.files import read_json
+
     if not path.exists():
         return (), ""
     earlier = read_json(path)
@@ -228,5 +220,7 @@ def _others(known: tuple[TradeRow, ...], rows: list[TradeRow]) -> list[TradeRow]
 
 
 def _write(folder: Path, run: TradeRun) -> None:
+    from kornia_tidy.tradeoff.files import write_csv, write_json
+
     write_json(folder / "trade.json", run)
     write_csv(folder / "trade.csv", run.rows)

@@ -17,6 +17,7 @@ from torch import Tensor
 from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.inference.half_precision import halved
 from kornia_tidy.inference.model_card import check_license, model_card
+from kornia_tidy.inference.settings import RENAMED
 from kornia_tidy.inference.trained import TrainedSystem, below, psfs_to_store, system_of_state
 from kornia_tidy.runtime.search_path import import_installed
 from kornia_tidy.tensor_files import read_tensors
@@ -176,11 +177,11 @@ def _state(config: Mapping[str, Any], weights: Mapping[str, Tensor], name: str) 
         value = config.get(key)
         if not isinstance(value, dict):
             raise ValueError(f"cannot read {name}: {key} must be values by name, got {value!r:.80}")
-        known |= value
+        known |= {RENAMED.get(one, one): own for one, own in value.items()}
     if isinstance(ends := known.get("depth_range"), list):
         known["depth_range"] = [math.inf if end == "inf" else end for end in ends]
-    if known.get("focus") == "inf":
-        known["focus"] = math.inf
+    if known.get("focus_distance") == "inf":
+        known["focus_distance"] = math.inf
     psfs, others = below(weights, PSFS), {k: v for k, v in weights.items() if not k.startswith(PSFS)}
     return {"settings": known, "global_step": config.get("global_step"), "state_dict": others, "psfs": psfs}
 

@@ -13,7 +13,7 @@ from torch import nn
 
 from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.checks import check_choice, check_part
-from kornia_tidy.inference.heads import CLOSED_FORMS
+from kornia_tidy.inference.head_names import CLOSED_FORMS
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics, fix_window, update_psfs
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -48,7 +48,7 @@ def measured_settings(psfs: MeasuredPSFs) -> dict[str, Any]:
         "pixel_pitch": camera.pixel_pitch,
         "depth_range": camera.depth_range,
         "f_number": camera.f_number,
-        "focus": float(camera.focus_distance),
+        "focus_distance": float(camera.focus_distance),
         "window": psfs.bank.window,
     }
 

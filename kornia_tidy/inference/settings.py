@@ -3,83 +3,204 @@
 from __future__ import annotations
 
 import json
-import math
 import os
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.choices import (
+    INVERSES,
+    TASKS,
+    Border,
+    ColorSpace,
+    Compositing,
+    Inverse,
+    Preset,
+    Start,
+    StrayLight,
+)
 from kornia_tidy.files import read_json, write_bytes
-from kornia_tidy.inference.heads import CLOSED_FORMS, check_head, check_repeats
-from kornia_tidy.inference.tasks import MAPS
-from kornia_tidy.masks.initial_heights import STARTS
-from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
-from kornia_tidy.psf.psf_bank import STRAY_LIGHT
-from kornia_tidy.reconstruction.closed_form import INVERSES
-from kornia_tidy.reconstruction.head import check_count
-from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.inference.head_names import CLOSED_FORMS, HEADS, check_head, check_repeats
+from kornia_tidy.settings import (
+    DepthRange,
+    Distance,
+    FNumber,
+    Metres,
+    Pixels,
+    Seed,
+    Unit,
+    check_settings,
+    one_of,
+)
 
-Distance = float  # metres, may be infinite
+if TYPE_CHECKING:
+    from kornia_tidy.optics.thin_lens import ThinLensCamera
+    from kornia_tidy.sensor.noise import SensorNoise
+
 MOST = 1024  # masks, their pixels along a side, blocks, or depths to refocus to: more would take days
+RENAMED = {"focus": "focus_distance"}  # in checkpoints of earlier versions
 
 
 @dataclass(frozen=True, kw_only=True)
-class SystemSettings:
+class LensSettings:
+    """Lens and sensor.
+
+    Lengths are in metres. Defocus, in radians at the edge of an aperture of radius R, is
+    psi = pi R^2 / 530 nm * (1/depth - 1/focus): from +20 at 0.2975 m to -20 at infinity
+    for the default lens. Aperture and focus that are not given are chosen for the range
+    of depths, so that it fills psi = -20 to +20.
+
+    Args:
+        focal_length: of the lens; longer enlarges the PSF.
+        f_number: focal length over the diameter of the aperture. None: 17.6, or by the depth range.
+        aperture_diameter: instead of the f-number; wider blurs more out of focus. None: by the f-number.
+        focus_distance: depth that is seen sharply; may be inf. None: the middle of the depth range in 1/depth.
+        depth_range: nearest and farthest depth that the camera is for; others are clamped to its ends. None: half the
+            focus distance to inf.
+        pixel_pitch: of the sensor; smaller enlarges the PSF in pixels.
+    """
+
+    focal_length: Metres = 50e-3
+    f_number: FNumber | None = None
+    aperture_diameter: Metres | None = None
+    focus_distance: Distance | None = None
+    depth_range: DepthRange | None = None
+    pixel_pitch: Metres = 8e-6
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        if self.f_number is not None and self.aperture_diameter is not None:
+            raise ValueError("f_number and aperture_diameter say the same: give one of them")
+        if self.focus_distance is not None and not self.focus_distance > self.focal_length:
+            raise ValueError(
+                f"focus_distance must be metres beyond the focal length of {self.focal_length:g} m, got "
+                f"{self.focus_distance}"
+            )
+        if self.depth_range is not None:
+            object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
+
+    def camera(self) -> ThinLensCamera:
+        """Return the lens and the sensor's pixels."""
+        from kornia_tidy.optics.thin_lens import ThinLensCamera  # noqa: PLC0415 (torch takes seconds)
+
+        lens: dict[str, Any] = {"focal_length": self.focal_length, "pixel_pitch": self.pixel_pitch}
+        diameter = self.aperture_diameter if self.f_number is None else self.focal_length / self.f_number
+        focus, depths = self.focus_distance, self._depths()
+        if diameter is None:
+            fits = self.depth_range is not None
+            chosen = ThinLensCamera.for_scene(self.depth_range, **lens) if fits else ThinLensCamera(**lens)
+            if focus is None:
+                return chosen
+            diameter = chosen.aperture_diameter
+        if focus is None:
+            focus = 2 / sum(1 / end for end in depths or ThinLensCamera().depth_range)
+        return ThinLensCamera(aperture_diameter=diameter, focus_distance=focus, depth_range=depths, **lens)
+
+    def _depths(self) -> tuple[float, float] | None:
+        """Return the range of depths where aperture or focus are given; None for one that follows from the focus."""
+        return self.depth_range
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskSettings:
+    """What is learnt.
+
+    Args:
+        task: an image in focus everywhere (edof), depth, or both (joint).
+        masks: learnable masks in one exposure; 0 is a fixed Fresnel lens.
+        start: heights of the masks at first, see :func:`~kornia_tidy.masks.initial_heights.initial_heights`. Those with
+            fisher suit depth, the sweep edof; noise has any number of masks, the others five; flat, with one mask, is a
+            lens without masks.
+        mask_size: pixels along a side of a mask, 20 of 23 of which span the aperture.
+        seed: of the initial masks, and of everything random in a run.
+    """
+
+    task: Annotated[str, one_of(TASKS)] = "edof"
+    masks: Annotated[int, Unit("K", "", 0, MOST)] = 5
+    start: Start = "noise"
+    mask_size: Annotated[int, Unit("N", "", 1, MOST)] = 23
+    seed: Seed = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSettings:
+    """Capture.
+
+    Args:
+        measured: PSFs were measured, see :func:`~kornia_tidy.inference.measured.measured_settings`. Checkpoints hold
+            them, and ``masks`` take no part.
+        sigma: read noise of the sensor, of full scale.
+        full_well: electrons at full scale, for shot noise. None: no shot noise.
+        bits: of the sensor's converter. None: no rounding.
+        fidelity: speed or accuracy of the PSFs, see :class:`~kornia_tidy.fidelity.Fidelity`.
+        window: side of the PSFs, odd. None: measured on the initial masks.
+        stray_light: what becomes of the light outside the window. None: as the fidelity has it.
+        compositing: how depths are put together, see :class:`~kornia_tidy.TiDyOptics`. gather: each pixel collects
+            light through its own depth's PSF, as the paper; scatter: each spreads its light, which conserves it;
+            occlusion: near things hide far ones, slowest.
+        color_space: srgb is decoded to linear light and encoded after; linear is light already; paper takes sRGB for
+            light, as the paper does. None: srgb, or paper with that fidelity.
+        border: what lies beyond the picture; valid crops it to where all is known.
+    """
+
+    measured: bool = False
+    sigma: Annotated[float, Unit("S", "", 0)] = 0.01
+    full_well: Annotated[float, Unit("E", "electrons", 0)] | None = None
+    bits: Annotated[int, Unit("B", "", 1)] | None = None
+    fidelity: Preset = "balanced"
+    window: Pixels | None = None
+    stray_light: StrayLight | None = None
+    compositing: Compositing = "gather"
+    color_space: ColorSpace | None = None
+    border: Border = "reflect"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSettings:
+    """Network.
+
+    Args:
+        head: a network, or a closed form, behind which only masks are learnt. Without a GPU take nafnet, plain or a
+            small width: the paper's attention-unet has 34.9 million weights. module:Class is a class of yours, which is
+            called with channels in, channels out and, if given, width.
+        width: channels of its first level. None: its own, the paper's 64.
+        repeats: factor of the number of blocks of nafnet.
+        residual: the network adds to the capture; for tasks with an image.
+        closed_form: the network takes deconvolved captures and the level of the noise, and adds to the best of them,
+            see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
+        inverse: filter of the deconvolved captures; wiener knows the spectrum of photographs and how PSFs differ
+            between depths.
+        refocus: depths that the capture is refocused to for the network, see
+            :class:`~kornia_tidy.reconstruction.Refocused`; 0: none.
+        fine: refocus twice to each of these depths, the second time sharper and with more noise; for closed_form
+            without depth_classes, see :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
+        depth_classes: depth as a distribution over so many classes, with its uncertainty, from the depths of refocus,
+            for the task joint; with closed_form 21 classes from 9 depths are usual, without 32 from 11; 0: one depth a
+            pixel; see :class:`~kornia_tidy.reconstruction.JointClosedFormHead` and
+            :class:`~kornia_tidy.reconstruction.LayeredJointHead`.
+        refined: a second network of the same kind refines the image, for depth_classes with closed_form.
+    """
+
+    head: Annotated[str, one_of((*HEADS, *CLOSED_FORMS), others=True)] = "attention-unet"
+    width: Annotated[int, Unit("C", "channels", 1)] | None = None
+    repeats: Annotated[int, Unit("N", "", 1, MOST)] = 1
+    residual: bool = False
+    closed_form: bool = False
+    inverse: Inverse = "tikhonov"
+    refocus: Annotated[int, Unit("D", "", 0, MOST)] = 0
+    fine: bool = False
+    depth_classes: Annotated[int, Unit("D", "", 0, MOST)] = 0
+    refined: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SystemSettings(NetworkSettings, CaptureSettings, LensSettings, MaskSettings):
     """Camera and network of a trained system. The defaults are the paper's, with our camera.
 
     Settings of a run are in :class:`~kornia_tidy.training.settings.TrainingSettings`.
 
     Args:
-        task: ``"edof"`` (all-in-focus image), ``"depth"`` or ``"joint"``.
-        masks: number K of learnable masks; 0 is a fixed Fresnel lens.
-        start: initial heights of the masks by name, the first K of
-            :func:`~kornia_tidy.masks.initial_heights.initial_heights`; ``"noise"`` gives any number of masks.
-        mask_size: pixels along a side of a mask; 20 of 23 span the aperture.
-        focal_length: of the lens in metres.
-        pixel_pitch: of the sensor in metres.
-        depth_range: nearest and farthest depth in metres for which focus and aperture are chosen. None: the default
-            lens, from 0.298 m to infinity.
-        f_number: focal length over the diameter of the aperture. None: f/17.6, or as chosen for ``depth_range``.
-        focus: distance in focus in metres; may be ``inf``. None: the middle of the range of inverse depth.
-        measured: PSFs were measured, see :func:`~kornia_tidy.inference.measured.measured_settings`. Checkpoints hold
-            them, and ``masks`` take no part.
-        sigma: read noise of the sensor, in units of full scale.
-        full_well: electrons at full scale, for shot noise. None: no shot noise.
-        bits: bits of the sensor's converter. None: no rounding.
-        fidelity: name of the preset by which PSFs are computed.
-        window: side of the PSFs in pixels. None: measured on the initial masks, then fixed.
-        stray_light: what becomes of the light outside the window, see :class:`~kornia_tidy.fidelity.Fidelity`. None: as
-            the preset has it.
-        compositing: see :class:`~kornia_tidy.TiDyOptics`.
-        color_space: as for :class:`~kornia_tidy.TiDyOptics`. None: its default.
-        border: as for :class:`~kornia_tidy.TiDyOptics`.
-        head: name of the network, see :data:`kornia_tidy.inference.heads.HEADS`; of a closed form alone,
-            one of :data:`~kornia_tidy.inference.heads.CLOSED_FORMS`; or the import path of a class, ``module:Class``.
-        width: channels of the network's first level. None: its default; the paper's attention U-Net has 64.
-        repeats: factor of the number of blocks of the head ``"nafnet"``, see
-            :class:`~kornia_tidy.reconstruction.NAFNet`.
-        residual: the network estimates the difference between image and capture; for tasks with an image.
-        closed_form: the network takes restorations in closed form beside the capture, and its image is added to the
-            best of them, see :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
-        inverse: filter of these restorations, ``"tikhonov"`` or ``"wiener"``, see
-            :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
-        refocus: number of depths that the capture is refocused to before it enters the network, see
-            :class:`~kornia_tidy.reconstruction.Refocused`. 0: none.
-        fine: the capture is refocused twice to each of these depths, the second time sharper and with more noise; for
-            ``closed_form`` without ``depth_classes``, see :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
-        depth_classes: classes of a distribution of depth, for the task ``"joint"``. It begins as the likelihood of
-            ``refocus`` depths in closed form; the image begins as with ``closed_form``, see
-            :class:`~kornia_tidy.reconstruction.JointClosedFormHead`, or without it as the capture deconvolved for each
-            of these depths, blended by the distribution, see :class:`~kornia_tidy.reconstruction.LayeredJointHead`.
-            0: one depth a pixel without uncertainty.
-        refined: a second network of the same kind refines the image, where ``depth_classes`` and ``closed_form`` are
-            given, see :class:`~kornia_tidy.reconstruction.JointClosedFormHead`.
-        seed: of the initial masks, and of everything random in a run.
+        depth_range: nearest and farthest depth that the camera is for. None: 0.298 to inf.
 
     Raises:
         ValueError: if a value is not allowed.
@@ -89,82 +210,23 @@ class SystemSettings:
         0.05
     """
 
-    task: str = "edof"
-    masks: int = 5
-    start: str = "noise"
-    mask_size: int = 23
-    focal_length: float = 50e-3
-    pixel_pitch: float = 8e-6
-    depth_range: tuple[float, float] | None = None
-    f_number: float | None = None
-    focus: Distance | None = None
-    measured: bool = False
-    sigma: float = 0.01
-    full_well: float | None = None
-    bits: int | None = None
-    fidelity: str = "balanced"
-    window: int | None = None
-    stray_light: str | None = None
-    compositing: str = "gather"
-    color_space: str | None = None
-    border: str = "reflect"
-    head: str = "attention-unet"
-    width: int | None = None
-    repeats: int = 1
-    residual: bool = False
-    closed_form: bool = False
-    inverse: str = "tikhonov"
-    refocus: int = 0
-    fine: bool = False
-    depth_classes: int = 0
-    refined: bool = False
-    seed: int = 0
-
     def __post_init__(self) -> None:
-        _check_types(self)
-        check_choice("task", self.task, tuple(MAPS))
-        check_choice("compositing", self.compositing, tuple(COMPOSITING))
-        check_choice("border", self.border, BORDERS)
-        Fidelity.preset(self.fidelity)
-        if self.stray_light is not None:
-            check_choice("stray_light", self.stray_light, STRAY_LIGHT)
-        for name in ("focal_length", "pixel_pitch"):
-            check_positive(name, getattr(self, name))
-        self._check_lens()
-        for name in ("masks", "refocus", "depth_classes", "seed"):
-            check_count(name, getattr(self, name), 0)
-        check_count("mask_size", self.mask_size)
-        for name in ("masks", "mask_size", "repeats", "refocus", "depth_classes"):
-            if getattr(self, name) > MOST:
-                raise ValueError(f"{name} must be {MOST} or fewer, got {getattr(self, name)}")
-        check_choice("start", self.start, STARTS)
+        super().__post_init__()
         if self.start != "noise" and self.masks > 5:
             raise ValueError(f"start {self.start!r} has five masks, got masks={self.masks}; 'noise' has any number")
-        if self.residual and "image" not in MAPS[self.task]:
+        if self.residual and self.task == "depth":
             raise ValueError(f"residual adds the capture to the image, and the task {self.task!r} estimates none")
         check_head(self.head)
-        check_count("repeats", self.repeats)
         check_repeats(self.head, self.repeats)
         self._check_closed_form()
         if self.depth_classes or self.refined:
             self._check_distribution()
-        if self.depth_range is not None:
-            object.__setattr__(self, "depth_range", tuple(self.depth_range))  # JSON has no tuples
-
-    def _check_lens(self) -> None:
-        if self.f_number is not None and self.f_number < FASTEST:
-            raise ValueError(f"f_number must be {FASTEST} or more, got {self.f_number}")
-        if self.focus is not None and not self.focus > self.focal_length:
-            raise ValueError(
-                f"focus must be metres beyond the focal length of {self.focal_length:g} m, got {self.focus}"
-            )
 
     def _check_closed_form(self) -> None:
         if self.head in CLOSED_FORMS and self.task != "edof":
             raise ValueError(f"head {self.head!r} restores images, for the task 'edof' only, got {self.task!r}")
         if self.residual and (self.closed_form or self.head in CLOSED_FORMS):
             raise ValueError("residual adds the capture and closed_form its restoration: choose one of them")
-        check_choice("inverse", self.inverse, INVERSES)
         if self.inverse != INVERSES[0] and not self.closed_form:
             raise ValueError(f"inverse {self.inverse!r} is the filter of closed_form, which is not asked for")
         if self.fine and (self.depth_classes or not (self.closed_form and self.refocus)):
@@ -194,25 +256,14 @@ class SystemSettings:
 
     def sensor(self) -> SensorNoise:
         """Return the sensor with its noise."""
+        from kornia_tidy.sensor.noise import SensorNoise  # noqa: PLC0415 (torch takes seconds)
+
         return SensorNoise(self.sigma, full_well=self.full_well, bits=self.bits)
 
-    def camera(self) -> ThinLensCamera:
-        """Return the lens and the sensor's pixels."""
-        lens: dict[str, Any] = {"focal_length": self.focal_length, "pixel_pitch": self.pixel_pitch}
-        if self.f_number is None and self.focus is None:
-            return self._chosen_camera(lens)
-        near, far = ThinLensCamera().depth_range if self.depth_range is None else self.depth_range
-        diameter = (
-            self._chosen_camera(lens).aperture_diameter if self.f_number is None else self.focal_length / self.f_number
-        )
-        focus = 2 / (1 / near + 1 / far) if self.focus is None else self.focus
-        return ThinLensCamera(aperture_diameter=diameter, focus_distance=focus, depth_range=(near, far), **lens)
+    def _depths(self) -> tuple[float, float] | None:
+        from kornia_tidy.optics.thin_lens import ThinLensCamera  # noqa: PLC0415
 
-    def _chosen_camera(self, lens: dict[str, Any]) -> ThinLensCamera:
-        """Return the lens whose focus and aperture follow from the depth range, or the default one."""
-        return (
-            ThinLensCamera(**lens) if self.depth_range is None else ThinLensCamera.for_scene(self.depth_range, **lens)
-        )
+        return ThinLensCamera().depth_range if self.depth_range is None else self.depth_range
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as a dictionary of plain values."""
@@ -239,6 +290,7 @@ class SystemSettings:
         """
         if not isinstance(values, Mapping):
             raise ValueError(f"settings must be values by name, got {values!r:.80}")
+        values = {RENAMED.get(name, name): value for name, value in values.items()}
         names = {field.name for field in fields(cls)}
         known = {name: value for name, value in values.items() if name in names}
         return known, {name: value for name, value in values.items() if name not in names}
@@ -260,43 +312,3 @@ class SystemSettings:
             return cls.from_dict(values)
         except ValueError as error:
             raise ValueError(f"cannot read {path}: {error}") from error
-
-
-def _check_types(settings: SystemSettings) -> None:
-    """Raise ``ValueError`` for a value of another type, as a damaged file may hold; int is allowed for float."""
-    for field in fields(settings):
-        name, value = field.name, getattr(settings, field.name)
-        if value is None and "None" in str(field.type):
-            continue
-        kind = str(field.type).split(" | ")[0]
-        if not _is_a(kind, value):
-            raise ValueError(f"{name} must be {_KINDS[kind]}, got {value!r:.80}")
-
-
-_KINDS = {
-    "str": "a text",
-    "bool": "true or false",
-    "int": "a whole number",
-    "float": "a finite number",
-    "Distance": "a number of metres",
-    "tuple[float, float]": "two numbers",
-}
-
-
-def _is_a(kind: str, value: Any) -> bool:
-    if kind == "tuple[float, float]":
-        return isinstance(value, (tuple, list)) and len(value) == 2 and all(_is_number(end) for end in value)
-    if kind == "float":
-        return _is_number(value) and math.isfinite(value)
-    if kind == "Distance":
-        return _is_number(value)
-    if kind == "int":
-        return isinstance(value, int) and not isinstance(value, bool)
-    return isinstance(value, {"str": str, "bool": bool}[kind])
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value is infinite or a number that a float can hold; integers in JSON may be larger."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return abs(value) <= sys.float_info.max or value == math.inf

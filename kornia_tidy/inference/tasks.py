@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.data.depth_range import middle_depths
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 
@@ -91,6 +92,19 @@ def metres(camera: ThinLensCamera, inverse_depth: Tensor) -> Tensor:
     """
     lo, hi = camera.defocus_range
     return camera.depth(lo + (hi - lo) * inverse_depth.clamp(0, 1))
+
+
+def stretched(depth: Tensor, valid: Tensor, camera: ThinLensCamera) -> Tensor:
+    """Stretch the depths of a scene, linearly in dioptres, over a camera's range.
+
+    Example:
+        >>> import torch
+        >>> depth = torch.tensor([[[2.0, 3.0, 6.0]]])
+        >>> stretched(depth, depth > 0, ThinLensCamera()).round(decimals=4)
+        tensor([[[0.2975, 0.5950,    inf]]])
+    """
+    near, far = (1 / end for end in middle_depths(depth, valid))
+    return metres(camera, ((1 / depth - far) / (near - far)))
 
 
 def deviation_in_metres(camera: ThinLensCamera, inverse_depth: Tensor, deviation: Tensor) -> Tensor:

@@ -13,7 +13,8 @@ from kornia_tidy.camera.saved_camera import below, camera_of_state, masks_of_sta
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_finite
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.inference.heads import CLOSED_FORMS, check_imported, make_head
+from kornia_tidy.inference.head_names import CLOSED_FORMS, check_imported
+from kornia_tidy.inference.heads import make_head
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import WHAT, read_state
 from kornia_tidy.inference.tasks import channels_of

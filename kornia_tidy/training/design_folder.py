@@ -41,7 +41,7 @@ def designed_settings(folder: str | os.PathLike[str]) -> dict[str, Any]:
             "pixel_pitch": float(task["pixel_pitch"]),
             "depth_range": (near, math.inf if far is None else far),
             "f_number": float(camera["f_number"]),
-            "focus": math.inf if camera["focus_m"] is None else float(camera["focus_m"]),
+            "focus_distance": math.inf if camera["focus_m"] is None else float(camera["focus_m"]),
             "masks": 1 if flat else task["masks"],
             "start": "flat" if flat else "noise",
             "mask_size": task["mask_size"],

@@ -21,7 +21,7 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.camera.saved_camera import below
 from kornia_tidy.files import only_here
-from kornia_tidy.inference.heads import CLOSED_FORMS
+from kornia_tidy.inference.head_names import CLOSED_FORMS
 from kornia_tidy.inference.state_file import read_state
 from kornia_tidy.inference.trained import (
     fix_window,

@@ -4,17 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.heads import CLOSED_FORMS, FIXED
+from kornia_tidy.inference.head_names import CLOSED_FORMS, FIXED
 from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.trained import TrainedSystem
-from kornia_tidy.reconstruction.head import check_count
-from kornia_tidy.reconstruction.metrics import SSIM_WINDOW
-from kornia_tidy.training.noisy_crops import TOLD_ERROR, check_electrons, check_noise_error, check_noise_range
-from kornia_tidy.training.task_loss import LOSSES
+from kornia_tidy.settings import Count, CountOrNone, Factor, FNumber, Pixels, Unit, one_of
 
+if TYPE_CHECKING:
+    from kornia_tidy.inference.trained import TrainedSystem
+
+DATA = {
+    "photographic-leaves": "painted, like photographs",
+    "dead-leaves": "painted, with sharp outlines and full textures",
+    "photo-collages": "cut out of your own photographs",
+    "flying-things": "frames of FlyingThings3D, as published; the nearest points are put at the camera's near end",
+    "flying-things-patches": "the paper's patches of them",
+    "nyu": "NYU Depth v2, as published",
+    "rgbd-folder": "your own folder, in which rgbd.json gives the pairs of files and the unit of depth",
+}
+"""Data sets by name."""
+LOSS = {
+    "mse": "the paper's",
+    "l1": "Ikoma's of depth",
+    "phasecam3d": "20 RMSE + RMSE of slopes",
+    "charbonnier": "smooth l1",
+    "psnr-ssim": "decibels of the error and of SSIM, for images",
+}
 SCHEDULES = ("constant", "cosine")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # of the network; optics always run in float32
 LEARN = {
@@ -24,6 +39,8 @@ LEARN = {
     "masks": "the masks, through a network that stays as it is",
 }
 FIXED_OPTICS = ("network", "refiner")
+SSIM_WINDOW = 11  # px, that of kornia_tidy.reconstruction.metrics
+
 
 NETWORK_RUN: dict[str, Any] = {
     "learn": "network", "head": "nafnet", "closed_form": True, "width": 16, "size": 256, "crop": None, "scenes": 1000,
@@ -37,52 +54,109 @@ a hundred times that of an image."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingSettings(SystemSettings):
+class SceneSettings:
+    """Scenes.
+
+    Args:
+        data: where scenes come from, see :data:`DATA`. Published splits are kept; of a folder a tenth is for
+            validation and a tenth for testing.
+        root: folder of data that are files. None: data/NAME.
+        size: side of the scenes; larger ones are cropped, at random for training.
+        scenes: number for training, of patches and of scenes made here.
+        validation_scenes: largest number for validation.
+        crop: side of what a step sees of a capture, for fixed optics. None: all of it.
+        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for fixed optics.
+    """
+
+    data: Annotated[str, one_of(DATA)] = "photographic-leaves"
+    root: Annotated[str, Unit("FOLDER")] | None = None
+    size: Pixels = 278
+    scenes: Count = 5077
+    validation_scenes: Count = 64
+    crop: Pixels | None = None
+    augment: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightSettings:
+    """Noise in training, where not masks and network are learnt together.
+
+    Args:
+        noise_range: least and largest standard deviation of the read noise, of full scale, drawn for half of the
+            captures; the sensor's own noise is that of scores afterwards.
+        noise_error: largest factor by which the noise told to the network is wrong, for fixed optics: how well the
+            noise of later captures will be known; 1: exactly.
+        electrons: least and largest number of electrons of white at the reference f-number, drawn for the other half,
+            which has shot noise: a smaller aperture gets fewer in the same exposure time. None: 500 to 60000 at any
+            f-number.
+        reference_f_number: f-number at which the electrons are counted.
+    """
+
+    noise_range: Annotated[tuple[float, float], Unit("LEAST LARGEST", "", 0, 1, above=True)] = (1e-3, 0.03)
+    noise_error: Annotated[float, Unit("X", "", 1)] = 2.5
+    electrons: Annotated[tuple[float, float], Unit("LEAST LARGEST", "electrons", 0, above=True)] | None = None
+    reference_f_number: FNumber = 17.6
+
+    def check_light(self) -> None:
+        """Raise ``ValueError`` if the ends of a range are out of order."""
+        for name in ("noise_range", "electrons"):
+            if (ends := getattr(self, name)) is not None:
+                object.__setattr__(self, name, tuple(ends))  # JSON has no tuples
+                if ends[0] > ends[1]:
+                    raise ValueError(f"{name} must be least and largest, got {ends[0]} and {ends[1]}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningSettings:
+    """Learning.
+
+    Args:
+        learn: what is learnt. Behind fixed optics each scene is rendered once, see
+            :class:`~kornia_tidy.training.noise_free.NoiseFreeCaptures`, and crop, gain and noise are drawn for each
+            step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`; masks are learnt with noise drawn for each
+            scene.
+        design: gradient steps that design the masks before training, without scenes or network, see
+            :func:`~kornia_tidy.training.designed.design_masks`; for the task edof only, 120 do.
+        lr: learning rate of the network.
+        lr_metres: learning rate of the masks in metres of height.
+        schedule: of both rates; cosine: up over a tenth of the steps, then down to zero.
+        batch: scenes in a batch.
+        accumulate: batches in a step.
+        epochs: passes over the scenes.
+        pretrain_epochs: passes before, of the network alone with a fixed Fresnel lens; the paper takes 300.
+        patience: epochs without improvement after which the run stops. None: it does not stop early.
+        ema: decay of the moving average of the network's weights; 0: none.
+        loss: of image and depth, see :data:`LOSS`.
+        depth_weight: of the depth loss in the task joint; beside psnr-ssim, which is in decibels, 10 or more.
+        image_weight: of the image loss in the task joint.
+        precision: of the network; optics stay in float32. bf16-mixed is faster on processors that compute in bfloat16
+            (AMX or AVX-512 BF16), and far slower on others.
+        channels_last: the network's memory holds the channels of a pixel together, which is faster in bfloat16.
+    """
+
+    learn: Annotated[str, one_of(LEARN)] = "both"
+    design: CountOrNone = 0
+    lr: Annotated[float, Unit("LR", "", 0, above=True)] = 1e-4
+    lr_metres: Annotated[float, Unit("LR", "metres", 0, above=True)] = 1e-8
+    schedule: Annotated[str, one_of(SCHEDULES)] = "constant"
+    batch: Annotated[int, Unit("B", "", 1)] = 32
+    accumulate: Count = 1
+    epochs: Count = 300
+    pretrain_epochs: CountOrNone = 0
+    patience: Count | None = None
+    ema: Annotated[float, Unit("D", "", 0)] = 0.999
+    loss: Annotated[str, one_of(LOSS)] = "mse"
+    depth_weight: Factor = 1.0
+    image_weight: Factor = 1.0
+    precision: Annotated[str, one_of(PRECISIONS)] = "32-true"
+    channels_last: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSettings(LearningSettings, LightSettings, SceneSettings, SystemSettings):
     """A training run. The defaults are the paper's, with our camera; see :func:`kornia_tidy.training.run.train`.
 
     Checkpoints and ``settings.json`` hold all of them in one dictionary.
-
-    Args:
-        learn: ``"both"``, masks and network together; or ``"network"`` alone behind fixed optics: scenes are rendered
-            once, see :class:`~kornia_tidy.training.noise_free.NoiseFreeCaptures`, and crop, gain and noise are drawn
-            for each step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`; or ``"refiner"``: as
-            ``"network"``, but only the second network of ``refined`` is learnt, and depth stays as it is; or
-            ``"masks"``: they are learnt through a network that stays as it is, with noise drawn for each scene.
-        design: gradient steps that optimise the masks for the task before training, without scenes or network, see
-            :func:`~kornia_tidy.training.designed.design_masks`; for the task ``"edof"`` only. 0: none. A fixed lens
-            is not changed.
-        data: name of the data, see :data:`kornia_tidy.training.data_sets.SCENES`.
-        root: folder of the data, where they are files. None: ``data/NAME``.
-        size: side of the scenes in pixels; larger scenes are cropped, at random for training.
-        crop: side of the crops of the captures in pixels, for fixed optics. None: whole captures.
-        noise_range: least and largest standard deviation of read noise, in units of full scale, where not masks and
-            network are learnt together; the sensor's own noise is that of scores afterwards.
-        noise_error: largest factor by which the noise told to the network is wrong, for fixed optics: how well
-            the noise of later captures will be known. 1: exactly.
-        electrons: least and largest number of electrons of a white pixel at the reference f-number, for the captures
-            with shot noise, likewise. A smaller aperture gets fewer in the same exposure time. None: 500
-            to 60,000 at every f-number.
-        reference_f_number: f-number at which the electrons are counted.
-        scenes: number of training scenes, for data whose number of scenes is not fixed.
-        validation_scenes: largest number of validation scenes.
-        augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for fixed optics.
-        lr: learning rate of the network.
-        lr_metres: learning rate of the masks in metres of height.
-        schedule: of both rates: ``"constant"``, or ``"cosine"``: a rise over the first tenth of the steps, then a fall
-            to zero.
-        batch: scenes in a batch.
-        accumulate: batches in a step of the optimiser.
-        epochs: passes over the data.
-        pretrain_epochs: earlier passes in which only the network is trained, with a fixed Fresnel lens. The paper
-            takes 300 for the tasks edof and joint.
-        patience: epochs without improvement after which the run stops. None: it does not stop early.
-        ema: decay of the exponential moving average of the network's weights. 0: none.
-        depth_weight: of the depth loss in the joint task.
-        image_weight: of the image loss in the joint task.
-        loss: name of the loss, see :data:`kornia_tidy.training.task_loss.LOSSES`.
-        precision: of the network.
-        channels_last: keep the channels of a pixel together in the network's memory, which is faster in bfloat16.
-        **system: the settings of :class:`~kornia_tidy.inference.settings.SystemSettings`.
 
     Raises:
         ValueError: if a value is not allowed.
@@ -92,68 +166,21 @@ class TrainingSettings(SystemSettings):
         1e-08
     """
 
-    learn: str = "both"
-    design: int = 0
-    data: str = "photographic-leaves"
-    root: str | None = None
-    size: int = 278
-    crop: int | None = None
-    noise_range: tuple[float, float] = (1e-3, 0.03)
-    noise_error: float = TOLD_ERROR
-    electrons: tuple[float, float] | None = None
-    reference_f_number: float = 17.6
-    scenes: int = 5077
-    validation_scenes: int = 64
-    augment: bool = True
-    lr: float = 1e-4
-    lr_metres: float = 1e-8
-    schedule: str = "constant"
-    batch: int = 32
-    accumulate: int = 1
-    epochs: int = 300
-    pretrain_epochs: int = 0
-    patience: int | None = None
-    ema: float = 0.999
-    depth_weight: float = 1.0
-    image_weight: float = 1.0
-    loss: str = "mse"
-    precision: str = "32-true"
-    channels_last: bool = False
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("learn", self.learn, tuple(LEARN))
+        self.check_light()
         if self.learn == "refiner" and not self.refined:
             raise ValueError("learn='refiner' needs the second network of refined=True")
         if self.learn == "masks" and not self.masks:
             raise ValueError("learn='masks' needs masks to learn, got masks=0, a fixed lens")
-        check_choice("loss", self.loss, tuple(LOSSES))
-        check_choice("precision", self.precision, PRECISIONS)
-        check_choice("schedule", self.schedule, SCHEDULES)
-        for name in ("lr", "lr_metres", "reference_f_number"):
-            check_positive(name, getattr(self, name))
-        for name in ("size", "scenes", "validation_scenes", "batch", "accumulate", "epochs"):
-            check_count(name, getattr(self, name), 1)
-        for name in ("pretrain_epochs", "design"):
-            check_count(name, getattr(self, name), 0)
         if self.design and self.task != "edof":
             raise ValueError(f"masks can be designed before training for the task 'edof' only, got {self.task!r}")
-        if self.patience is not None and self.patience < 1:
-            raise ValueError(f"patience must be 1 epoch or more, got {self.patience}")
-        object.__setattr__(self, "noise_range", tuple(self.noise_range))  # JSON has no tuples
-        check_noise_range(self.noise_range)
-        check_noise_error(self.noise_error)
-        if self.electrons is not None:
-            object.__setattr__(self, "electrons", tuple(self.electrons))
-            check_electrons(self.electrons)
-        if self.crop is not None:
-            check_count("crop", self.crop, 1)
-            if self.crop > self.size:
-                raise ValueError(f"crop must be at most the size of the scenes, {self.size}, got {self.crop}")
+        if self.crop is not None and self.crop > self.size:
+            raise ValueError(f"crop must be at most the size of the scenes, {self.size}, got {self.crop}")
         side = self.crop or self.size
         if self.loss == "psnr-ssim" and side < SSIM_WINDOW:
             raise ValueError(f"loss 'psnr-ssim' needs images of at least {SSIM_WINDOW} pixels a side, got {side}")
-        if not 0 <= self.ema < 1:
+        if not self.ema < 1:
             raise ValueError(f"ema must be in [0, 1), got {self.ema}")
 
     @property

@@ -17,9 +17,9 @@ from kornia_tidy.app.pictures import CELL, COLUMNS, GAP, HEAD, LEFT, MASK_SPACE,
 from kornia_tidy.app.scenes import read_files
 from kornia_tidy.app.script import as_python
 from kornia_tidy.app.settings import Settings
-from kornia_tidy.commands.demo import stretched
 from kornia_tidy.data import write_image
 from kornia_tidy.figures.style import PHASE_COLORS
+from kornia_tidy.inference.tasks import stretched
 from tests.base import BaseTester
 
 matplotlib = pytest.importorskip("matplotlib", reason="depth maps and masks are drawn with matplotlib")

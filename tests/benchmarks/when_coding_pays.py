@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 import torch
 from tqdm import tqdm
 
-from kornia_tidy.commands.demo import stretched
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.figures.style import ACCENT, FAINT, INK, open_chart
 from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.inference.tasks import stretched
 from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design
 from kornia_tidy.mask_design.design_task import DesignTask
 from tests.scenes import ENTRIES, halves, load_scene

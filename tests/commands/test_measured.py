@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kornia_tidy.commands.options import noise
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.calibration.noise.photon_transfer import write_json
 from kornia_tidy.calibration.psf import MeasuredPSFs, measured_camera
 from kornia_tidy.cli import build_parser, main
 from kornia_tidy.coded_datasets.captures import CodedCaptures
-from kornia_tidy.commands.options import noise
 from kornia_tidy.data import dead_leaves, read_image, read_rgbd, write_depth, write_image
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
 from kornia_tidy.inference.measured import closed_form_system

@@ -11,10 +11,10 @@ import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.commands.options import middle_depths
 from kornia_tidy.data import fill_holes
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data.depth_range import middle_depths
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.rgbd import read_rgbd
 from tests.base import BaseTester, shared

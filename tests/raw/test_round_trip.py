@@ -10,11 +10,11 @@ import torch
 from kornia.color import linear_rgb_to_rgb
 
 from kornia_tidy import SensorNoise
-from kornia_tidy.commands.demo import stretched
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
 from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.inference.tasks import stretched
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
 from kornia_tidy.raw.dng_file import encode_dng

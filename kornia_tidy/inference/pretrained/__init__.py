@@ -11,20 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.choices import PRETRAINED
 from kornia_tidy.inference.eight_bits import in_eight_bits
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.inference.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
-PRETRAINED = (
-    "joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat", "joint-uncertain",
-)  # fmt: skip
-"""Names: task and number of masks; 0 masks are a Fresnel element, as in the paper. All have the paper's lens of f/17.6
-but three. The networks of two know light of 500 to 57,000 electrons of white at f/17.6 in the same exposure time:
-``"edof-designed"`` has five masks at f/22, of 92 x 92 pixels; ``"edof-flat"`` has none, at f/48.
-``"joint-uncertain"`` has five masks at f/28.5, designed for image and depth, and a network that begins with the closed
-form: it returns a distribution of depth, so that it tells how sure it is, and a better image."""
 
 
 def load_pretrained(name: str) -> TrainedSystem:

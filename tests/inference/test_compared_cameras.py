@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.commands import demo_cameras
-from kornia_tidy.commands.demo_cameras import photograph, shipped_cameras, stopped_down
 from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.inference import compared_cameras
+from kornia_tidy.inference.compared_cameras import photograph, shipped_cameras, stopped_down
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics, update_psfs
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -31,9 +31,9 @@ def shipped(monkeypatch):
             update_psfs(head, optics)
         return TrainedSystem(optics.eval(), head.eval(), SHIPPED[name], 0)
 
-    monkeypatch.setattr(demo_cameras, "PRETRAINED", tuple(SHIPPED))
-    monkeypatch.setattr(demo_cameras, "pretrained_settings", SHIPPED.__getitem__)
-    monkeypatch.setattr(demo_cameras, "load_pretrained", load)
+    monkeypatch.setattr(compared_cameras, "PRETRAINED", tuple(SHIPPED))
+    monkeypatch.setattr(compared_cameras, "pretrained_settings", SHIPPED.__getitem__)
+    monkeypatch.setattr(compared_cameras, "load_pretrained", load)
 
 
 @pytest.fixture

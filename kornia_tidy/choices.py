@@ -1,0 +1,57 @@
+"""Names that settings choose from, without what they name: torch is not imported, so that ``--help`` comes at once."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.settings import one_of
+
+TASKS = ("edof", "depth", "joint")
+COMPOSITING = ("gather", "scatter", "occlusion")
+BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
+STRAY_LIGHT = ("renormalize", "veil", "discard")
+COLOR_SPACES = ("srgb", "linear", "paper")
+HOLES = ("error", "fill")
+STARTS = (
+    "noise", "fisher, noise", "noisy fishers", "fisher, noisy fishers", "3 fishers, 2 noisy", "like fishers",
+    "focal sweep", "flat",
+)  # fmt: skip
+INVERSES = ("tikhonov", "wiener")
+SYSTEMS = (
+    "tidy-5", "tidy-1", "fresnel", "phasecam3d", "ikoma2021", "chang2019", "liu2022-pixelwise", "liu2022-spiral",
+    "sitzmann2018",
+)  # fmt: skip
+SPLITS = ("train", "validation", "test", "all")
+BESIDE = ("image", "depth", "mask")  # of a coded image
+BETWEEN = ("random", "linear", "exponential")  # two masks, the phase while a modulator switches
+MATERIALS = ("constant", "fused-silica", "pmma", "pdms", "noa61")
+FLIPS, ROTATIONS = ("none", "left-right", "up-down"), (0, 90, 180, 270)
+ORIENTATIONS = (1, 2, 4, 8)
+KNOBS = (
+    "preset", "layers", "layer_spacing", "pixel_tolerance", "window", "enclosed_energy", "stray_light", "double",
+    "plan",
+)  # fmt: skip
+DEMOSAIC = (
+    "bilinear", "half", "kornia", "opencv_bilinear", "opencv_edge_aware", "opencv_vng", "libraw_linear", "libraw_vng",
+    "libraw_ppg", "libraw_ahd", "libraw_dcb", "libraw_dht", "libraw_markesteijn",
+)  # fmt: skip
+WHITE_BALANCES = ("as shot", "daylight", "auto", "none")
+HIGHLIGHTS = ("clip", "keep")
+ADAPTATIONS = ("Bradford", "CAT02", "CAT16", "Von Kries")
+PRETRAINED = (
+    "joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat", "joint-uncertain",
+)  # fmt: skip
+"""Shipped systems: task and number of masks; 0 masks are a Fresnel element, as in the paper. All have the paper's lens
+of f/17.6 but three. The networks of two know light of 500 to 57,000 electrons of white at f/17.6 in the same exposure
+time: ``"edof-designed"`` has five masks at f/22, of 92 x 92 pixels; ``"edof-flat"`` has none, at f/48.
+``"joint-uncertain"`` has five masks at f/28.5, designed for image and depth, and a network that begins with the closed
+form: it returns a distribution of depth, so that it tells how sure it is, and a better image."""
+
+Preset = Annotated[str, one_of(PRESETS)]
+Compositing = Annotated[str, one_of(COMPOSITING)]
+Border = Annotated[str, one_of(BORDERS)]
+StrayLight = Annotated[str, one_of(STRAY_LIGHT)]
+ColorSpace = Annotated[str, one_of(COLOR_SPACES)]
+Start = Annotated[str, one_of(STARTS)]
+Inverse = Annotated[str, one_of(INVERSES)]

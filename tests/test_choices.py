@@ -1,0 +1,69 @@
+"""Names that settings choose from are those of what they name."""
+
+from __future__ import annotations
+
+import pytest
+
+from kornia_tidy import choices
+from kornia_tidy.camera import camera_state
+from kornia_tidy.coded_datasets import layout
+from kornia_tidy.fidelity import PRESETS
+from kornia_tidy.inference.pretrained import FOLDER
+from kornia_tidy.inference.tasks import MAPS
+from kornia_tidy.mask_export import placement
+from kornia_tidy.masks.initial_heights import STARTS
+from kornia_tidy.modulator import switching
+from kornia_tidy.optics import holes
+from kornia_tidy.psf import psf_bank
+from kornia_tidy.raw.color import ADAPTATIONS
+from kornia_tidy.raw.demosaic import METHODS
+from kornia_tidy.raw.develop import HIGHLIGHTS
+from kornia_tidy.reconstruction import closed_form, metrics
+from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
+from kornia_tidy.render import borders, compositing
+from kornia_tidy.settings import settings_of
+from kornia_tidy.systems.presets import SYSTEMS
+from kornia_tidy.tradeoff.sweep_settings import PLAN, SWEEP_VALUES
+from kornia_tidy.training import data_sets, noisy_crops, settings, task_loss
+from tests.base import BaseTester
+
+
+class TestChoices(BaseTester):
+    @pytest.mark.parametrize(
+        ("name", "named"),
+        [
+            ("TASKS", MAPS),
+            ("COMPOSITING", compositing.COMPOSITING),
+            ("BORDERS", borders.BORDERS),
+            ("STRAY_LIGHT", psf_bank.STRAY_LIGHT),
+            ("COLOR_SPACES", camera_state.COLOR_SPACES),
+            ("HOLES", holes.HOLES),
+            ("STARTS", STARTS),
+            ("INVERSES", closed_form.INVERSES),
+            ("SYSTEMS", SYSTEMS),
+            ("SPLITS", data_sets.SPLITS),
+            ("BESIDE", layout.BESIDE),
+            ("BETWEEN", switching.BETWEEN),
+            ("FLIPS", placement.FLIPS),
+            ("ROTATIONS", placement.ROTATIONS),
+            ("ORIENTATIONS", ORIENTATIONS),
+            ("KNOBS", (*SWEEP_VALUES, PLAN)),
+            ("DEMOSAIC", METHODS),
+            ("HIGHLIGHTS", HIGHLIGHTS),
+            ("ADAPTATIONS", ADAPTATIONS),
+        ],
+    )
+    def test_feature_names_are_those_of_what_they_name(self, name, named):
+        assert getattr(choices, name) == tuple(named)
+
+    def test_feature_pretrained_are_the_files(self):
+        assert set(choices.PRETRAINED) == {path.stem for path in FOLDER.glob("*.safetensors")}
+
+    def test_feature_settings_of_training(self):
+        assert tuple(settings.DATA) == tuple(data_sets.SCENES)
+        assert tuple(settings.LOSS) == tuple(task_loss.LOSSES)
+        assert settings.SSIM_WINDOW == metrics.SSIM_WINDOW
+        assert settings.TrainingSettings().noise_error == noisy_crops.TOLD_ERROR
+        assert {one.name: one for one in settings_of(settings.TrainingSettings)}["fidelity"].unit.choices == tuple(
+            PRESETS
+        )
