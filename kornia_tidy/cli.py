@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         interrupted, 141 if the reader of the output has closed its pipe, 143 if terminated.
 
     Raises:
-        SystemExit: from argparse, after ``--help`` (0) or arguments that it cannot read (2).
+        SystemExit: from argparse, after ``--help``.
     """
     _open_closed_streams()
     _print_any_name()
@@ -176,8 +176,8 @@ def read_command(argv: Sequence[str]) -> Any:
     """Return the command that the arguments ask for, with its settings.
 
     Raises:
-        SystemExit: after ``--help``, or arguments that cannot be read.
-        ValueError: if a value is not allowed.
+        SystemExit: after ``--help``.
+        ValueError: if an argument cannot be read, or a value is not allowed.
     """
     commands, prog, words = COMMANDS, "kornia-tidy", list(argv)
     while True:
@@ -186,7 +186,7 @@ def read_command(argv: Sequence[str]) -> Any:
             parser = _overview(commands, prog)
             if name and not name.startswith("-"):
                 meant = get_close_matches(name, commands, 1)
-                parser.error(f"there is no command {name}" + (f": did you mean {meant[0]}?" if meant else ""))
+                parser.error(f"there is no command {name}" + (f" (did you mean {meant[0]}?)" if meant else ""))
             parser.parse_args(words)
         chosen, prog, words = commands[name], f"{prog} {name}", words[1:]
         if isinstance(chosen, str):
@@ -201,7 +201,7 @@ def _overview(commands: Commands, prog: str) -> Parser:
         parser.add_argument("--version", action="version", version=f"kornia-tidy {kornia_tidy.__version__}")
     actions = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     for name, chosen in commands.items():
-        actions.add_parser(name, help=ABOUT[name] if isinstance(chosen, dict) else documented(_class(chosen))[0])
+        actions.add_parser(name, help=documented(_class(chosen))[0] if isinstance(chosen, str) else ABOUT[name])
     return parser
 
 

@@ -47,7 +47,7 @@ class Unit:
 
     def complaint(self, value: Any, kind: type) -> str:
         """Return what is wrong with a number, as the end of a sentence; nothing if it is allowed."""
-        if _is_number(value, kind) and (self.infinite or isfinite(value)) and self._holds(value):
+        if _is_number(value, kind) and (self.infinite or -inf < value < inf) and self._holds(value):
             return ""
         return f"must be {self._allowed(kind)}, got {value!r:.80}"
 
@@ -130,7 +130,7 @@ class Setting(NamedTuple):
     """What else the type is annotated with."""
 
 
-def settings_of(cls: type) -> Iterator[Setting]:
+def settings_of(cls: Any) -> Iterator[Setting]:
     """Yield the fields of a dataclass of settings, those of its base classes first.
 
     Example:
@@ -160,11 +160,11 @@ def _hints(cls: type) -> dict[str, Any]:
 
 def _setting(one: Any, group: type, hint: Any, purpose: str = "", unset: str = "") -> Setting:
     default = one.default if one.default_factory is MISSING else one.default_factory()
-    unit, mark, optional = Unit(one.name.upper()), None, False
+    unit, mark, optional = Unit(""), None, False
     while True:
         members = [member for member in get_args(hint) if member is not NoneType]
         if get_origin(hint) is Annotated:
-            hint, found = hint.__origin__, hint.__metadata__[0]
+            hint, found = get_args(hint)
             unit, mark = (found, mark) if isinstance(found, Unit) else (unit, found)
         elif get_origin(hint) in {Union, UnionType} and len(members) < len(get_args(hint)):
             hint, optional = Union[tuple(members)], True  # noqa: UP007 (of members that are found here)
@@ -174,7 +174,7 @@ def _setting(one: Any, group: type, hint: Any, purpose: str = "", unset: str = "
     if get_origin(hint) is tuple:
         items = 0 if get_args(hint)[-1] is Ellipsis else len(get_args(hint))
         inner = _setting(one, group, get_args(hint)[0])
-        hint, unit = inner.kind, inner.unit if inner.unit.symbol != one.name.upper() else unit
+        hint, unit = inner.kind, inner.unit if inner.unit.symbol else unit
     return Setting(one.name, hint, items, unit, default, optional, purpose, unset, group, mark)
 
 

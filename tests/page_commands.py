@@ -24,7 +24,7 @@ from unittest.mock import patch
 
 import pytest
 
-from kornia_tidy.cli import build_parser
+from kornia_tidy.cli import read_command
 
 ROOT = Path(__file__).resolve().parents[1]
 STOPS = {"|", "||", "&&", ";", ">"}  # what ends a command in a recipe of make
@@ -81,7 +81,7 @@ def find_module(name: str) -> bool:
 def read_arguments(program: str, arguments: list[str]) -> None:
     """Let a program read its arguments, and stop it there."""
     if program == "kornia-tidy":
-        build_parser().parse_args(arguments)
+        read_command(arguments)
     elif program == "pip":
         check_pip(arguments)
     elif program == "pytest":

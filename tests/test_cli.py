@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from kornia_tidy import cli
+from kornia_tidy.commands.simulate import Simulate
 from tests.base import BaseTester
 from tests.forks import fork, wait
 
@@ -25,33 +26,18 @@ class TestMain(BaseTester):
         """Make the command do something else than it should."""
 
         def install(action):
-            monkeypatch.setattr(cli.simulate, "run", lambda args: action())
+            monkeypatch.setattr(Simulate, "run", lambda _: action())
             return ["simulate", "image.png", "--depth", "depth.png"]
 
         return install
 
-    @pytest.mark.parametrize(
-        "argv",
-        [
-            [],
-            ["simulate"],
-            ["demo"],
-            ["design"],
-            ["systems"],
-            ["trade"],
-            ["train"],
-            ["evaluate"],
-            ["raw"],
-            ["render"],
-            ["app"],
-            ["info"],
-        ],
-    )
-    def test_smoke_help_teaches_and_exits_with_zero(self, argv, capsys):
+    def test_smoke_help_lists_the_commands(self, capsys):
         with pytest.raises(SystemExit) as exit_:
-            cli.main([*argv, "--help"])
+            cli.main(["--help"])
         assert exit_.value.code == 0
-        assert "usage: kornia-tidy" in capsys.readouterr().out
+        told = capsys.readouterr().out
+        assert told.startswith("usage: kornia-tidy")
+        assert all(f"    {name} " in told for name in cli.COMMANDS)
 
     def test_smoke_version(self, capsys):
         with pytest.raises(SystemExit):

@@ -108,7 +108,7 @@ class Design:
         depth_range: nearest and farthest depth that the camera is for; the farthest may be inf.
         depth_weight: share of depth in what matters, from 0, the image alone, to 1.
         scenes: pictures with depth, which decide beside dead leaves; FOLDER/rgbd.json pairs them: {"image": "*.png",
-            "depth": "*_depth.png", "scale": 0.001}.
+            "depth": "*_depth.png", "scale": 0.001}. None: dead leaves alone.
         sensor: lens and sensor.
         modulator: what shows the masks.
     """

@@ -42,7 +42,8 @@ class Evaluate:
         system: best.safetensors or last.safetensors of a run; a shipped system; or, with PSFs, a closed form, which
             needs no training.
         output: made if missing. None: evaluation, beside the system.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, which takes the captures.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, which takes the captures. None: those of the
+            system's camera.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: that of the training.
         scenes: their number. None: the whole test split; 32 of generated scenes.
@@ -104,7 +105,7 @@ Closed forms: {", ".join(CLOSED_FORMS)}.
 
             rows = evaluate(system, scenes, self.noise_seed, each)
         about = {"checkpoint": str(self.system), "step": system.step, "noise_seed": self.noise_seed, "split": split}
-        about |= {"psfs": self.psfs, "noise": self.noise}
+        about = {**about, "psfs": self.psfs, "noise": self.noise}
         near, far = metric_range(settings.camera())
         write_table(folder, rows, {**about, "metres_counted": [near, far], "settings": settings.as_dict()})
         for line in table(rows):

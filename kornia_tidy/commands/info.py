@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from pathlib import Path
@@ -16,6 +17,9 @@ PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
     *("lightning", "matplotlib", "h5py", "OpenEXR"),
 )
+
+
+SOURCES = ("gather_ops", "overlap_ops", "occlusion_ops", "mutual_intensity_ops", "srgb_ops")  # in kornia_tidy.kernels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +44,9 @@ def lines() -> Iterator[tuple[str, str]]:
     import torch
 
     import kornia_tidy
-    from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops, srgb_ops
     from kornia_tidy.kernels.build import REALS, build, vector_bytes
 
-    sources = (ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, srgb_ops))
+    sources = (import_module(f"kornia_tidy.kernels.{name}").SOURCE for name in SOURCES)
     yield "package", f"kornia_tidy {kornia_tidy.__version__}, Python {platform.python_version()}"
     yield "uses", ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
     yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}"

@@ -48,7 +48,7 @@ class Panel:
         wavelength: the panel's working wavelength.
         phase_range: phase at that wavelength that the levels span. None: as saved, or 2 pi.
         response: instead: its measured phases at that wavelength, as text: one for each level, or two columns, level
-            and phase; radians, or the unit that a header names (deg, pi, waves).
+            and phase; radians, or the unit that a header names (deg, pi, waves). None: levels that are evenly spaced.
         panel: its size.
         panel_pitch: distance of its pixels.
         offset: of the mask's centre from the panel's.
@@ -91,7 +91,7 @@ class Plate:
     """Plate (STL).
 
     Args:
-        mask: which mask, from 0; needed if there are several.
+        mask: which mask, from 0; needed if there are several. None: the only one.
         base: its thickness.
     """
 

@@ -63,16 +63,16 @@ class Optional(Unit):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that answers a mistake in two lines, and whose help does not vanish where nothing can be written."""
+    """A parser that raises ``ValueError``, and whose help does not vanish where nothing can be written."""
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong and what was meant, and exit with status 2."""
+        """Say in a sentence what is wrong, and what was perhaps meant."""
         message = re.sub(r"^argument (?:-\w/)?(\S+):", r"\1", message)
         if message.startswith("unrecognized arguments: "):
             word = message.split()[2].partition("=")[0]
             meant = difflib.get_close_matches(word, self._option_string_actions, 1)
-            message = f"there is no {word}" + (f": did you mean {meant[0]}?" if meant else " here")
-        self.exit(2, f"{self.prog}: error: {message}\nall options: {self.prog} --help\n")
+            message = f"there is no {word}" + (f" (did you mean {meant[0]}?)" if meant else " here")
+        raise ValueError(f"{message}; see {self.prog} --help")
 
     def _print_message(self, message: str, file: Any = None) -> None:
         if message:
@@ -90,8 +90,8 @@ def read(command: type, argv: Sequence[str], prog: str) -> Any:
     """Return a command with the settings that the arguments give.
 
     Raises:
-        SystemExit: after ``--help``, or arguments that cannot be read.
-        ValueError: if a value is not allowed beside another.
+        SystemExit: after ``--help``.
+        ValueError: if an argument cannot be read, or a value is not allowed.
     """
     return _made(command, vars(make_parser(command, prog, "--help-all" in argv).parse_args(argv)))
 
@@ -168,7 +168,7 @@ def _options(setting: Setting, given: Given | None) -> dict[str, Any]:
 
 def _metavar(setting: Setting) -> str:
     choices = f"{{{','.join(map(str, _choices(setting)))}}}"
-    return choices if 2 < len(choices) <= WIDEST else setting.unit.symbol
+    return choices if 2 < len(choices) <= WIDEST else setting.unit.symbol or setting.name.upper()
 
 
 def _choices(setting: Setting) -> tuple[Any, ...]:
@@ -181,7 +181,7 @@ def _help(setting: Setting, brief: bool, given: Given | None, names: Collection[
     words = () if brief or not isinstance(setting.unit, Choice) else setting.unit.words
     if words:
         purpose += ": " + "; ".join(map(": ".join, zip(_choices(setting), words, strict=True)))
-    elif _choices(setting) and _metavar(setting) == setting.unit.symbol:
+    elif _choices(setting) and not _metavar(setting).startswith("{"):
         purpose += f": {', '.join(_quoted(choice) for choice in _choices(setting))}"
     default = setting.unset if setting.default in (None, MISSING, ()) else _shown(setting.default, setting.unit)
     if given is not None and given.stored:
@@ -211,12 +211,12 @@ def _value(setting: Setting, word: str) -> Any:
             return setting.unit.read(word)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
-    if choices := _choices(setting):
-        named = {str(choice): choice for choice in choices}
+    if isinstance(setting.unit, Choice):
+        named = {str(choice): choice for choice in setting.unit.choices}
         if word in named or setting.unit.others:
             return named.get(word, word)
         meant = difflib.get_close_matches(word, named, 1)
-        hint = f": did you mean {meant[0]}?" if meant else ""
+        hint = f" (did you mean {meant[0]}?)" if meant else ""
         raise argparse.ArgumentTypeError(setting.unit.complaint(word, str) + hint)
     kinds = get_args(setting.kind) or (setting.kind,)
     for kind in kinds:

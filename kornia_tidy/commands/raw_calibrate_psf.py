@@ -29,8 +29,8 @@ class NoiseOfSensor:
     """Noise of the sensor.
 
     Args:
-        full_well: electrons from black to white.
-        read_noise: its standard deviation.
+        full_well: electrons from black to white. None: as noise says.
+        read_noise: its standard deviation. None: as noise says.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by full_well and read_noise.
     """
@@ -60,7 +60,7 @@ class CalibratePsf:
         distances: of the point.
         output: bank to write, .safetensors.
         exposures: at each place.
-        reference: the same places with a flat mask, unsaturated.
+        reference: the same places with a flat mask, unsaturated. None: PSFs are centred at their centroids.
         window: side of the PSFs in pixels of the sensor.
         points: points in each picture.
         picture: draw PSFs, uncertainties and residuals. None: they are not drawn.
@@ -87,6 +87,10 @@ class CalibratePsf:
     lens: Annotated[dict[str, Any], Given(LensSettings, but=("depth_range",))] = field(default_factory=dict)
     dump: Dump = field(default_factory=Dump)
 
+    basic: ClassVar = (
+        *("files", "distances", "output", "exposures", "reference", "window", "points", "picture", "fit_mask", "noise"),
+        *("full_well", "read_noise", "focal_length", "f_number", "focus_distance", "pixel_pitch"),
+    )
     notes: ClassVar = """\
 The printed numbers show the accuracy of the bank. "noise" is the expected error, as the
 sum of its moduli relative to the PSF's light. "residuals" of about 1 mean that the
@@ -235,12 +239,12 @@ In Python:
         """Return the noise of the settings, and its calibration if it was measured."""
         from kornia_tidy.sensor.noise import SensorNoise
 
-        given = self.sensor.full_well, self.sensor.read_noise
+        full_well, read = self.sensor.full_well, self.sensor.read_noise
         if self.sensor.noise is None:
-            if None in given:
+            if full_well is None or read is None:
                 raise ValueError("the noise of the sensor is needed: --noise, or --full-well and --read-noise")
-            return SensorNoise.physical(*given), None
-        if given != (None, None):
+            return SensorNoise.physical(full_well, read), None
+        if full_well is not None or read is not None:
             raise ValueError("--noise says full well and read noise: leave out --full-well and --read-noise")
         sensor, calibration = read_noise(self.sensor.noise)
         assert sensor is not None

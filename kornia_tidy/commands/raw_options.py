@@ -45,10 +45,11 @@ class Dump:
     and --white, and all FILES are read as such dumps, row by row.
 
     Args:
-        size: columns x rows, such as 768x512.
+        size: columns x rows, such as 768x512. None: as the raw file says.
         pattern: colours of the filter array's tile, by rows: RGGB, GMYC, 36 letters for X-Trans; NONE for monochrome.
-        black: count without light, one or one a place.
-        white: saturation count; for raw files, replaces that of the file.
+            None: as the raw file says.
+        black: count without light, one or one a place. None: as the raw file says.
+        white: saturation count; for raw files, replaces that of the file. None: as the raw file says.
         dtype: of a count. None: uint16.
         byte_order: of a count. None: little.
     """
@@ -77,6 +78,7 @@ class Dump:
         for name in ("pattern", "black", "white"):
             if getattr(self, name) in (None, ()):
                 raise ValueError(f"a bare dump of counts needs --{name}")
+        assert self.white is not None
         return RawCapture.open_dump(
             path,
             self.size,

@@ -56,7 +56,8 @@ class ReconstructRaw:
         output: where to; made if it is not there.
         head: a shipped system, or a checkpoint of a training (best.safetensors), or, with PSFs, a closed form. None:
             with PSFs wiener-bilateral.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, by which captures are deconvolved.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, by which captures are deconvolved. None:
+            those of the network's camera.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
             sensor.
@@ -137,7 +138,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
 
         from kornia_tidy.commands.file_jobs import Row, table, work_on_all
         from kornia_tidy.commands.report import tell
-        from kornia_tidy.commands.system_options import digests, load_system
+        from kornia_tidy.commands.system_options import load_system
         from kornia_tidy.figures.style import require_matplotlib
         from kornia_tidy.files import remove_leftovers, write_bytes
         from kornia_tidy.inference.light_head import LightHead, reconstruct_light, with_noise_of
@@ -159,15 +160,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
             require_matplotlib()
         folder = Path(self.output)
         outputs = output_paths(self.files, folder, suffixes)
-        made_by = {
-            "system": digests(self.head, self.psfs, self.noise),
-            "depth_unit": self.depth_unit,
-            "linear": self.linear,
-            "overlap": self.overlap,
-            "orientations": self.orientations,
-            "white_balance": self.white_balance,
-            "dump": vars(self.dump),
-        }
+        made_by = self._made_by()
         folder.mkdir(parents=True, exist_ok=True)
         if self.resume:
             remove_leftovers(folder)
@@ -200,6 +193,20 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
         if failed:
             raise ValueError(f"{failed} of {len(rows)} files failed")
+
+    def _made_by(self) -> dict[str, Any]:
+        """Return what results depend on beside their file, to recognise them on resuming."""
+        from kornia_tidy.commands.system_options import digests
+
+        return {
+            "system": digests(self.head, self.psfs, self.noise),
+            "depth_unit": self.depth_unit,
+            "linear": self.linear,
+            "overlap": self.overlap,
+            "orientations": self.orientations,
+            "white_balance": self.white_balance or None,
+            "dump": {name: value or None for name, value in vars(self.dump).items()},
+        }
 
     def _light(
         self, path: str, sensor: SensorNoise | None = None, calibration: PhotonTransfer | None = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.choices import Compositing, Preset
 from kornia_tidy.commands.raw_options import Pattern, Size
-from kornia_tidy.commands.shared import CameraSettings, DepthFile, File, Noise, check_outputs
+from kornia_tidy.commands.shared import CameraSettings, DepthFile, File, Noise, check_outputs, read_noise
 from kornia_tidy.settings import Count, Electrons, Metres, Seed, Unit, one_of
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class SensorOptions:
         pattern: filter array's tile, by rows. None: RGGB.
         bits: of the converter, whose white is 2^bits - 1. None: 12.
         black: count without light. None: 2^bits / 16.
-        white: saturation count, replaces that of the file of like.
+        white: saturation count, replaces that of the file of like. None: as the file of like says, or by bits.
         color: camera: the picture's colours are seen through the camera's filters, by its matrix and white balance;
             channels: red, green and blue are the camera's own. None: camera with like, else channels.
         full_well: electrons from black to white. None: 10500.
@@ -71,11 +71,11 @@ class SimulateRaw:
 
     Args:
         output: DNG to write.
-        image: picture: PNG, JPEG, TIFF or NPY.
-        depth: of the picture: PNG, TIFF, PGM, PFM, NPY, OpenEXR.
-        flat: instead: an evenly lit sheet, of full scale; 0: the lens cap.
-        points: instead: points of light in a sheet.
-        distance: of the points.
+        image: picture: PNG, JPEG, TIFF or NPY. None: another target.
+        depth: of the picture: PNG, TIFF, PGM, PFM, NPY, OpenEXR. None: there is no picture.
+        flat: instead: an evenly lit sheet, of full scale; 0: the lens cap. None: another target.
+        points: instead: points of light in a sheet. None: another target.
+        distance: of the points. None: there are no points.
         size: of a sheet. None: 640x480.
         fidelity: speed or accuracy.
         compositing: how depths are put together.
@@ -135,7 +135,7 @@ In Python: simulate_scene(image, depth, TiDyOptics(sensor=None), camera, noise)
         from kornia_tidy.raw.simulation import simulate_raw
 
         stages = Stages()
-        generator = torch.Generator().manual_seed(self.seed)
+        generator = torch.Generator().manual_seed(self.sensor.seed)
         with stages("read"):
             camera = self._camera()
             noise = self._noise(camera)
@@ -187,6 +187,8 @@ In Python: simulate_scene(image, depth, TiDyOptics(sensor=None), camera, noise)
         if self.flat is not None:
             tell("target", f"an evenly lit sheet, {self.flat:g} of full scale")
             return torch.full((channels, rows, columns), self.flat)
+        assert self.distance is not None
+        assert self.points is not None
         optics = self.optics.optics(None, sensor=None, fidelity=self.fidelity)
         tell("lens", optics.camera.extra_repr())
         tell("target", f"{self.points} points of light at {self.distance:g} m, up to {BRIGHTEST:g} of full scale")
@@ -222,8 +224,8 @@ In Python: simulate_scene(image, depth, TiDyOptics(sensor=None), camera, noise)
 
         if self.sensor.noise is None:
             full_well = FULL_WELL if self.sensor.full_well is None else self.sensor.full_well
-            read_noise = READ_NOISE if self.sensor.read_noise is None else self.sensor.read_noise
-            return SensorNoise.physical(full_well, read_noise, bits=16)
+            read = READ_NOISE if self.sensor.read_noise is None else self.sensor.read_noise
+            return SensorNoise.physical(full_well, read, bits=16)
         if self.sensor.full_well is not None or self.sensor.read_noise is not None:
             raise ValueError("--noise says full well and read noise: leave out --full-well and --read-noise")
         sensor, calibration = read_noise(self.sensor.noise)

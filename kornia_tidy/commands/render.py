@@ -73,9 +73,11 @@ class Render:
         split: part of the data; all: of an rgbd-folder.
         scenes: number of patches and scenes made here; of files at most, but of their train split all. None: the
             split's.
-        preset: a published system; only noise, fidelity, compositing and border can be given beside it.
-        checkpoint: best.safetensors of a training, whose scenes are the defaults.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances.
+        preset: a published system; only noise, fidelity, compositing and border can be given beside it. None: a camera
+            of the options below.
+        checkpoint: best.safetensors of a training, whose scenes are the defaults. None: a camera of the options below.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances. None:
+            computed for lens and masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: 0.01.
         files: of the captures.
@@ -210,7 +212,7 @@ In Python, in a data loader:
         if not self.preset:
             options = {name: getattr(settings, name) for name in (*OF_CAMERA, *(n for n in OF_MEASURED if n in given))}
             made_from: dict[str, Any] = {"options": options}
-            if psfs is not None:
+            if self.psfs is not None:
                 made_from["psfs"] = hashlib.sha256(read_bytes(self.psfs)).hexdigest()
             return build_optics(settings, psfs), settings, made_from
         overrides: dict[str, Any] = {name: given[name] for name in own if name != "sigma"}

@@ -47,10 +47,10 @@ class DepthFile:
             TUM's 5000 units per metre.
         depth_kind: what is stored.
         invalid: stored values that mean 'unknown', such as inf. NaN and a stored integer 0 always do. Unknown pixels
-            take the depth of their nearest known neighbour.
-        focal_px: focal length of the stereo pair, for disparity.
-        baseline_m: distance between its cameras, for disparity.
-        doffs_px: offset of their principal points, for disparity.
+            take the depth of their nearest known neighbour. None: no others.
+        focal_px: for disparity: focal length of the stereo pair. None: unknown.
+        baseline_m: for disparity: distance between its cameras. None: unknown.
+        doffs_px: for disparity: offset of their principal points.
     """
 
     depth_scale: Annotated[float, Unit("S")] = 1.0
@@ -82,7 +82,7 @@ class OwnScene:
 
     Args:
         image: picture of a scene: PNG, JPEG, TIFF or NPY. None: a scene that is painted here.
-        depth: its depth: PNG, TIFF, PGM, PFM, NPY or OpenEXR.
+        depth: its depth: PNG, TIFF, PGM, PFM, NPY or OpenEXR. None: that of the painted scene.
         file: how it is stored.
     """
 
@@ -134,7 +134,8 @@ class CameraSettings:
     Args:
         masks: number of masks of random height in one exposure, or a file of heights. None: 5.
         mask_seed: seed of random heights. None: 0.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances. None:
+            computed for lens and masks.
         lens: of the camera.
     """
 

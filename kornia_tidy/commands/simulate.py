@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 from kornia_tidy.choices import HOLES, Border, ColorSpace, Compositing, Preset
 from kornia_tidy.commands.parser import Argument
-from kornia_tidy.commands.shared import CameraSettings, DepthFile, File, Noise, check_output, read_noise
+from kornia_tidy.commands.shared import CameraSettings, DepthFile, Noise, check_output, read_noise
 from kornia_tidy.settings import Seed, Unit, one_of
 
 
@@ -40,7 +40,7 @@ class Simulate:
     """
 
     image: Annotated[str, Argument("IMAGE")]
-    depth: File
+    depth: Annotated[str, Unit("DEPTH")]
     output: Annotated[str, Unit("OUT")] | None = None
     bits: Annotated[int, one_of((8, 16))] = 8
     seed: Seed = 0

@@ -51,13 +51,14 @@ class Train:
     Args:
         output: made if missing.
         resume: go on with the run in FOLDER, if there is one, with its settings.
-        head_from: begin with the network of another run.
-        refiner_from: begin the second network of refined with that of a run for the image alone.
-        masks_from: begin with the masks of another run, or of a camera that was saved.
+        head_from: begin with the network of another run. None: new weights.
+        refiner_from: begin the second network of refined with that of a run for the image alone. None: new weights.
+        masks_from: begin with the masks of another run, or of a camera that was saved. None: by start.
         design_from: lens, depth range and masks that kornia-tidy design recommends in FOLDER; options given here go
-            first.
+            first. None: no design.
         captures: noise-free captures, which runs may share, for learn network and refiner. None: in the run's folder.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances. None:
+            computed for lens and masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: 0.01.
     """

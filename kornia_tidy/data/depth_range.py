@@ -26,5 +26,5 @@ def middle_depths(depth: Tensor, valid: Tensor) -> tuple[float, float]:
     ends = np.quantile(1 / depth[valid].double().numpy(), (0.995, 0.005), method="nearest")
     near, far = (float("inf") if end == 0 else float(1 / end) for end in ends)
     if not near < far:
-        raise ValueError(f"--fit-depth needs a scene with a range of depths, this one lies at {near:.4g} m")
+        raise ValueError(f"a scene with a range of depths is needed, this one lies at {near:.4g} m")
     return near, far

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kornia_tidy.cli import build_parser, main
+from kornia_tidy.cli import main, read_command
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,13 +23,12 @@ class TestCommand(BaseTester):
 
     @pytest.mark.parametrize("text", ["0", "80", "65536", "x", "-1", "8080.5", "9" * 400])
     def test_exception_ports(self, text, capsys):
-        with pytest.raises(SystemExit):
-            build_parser().parse_args(["app", f"--port={text}"])
-        assert "must be a whole number from 1024 to 65535, got" in capsys.readouterr().err
+        assert main(["app", f"--port={text}"]) == 2
+        assert "--port must be a whole number from 1024 to 65535, got" in capsys.readouterr().err
 
     def test_feature_the_port_is_free_to_choose(self):
-        assert build_parser().parse_args(["app", "--port", "8080"]).port == 8080
-        assert build_parser().parse_args(["app"]).port is None
+        assert read_command(["app", "--port", "8080"]).port == 8080
+        assert read_command(["app"]).port is None
 
     @pytest.mark.skipif(importlib.util.find_spec("gradio") is not None, reason="Gradio is installed")
     def test_exception_without_gradio_the_remedy_is_told(self, capsys):

@@ -10,6 +10,7 @@ from kornia_tidy.cli import main
 from kornia_tidy.commands import demo
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.figures import demonstration
 from tests.base import BaseTester
 
 NAMES = {"demo.png", "reconstruction.png", "scene.png", "depth.png", "joint_depth.png"}
@@ -19,7 +20,7 @@ NAMES |= {"flat_capture.png", "flat_closed_form.png"}
 
 @pytest.fixture(autouse=True)
 def small_pages(monkeypatch):
-    monkeypatch.setattr(demo, "DOTS_PER_INCH", 40)
+    monkeypatch.setattr(demonstration, "DOTS_PER_INCH", 40)
 
 
 class TestDemo(BaseTester):
@@ -76,18 +77,10 @@ class TestDemo(BaseTester):
         assert main(["demo", *files, "-o", str(tmp_path / "out")]) == 0
         assert "48 x 32 px" in capsys.readouterr().out
 
-    @pytest.mark.parametrize(
-        ("arguments", "sentence"),
-        [
-            (["--image", "a.png"], "--image and --depth belong together"),
-            (["--size", "0"], "height must be a positive integer, got 0"),
-            (["--electrons", "-1"], "electrons must be positive and finite, got -1.0"),
-        ],
-    )
-    def test_exception_is_one_sentence(self, arguments, sentence, tmp_path, monkeypatch, capsys):
+    def test_exception_an_image_without_depth(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
-        assert main(["demo", *arguments]) == 2
-        assert sentence in capsys.readouterr().err
+        assert main(["demo", "--image", "a.png"]) == 2
+        assert "--image and --depth belong together" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
     def test_exception_without_matplotlib_comes_before_any_work(self, tmp_path, monkeypatch, capsys):

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
-import argparse
 import json
 
 import pytest
 import torch
 
-from kornia_tidy.cli import main
+from kornia_tidy.cli import main, read_command
 from kornia_tidy.commands import design
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
@@ -22,9 +21,7 @@ FILES = {"report.md", "report.json", "design.png", "masks.npy", "camera.safetens
 
 def parsed(arguments):
     """Return the task of a command line."""
-    parser = argparse.ArgumentParser()
-    design.add_parser(parser.add_subparsers())
-    return design.make_task(parser.parse_args(["design", *arguments]))
+    return read_command(["design", *arguments]).task()
 
 
 class TestDesign(BaseTester):
@@ -69,10 +66,8 @@ class TestDesign(BaseTester):
         [
             (["--focal-length", "50"], "focal_length must be metres between 1e-05 and 10 (50 mm is 50e-3), got 50.0"),
             (["--depth-range", "300", "5000"], "if they are millimetres, multiply them by 0.001"),
-            (["--masks", "0"], "masks must be a whole number from 1 to 64, got 0"),
-            (["--depth-weight", "2"], "depth_weight must be from 0 (image alone) to 1 (depth alone), got 2.0"),
             (["--switching-time", "4"], "transitions of 4000 ms must fit into the exposure of 100 ms"),
-            (["--bits", "0"], "bits must be a whole number from 1 to 10, got 0"),
+            (["--bits", "11"], "bits must be a whole number from 1 to 10, got 11"),
             (["--scenes", "nowhere"], "rgbd.json"),
         ],
     )

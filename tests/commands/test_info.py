@@ -11,6 +11,7 @@ import torch
 from kornia_tidy import cli
 from kornia_tidy.commands import info
 from kornia_tidy.kernels import build as compiled
+from kornia_tidy.kernels import gather_ops
 from tests.base import BaseTester
 from tests.kernels.test_build import forget
 
@@ -40,13 +41,13 @@ class TestInfo(BaseTester):
         assert f"{os.cpu_count()} cores" in topics["processor"][0]
         assert len(topics["kernel"]) == 2 * len(info.SOURCES)
 
-    @pytest.mark.skipif(compiled.build(info.SOURCES[0], torch.float32).library is None, reason="no C compiler")
+    @pytest.mark.skipif(compiled.build(gather_ops.SOURCE, torch.float32).library is None, reason="no C compiler")
     def test_feature_kernels_and_their_cache(self, capsys):
         topics = self.told(capsys)
         assert topics["kernel"][0].startswith("direct.c, float32: compiled for this processor by ")
         assert all(text.endswith(".so") for text in topics["kernel"])
 
-    @pytest.mark.skipif(compiled.build(info.SOURCES[0], torch.float32).library is None, reason="no C compiler")
+    @pytest.mark.skipif(compiled.build(gather_ops.SOURCE, torch.float32).library is None, reason="no C compiler")
     def test_feature_libraries_that_were_removed_meanwhile(self, capsys, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
         monkeypatch.setattr(info, "SOURCES", info.SOURCES[-1:])

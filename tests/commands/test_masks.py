@@ -111,17 +111,14 @@ class TestMasks(BaseTester):
         ("arguments", "sentence"),
         [
             ("show none.npy", "cannot read none.npy: there is no such file"),
-            ("show heights.npy --material glass", "invalid choice"),
             ("export heights.npy -o slm.png", "the suffix of what to write must be one of '', '.npy', '.stl'"),
             ("export heights.npy -o none/slm", "cannot write none/slm: there is no folder none"),
             ("export heights.npy -o taken", "cannot write taken: it exists, and --force was not given"),
             ("export heights.npy -o taken --force", "it holds holiday.jpg, which is no file of a folder of frames"),
             ("export heights.npy -o heights.npy --force", "cannot write heights.npy: it is the input"),
-            ("export heights.npy -o slm --bits 11", "bits must be a whole number from 1 to 10, got 11"),
-            ("export heights.npy -o slm --panel 0x5", "a panel is WIDTHxHEIGHT in pixels"),
+            ("export heights.npy -o slm --panel 0x5", "--panel must be WIDTHxHEIGHT in pixels"),
             ("export heights.npy -o slm --panel 5x5", "must have pixels at least as large as the panel's"),
             ("export heights.npy -o slm --pupil-radius 1", "the mask must fit on the panel"),
-            ("export heights.npy -o slm --phase-range 0", "phase_range must be positive"),
             (
                 "export heights.npy -o slm --response heights.npy",
                 "cannot read heights.npy: a response has one phase for",
@@ -156,11 +153,7 @@ class TestMasks(BaseTester):
         for name, text in (("nan", 500 * "1.5 " + "nan"), ("one", "1.5"), ("long", 5000 * "x"), ("turn", "0\n2\n1\n6")):
             (folder / f"{name}.txt").write_text(text)
         before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
-        try:
-            status = run(arguments)
-        except SystemExit as exit_:  # argparse's own
-            status = exit_.code
-        assert status == 2
+        assert run(arguments) == 2
         last = capsys.readouterr().err.strip().splitlines()[-1]
         assert "error: " in last
         assert sentence in last

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 
 import pytest
 import torch
-from kornia_tidy.commands.options import noise
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.calibration.noise.photon_transfer import write_json
 from kornia_tidy.calibration.psf import MeasuredPSFs, measured_camera
-from kornia_tidy.cli import build_parser, main
+from kornia_tidy.cli import main
 from kornia_tidy.coded_datasets.captures import CodedCaptures
 from kornia_tidy.data import dead_leaves, read_image, read_rgbd, write_depth, write_image
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
@@ -34,11 +32,6 @@ MEASURED = [*PSFS, *NOISE]
 AT_ONE_METRE = ["--distances", "1", "-o", "b.safetensors"]
 LENS = {"depth_range": (0.4, 2.5), "f_number": 50e-3 / 2.835e-3, "focus": 0.595}
 SCENE = ["--depth", "depth.png", "--depth-scale", "0.001"]
-TAKE_NOISE = {
-    ("simulate",), ("raw", "simulate"), ("raw", "reconstruct"), ("raw", "calibrate-psf"), ("train",), ("evaluate",),
-    ("render",),
-}  # fmt: skip
-TAKE_PSFS = TAKE_NOISE - {("raw", "calibrate-psf")}
 
 
 @pytest.fixture(scope="module")
@@ -74,35 +67,6 @@ def here(laboratory, tmp_path, monkeypatch):
         (tmp_path / path.name).symlink_to(path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def parsers(parser, words=()):
-    """Return the parsers of all commands by their words."""
-    found = {}
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name, one in action.choices.items():
-                found |= {(*words, name): one, **parsers(one, (*words, name))}
-    return found
-
-
-class TestOptions(BaseTester):
-    def test_feature_one_option_with_one_name_and_meaning_everywhere(self):
-        commands = parsers(build_parser())
-        for option, takers in (("--noise", TAKE_NOISE), ("--psfs", TAKE_PSFS)):
-            having = {words: one for words, one in commands.items() if option in one._option_string_actions}
-            assert set(having) == takers
-            helps = [one._option_string_actions[option].help for one in having.values()]
-            start = helps[0][: helps[0].index("calibrate-")]
-            assert all(text.startswith(start) for text in helps)
-        assert {commands[words]._option_string_actions["--noise"].type for words in TAKE_NOISE} == {noise}
-
-    @pytest.mark.parametrize("text", ["-1", "nan", "inf"])
-    def test_exception_a_number_that_is_no_noise(self, text, capsys):
-        for words in TAKE_NOISE:
-            with pytest.raises(SystemExit):
-                main([*words, "x", "--noise", text])
-            assert f"a noise must be zero or positive and finite, of full scale, got {text}" in capsys.readouterr().err
 
 
 class TestRawReconstruct(BaseTester):

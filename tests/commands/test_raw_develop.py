@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.commands import raw_develop
+from kornia_tidy.data import image_files
 from kornia_tidy.data.image_files import read_image
 from kornia_tidy.raw.capture import RawCapture
 from kornia_tidy.raw.develop import develop
@@ -122,14 +122,14 @@ class TestRawDevelop(BaseTester):
 
     def test_feature_interrupted_leaves_whole_files_only(self, files, tmp_path, monkeypatch, capsys):
         folder = tmp_path / "out"
-        write = raw_develop.write_image
+        write = image_files.write_image
 
         def interrupted(path, *args, **options):
             if path.name == "c.png":
                 raise KeyboardInterrupt
             write(path, *args, **options)
 
-        monkeypatch.setattr(raw_develop, "write_image", interrupted)
+        monkeypatch.setattr(image_files, "write_image", interrupted)
         assert main(["raw", "develop", files[0], files[2], files[3], "-o", str(folder)]) == 130
         assert "1 developed, 0 kept, 2 failed or left" in capsys.readouterr().out
         assert sorted(path.name for path in folder.iterdir()) == ["a.jpg", "a.png", "c.jpg"]

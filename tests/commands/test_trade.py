@@ -114,10 +114,8 @@ class TestTrade(BaseTester):
         ("arguments", "sentence"),
         [
             (["--image", "a.png"], "--image and --depth belong together"),
-            (["--repeats", "0"], "--repeats must be 1 or more, got 0"),
             (["--device", "tpu"], "--device must be one of 'cpu', 'cuda', got 'tpu'"),
             (["--device", "cpu:x"], "--device must be cpu, cuda or cuda:N, got 'cpu:x'"),
-            (["--size", "0"], "height must be a positive integer, got 0"),
         ],
     )
     def test_exception_is_one_sentence_before_any_work(self, arguments, sentence, tmp_path, monkeypatch, capsys):

@@ -6,7 +6,6 @@ processor. SIGKILL is in tests/coded_datasets/test_resume.py and tests/training/
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import random
@@ -17,6 +16,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -53,9 +53,7 @@ def send_after(number, seconds):
 
 def run_instead(monkeypatch, action):
     """Let the command do something else."""
-    parser = argparse.ArgumentParser()
-    parser.set_defaults(run=action)
-    monkeypatch.setattr(cli, "build_parser", lambda: parser)
+    monkeypatch.setattr(cli, "read_command", lambda _: SimpleNamespace(run=lambda: action(None)))
 
 
 def whole_run(argv, folder):
