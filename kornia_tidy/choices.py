@@ -12,7 +12,7 @@ COMPOSITING = ("gather", "scatter", "occlusion")
 BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
 STRAY_LIGHT = ("renormalize", "veil", "discard")
 COLOR_SPACES = ("srgb", "linear", "paper")
-HOLES = ("error", "fill")
+HOLES = ("error", "fill")  # what a camera and its adapters do about holes
 STARTS = (
     "noise", "fisher, noise", "noisy fishers", "fisher, noisy fishers", "3 fishers, 2 noisy", "like fishers",
     "focal sweep", "flat",

@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _open_closed_streams()
     _print_any_name()
     try:
-        with warnings.catch_warnings(), raised_signals():
+        with warnings.catch_warnings():
             warnings.showwarning = _print_warning  # ty: ignore[invalid-assignment]
             return _run(argv)
     finally:
@@ -95,7 +95,9 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         try:
             command = read_command(sys.argv[1:] if argv is None else argv)
-            command.run()
+            import_module("kornia_tidy.camera.tidy_optics")  # seconds, in which a signal ends the process at once
+            with raised_signals():
+                command.run()
         except SystemExit:
             sys.stdout.flush()  # of --help
             raise

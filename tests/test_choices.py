@@ -11,14 +11,13 @@ from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.inference.pretrained import FOLDER
 from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.mask_export import placement
-from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.modulator import switching
-from kornia_tidy.optics import holes
+from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.psf import psf_bank
 from kornia_tidy.raw.color import ADAPTATIONS
 from kornia_tidy.raw.demosaic import METHODS
 from kornia_tidy.raw.develop import HIGHLIGHTS
-from kornia_tidy.reconstruction import closed_form, metrics
+from kornia_tidy.reconstruction import metrics
 from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from kornia_tidy.render import borders, compositing
 from kornia_tidy.settings import settings_of
@@ -37,9 +36,7 @@ class TestChoices(BaseTester):
             ("BORDERS", borders.BORDERS),
             ("STRAY_LIGHT", psf_bank.STRAY_LIGHT),
             ("COLOR_SPACES", camera_state.COLOR_SPACES),
-            ("HOLES", holes.HOLES),
-            ("STARTS", STARTS),
-            ("INVERSES", closed_form.INVERSES),
+            ("HOLES", HOLES),
             ("SYSTEMS", SYSTEMS),
             ("SPLITS", data_sets.SPLITS),
             ("BESIDE", layout.BESIDE),

@@ -8,8 +8,8 @@ from decimal import Decimal, InvalidOperation
 from typing import Any, Literal, NamedTuple
 
 from kornia_tidy.app.settings import AS_SYSTEM, CHART, FILES, FLAT, MOST_MASKS, OWN, SCENES, SEEDS, SIDES, Settings
+from kornia_tidy.choices import STARTS
 from kornia_tidy.inference.pretrained import PRETRAINED
-from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.systems.presets import SYSTEMS
 
 Kind = Literal["choice", "number", "whole", "slider", "check", "file"]

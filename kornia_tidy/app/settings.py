@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.choices import STARTS
 from kornia_tidy.data.dead_leaves import MOST_LEAVES, PIXELS_A_LEAF
 from kornia_tidy.inference.pretrained import PRETRAINED
-from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.systems.presets import SYSTEMS
 

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_generator
+from kornia_tidy.choices import STARTS
 from kornia_tidy.masks.base import mask_axes
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.masks.zernike import ZernikeMask, quarter_polynomials
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 CLEAN = {"noisy fishers": 0, "fisher, noisy fishers": 1, "3 fishers, 2 noisy": 3}  # Fisher masks without noise
-STARTS = ("noise", "fisher, noise", *CLEAN, "like fishers", "focal sweep", "flat")
 
 NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in the paper
 SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; defocus at which each of the five masks is in focus

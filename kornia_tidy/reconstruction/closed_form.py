@@ -10,6 +10,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.choices import INVERSES
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
@@ -23,7 +24,6 @@ WEIGHTS = tuple(3e-3 * 10 ** (i / 2) for i in range(4))  # 0.003 to 0.095
 # 0.003 (noise / 0.002) ** 0.87, and the best width in colour is 0.2 (noise / 0.002) ** 0.5: at noise of 0.002, 0.01 and
 # 0.03, weights of 0.003, 0.01 and 0.03, and widths of 0.2, 0.4 and 0.8 are best on 18 real scenes.
 NOISE, EXPONENT, EXPONENT_BEFORE_BILATERAL = 2e-3, 1.3, 0.87
-INVERSES = ("tikhonov", "wiener")
 STEP = 0.55  # of the logarithm of the noise between two Wiener filters
 WIENER_NOISES = tuple(8e-4 * 10 ** (STEP * i) for i in range(len(WEIGHTS)))  # 0.0008 to 0.036
 # It takes the noise for less than it is where a bilateral filter follows, which takes noise away, and for more where

@@ -28,13 +28,13 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
+from kornia_tidy.choices import STARTS
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
 from kornia_tidy.inference.pretrained import FOLDER, ship
 from kornia_tidy.inference.tasks import stretched
 from kornia_tidy.inference.trained import load_trained
-from kornia_tidy.masks.initial_heights import STARTS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.training.callbacks import BEST

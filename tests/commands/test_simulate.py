@@ -161,7 +161,7 @@ class TestSimulate(BaseTester):
             ("image.png --depth depth.pfm -o out.gif", "suffix of an image file must be one of"),
             ("image.png --depth depth.pfm -o out.jpg --bits 16", "bits of a .jpg file must be one of 8, got 16"),
             ("image.png --depth depth.pfm -o nowhere/out.png", "there is no folder nowhere"),
-            ("image.png --depth depth.pfm -o image.png", "cannot write image.png: it is the input"),
+            ("image.png --depth depth.pfm -o image.png", "cannot write image.png: it is an input"),
         ],
     )
     def test_exception_is_one_sentence_and_nothing_is_written(self, arguments, sentence, scene, capsys):

@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import nn
 
+from kornia_tidy.choices import INVERSES
 from kornia_tidy.inference.heads import CLOSED_FORMS, HEADS, make_head
 from kornia_tidy.inference.settings import SystemSettings
 from kornia_tidy.inference.state_file import write_state
 from kornia_tidy.inference.trained import build_head, build_optics, load_trained, update_psfs
 from kornia_tidy.reconstruction import ReconstructionHead, receptive_field
-from kornia_tidy.reconstruction.closed_form import INVERSES
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
 
