@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 
 PROGRESS = "progress.json"
 DOTS_PER_INCH = 150
-_LARGEST = 512  # pixels a side of the user's scenes; of larger ones the middle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,9 +171,10 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
         """Design, and write the files."""
         folder = check_folder(self.output)
         from kornia_tidy.commands.report import tell
+        from kornia_tidy.data.rgbd_folder import scenes_in
         from kornia_tidy.figures.style import require_matplotlib
         from kornia_tidy.files import only_here
-        from kornia_tidy.mask_design.co_design import Effort, planned_work
+        from kornia_tidy.mask_design.co_design import Effort, expected_in_words, planned_work
         from kornia_tidy.mask_design.design_report import (
             CAMERA,
             DATA,
@@ -188,7 +187,7 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
         require_matplotlib()
         task = self.task()
         effort = Effort.quick() if self.quick else Effort()
-        scenes = _own_scenes(self.scenes)
+        scenes = [] if self.scenes is None else scenes_in(self.scenes)
         folder.mkdir(parents=True, exist_ok=True)
         with only_here(folder, "a design is running"):
             work = planned_work(task, effort, len(scenes))
@@ -197,7 +196,7 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
             tell(
                 "light", f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g}, equal exposure time"
             )
-            tell("work", _estimate(task, effort, work) + _earlier(folder / PROGRESS))
+            tell("work", expected_in_words(task, effort, work) + _earlier(folder / PROGRESS))
             design = _with_progress(task, scenes, effort, self.seed, folder / PROGRESS, work)
             _write(folder, design)
         tell("verdict", design.words)
@@ -207,42 +206,6 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
         tell("wrote", f"{folder / REPORT}: read this one")
         for name in (PICTURE, DATA, "masks.npy", CAMERA):
             tell("", str(folder / name))
-
-
-def _own_scenes(folder: str | None) -> list[Scene]:
-    """Return the middles of the user's scenes."""
-    from kornia_tidy.data.patches import central_crop
-    from kornia_tidy.data.rgbd import Scene
-    from kornia_tidy.data.rgbd_folder import described_folder
-
-    if folder is None:
-        return []
-    scenes = []
-    for sample in described_folder(Path(folder)):
-        height, width = sample["image"].shape[-2:]
-        cut = central_crop(sample, (min(height, _LARGEST), min(width, _LARGEST)))
-        scenes.append(Scene(cut["image"], cut["depth"], cut["mask"]))
-    return scenes
-
-
-def _estimate(task: DesignTask, effort: Effort, work: dict[str, int]) -> str:
-    """Return the work and its time in words, from a few steps and one capture."""
-    from kornia_tidy.mask_design.candidates import coded_candidate, flat_candidate
-    from kornia_tidy.mask_design.simulated_captures import leaf_scenes, score_candidate
-
-    f_number = task.f_numbers()[1]
-    times = []
-    for steps in (1, 3):  # the first step also computes what the others find
-        start = time.perf_counter()
-        coded_candidate(task, "focal sweep", f_number, 0.5, steps)
-        times.append(time.perf_counter() - start)
-    step = times[1] / 4
-    scenes = leaf_scenes(2, effort.size, task.depth_range)
-    start = time.perf_counter()
-    list(score_candidate(task, flat_candidate(task, task.balanced_f_number, 0.5), scenes))
-    seconds = work["search"] * step + work["captures"] * (time.perf_counter() - start) / 2
-    told = f"{seconds:.0f} s" if seconds < 100 else f"{math.ceil(seconds / 60)} minutes"
-    return f"{work['search']} gradient steps and {work['captures']} captures, about {told}"
 
 
 def _earlier(progress_file: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +13,10 @@ from kornia_tidy.commands.shared import File
 from kornia_tidy.settings import Metres, Seconds, Unit, one_of
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    from torch import Tensor
 
     from kornia_tidy.mask_export.mask_files import SavedMasks
     from kornia_tidy.mask_export.slm_frames import SLMFrames
-    from kornia_tidy.mask_export.timing import FrameTime
-    from kornia_tidy.modulator.phase_panel import GreyLevels
     from kornia_tidy.optics.materials import Material
 
 MasksFile = Annotated[str, Argument("MASKS")]
@@ -198,16 +195,20 @@ class ExportMasks:
         from kornia_tidy.commands.report import tell
         from kornia_tidy.mask_export.frame_files import read_slm_frames, write_slm_frames
         from kornia_tidy.mask_export.placement import PanelPlacement
+        from kornia_tidy.mask_export.response_file import read_response
         from kornia_tidy.mask_export.slm_frames import SLMFrames
         from kornia_tidy.masks.base import metres_to_radians
 
-        asked, levels, heights = self.panel, self._levels(saved), saved.heights
+        asked, timing, heights = self.panel, self.timing, saved.heights
+        response = None if asked.response is None else read_response(asked.response, asked.bits or 8)
+        levels = saved.levels(asked.wavelength, asked.bits, asked.phase_range, response)
+        times = saved.times(timing.exposure, timing.switching_time, timing.dwell, timing.cyclic)
         width, height = asked.panel
         placement = PanelPlacement(
             (height, width), asked.panel_pitch, self.pupil_radius, asked.offset, asked.flip, asked.rotate
         )
         frames = SLMFrames.of(heights, levels, asked.wavelength, saved.material)
-        write_slm_frames(self.output, frames, placement, self._times(saved), asked.suffix, replace=self.force)
+        write_slm_frames(self.output, frames, placement, times, asked.suffix, replace=self.force)
         size = (heights.shape[1], heights.shape[2])
         scale = placement.scale(size)
         uneven = "" if scale == round(scale) else ", so that blocks differ by one"
@@ -220,41 +221,6 @@ class ExportMasks:
         tell("check", f"read back, phase differs by up to {error:.3g} rad, {share / 2:.3f} grey levels, 0.5 allowed")
         if share > 1:
             raise ValueError(f"{self.output} does not hold the masks: phase differs by {error:.3g} rad")
-
-    def _levels(self, saved: SavedMasks) -> GreyLevels:
-        """Return the panel's levels; without options, the camera's, with their phases at the working wavelength."""
-        from kornia_tidy.mask_export.response_file import read_response
-        from kornia_tidy.masks.base import metres_to_radians
-        from kornia_tidy.modulator.phase_panel import GreyLevels
-        from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-
-        asked = self.panel
-        bits = 8 if asked.bits is None else asked.bits
-        if asked.response is not None:
-            return GreyLevels(bits, response=read_response(asked.response, bits))
-        known = next((part for part in _parts(saved) if isinstance(part, GreyLevels)), None)
-        if known is None or asked.bits is not None or asked.phase_range is not None:
-            return GreyLevels(bits, 2 * math.pi if asked.phase_range is None else asked.phase_range)
-        if asked.wavelength == REFERENCE_WAVELENGTH:
-            return known
-        scale = metres_to_radians(saved.material, asked.wavelength) / metres_to_radians(saved.material)
-        if known.response is None:
-            return GreyLevels(known.bits, known.phase_range * scale)
-        return GreyLevels(known.bits, response=(known.levels * scale).tolist())
-
-    def _times(self, saved: SavedMasks) -> list[FrameTime]:
-        """Return when the frames are shown, by the options; without them, by the camera's modulator."""
-        from kornia_tidy.mask_export.timing import frame_times
-        from kornia_tidy.modulator.switching import Switching
-
-        asked = self.timing
-        known = next((part for part in _parts(saved) if isinstance(part, Switching)), Switching(0.0))
-        exposure = known.exposure if asked.exposure is None else asked.exposure
-        switching = known.switching_time if asked.switching_time is None else asked.switching_time
-        shares = asked.dwell or saved.dwell or [1.0] * len(saved.heights)
-        if len(shares) != len(saved.heights):
-            raise ValueError(f"there are {len(shares)} dwell shares for {len(saved.heights)} masks")
-        return frame_times(shares, exposure, switching, asked.cyclic or known.cyclic)
 
     def _stl(self, heights: Tensor) -> None:
         from kornia_tidy.mask_export.printing import write_stl
@@ -332,10 +298,6 @@ def _saved(path: str, name: str | None) -> SavedMasks:
         return masks_in_state(state, _material(name))
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from None
-
-
-def _parts(saved: SavedMasks) -> list[nn.Module]:
-    return [] if saved.modulator is None else list(saved.modulator.modules())
 
 
 def _check_absent(path: str, force: bool, source: str | None = None, folder: bool = False) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from kornia_tidy.camera.tidy_optics import TiDyOptics
 
 DOTS_PER_INCH = 150
-FREQUENCIES = 64  # rings of the contrast
-SLICES = 81  # of the picture through focus
 COLUMNS = 7
 
 
@@ -90,56 +87,27 @@ class Psf:
         import torch
 
         from kornia_tidy.commands.report import Stages, tell
-        from kornia_tidy.figures.psf import PSFSheet, draw_psfs
+        from kornia_tidy.figures.psf import draw_psfs
+        from kornia_tidy.figures.psf_measures import measures_of_psfs
         from kornia_tidy.figures.style import require_matplotlib
-        from kornia_tidy.figures.system_statistics import contrast_transfer
         from kornia_tidy.files import write_bytes
 
         check_output(self.output, self.camera)
         require_matplotlib()
         stages = Stages()
-        with torch.no_grad():
-            with stages("camera"):
-                optics = self._optics()
-                psi = self._defocus(optics)
-            with stages("PSFs"):
-                psfs = optics.psf_bank(defocus=psi.tolist()).psfs.flip(0)  # nearest first
-                lo, hi = optics.camera.defocus_range
-                focus = torch.linspace(lo, hi, SLICES, dtype=torch.float64)
-                through = optics.psf_bank(defocus=focus.tolist()).psfs
-                contrast = contrast_transfer(psfs / psfs.sum((2, 3), keepdim=True), FREQUENCIES)
-                strehl = psfs.amax((2, 3)) / _without_mask(optics).amax((2, 3))
-            near_to_far = [round(each, 6) + 0.0 for each in psi.flip(0).tolist()]  # without a negative zero
-            depths, channels = [_in_metres(each, optics) for each in near_to_far], _channels(optics)
-            middle = len(channels) // 2
-            sheet = PSFSheet(
-                title=f"PSFs of {Path(self.camera).name}, window {optics.window} x {optics.window} px",
-                depths=[
-                    f"{depth}\nψ = {each:+.3g}" if each else f"{depth}\nψ = 0"
-                    for depth, each in zip(depths, near_to_far, strict=True)
-                ],
-                channels=channels,
-                psfs=psfs,
-                contrast=contrast[:, middle],
-                focus=focus,
-                slices=through[:, middle, optics.window // 2],
-            )
-            with stages("picture"):
-                picture = BytesIO()
-                draw_psfs(sheet).savefig(picture, dpi=DOTS_PER_INCH, format=Path(self.output).suffix[1:])
+        with torch.no_grad(), stages("camera"):
+            optics = self._optics()
+            psi = self._defocus(optics)
+        with stages("PSFs"):
+            measured = measures_of_psfs(optics, psi)
+        title = f"PSFs of {Path(self.camera).name}, window {optics.window} x {optics.window} px"
+        with stages("picture"):
+            picture = BytesIO()
+            draw_psfs(measured.sheet(title)).savefig(picture, dpi=DOTS_PER_INCH, format=Path(self.output).suffix[1:])
         tell("camera", optics.camera.extra_repr())
         tell("masks", optics.masks.extra_repr())
         tell("window", f"{optics.window} x {optics.window} px, fidelity {optics.fidelity.name!r}")
-        print()
-        print(f"{'depth':>9}  {'psi, rad':>8}  {'colour':>8}  {'held':>6}  {'peak':>7}  Strehl  MTF50, cycles a pixel")
-        for d, (depth, each) in enumerate(zip(depths, near_to_far, strict=True)):
-            for c, name in enumerate(channels):
-                held, peak = 100 * float(psfs[d, c].sum()), 100 * float(psfs[d, c].max())
-                print(
-                    f"{depth:>9}  {each:>+8.2f}  {name:>8}  {held:>4.1f} %  {peak:>5.2f} %  "
-                    f"{float(strehl[d, c]):>6.3f}  {_half_contrast(contrast[d, c])}"
-                )
-        print()
+        print("", *measured.table(), "", sep="\n")
         write_bytes(self.output, picture.getvalue())
         tell("wrote", f"{self.output}: look at it")
         tell("time", stages.summary())
@@ -180,54 +148,3 @@ class Psf:
         if self.depths is None:
             return torch.linspace(lo, hi, COLUMNS, dtype=torch.float64)
         return optics.camera.defocus(torch.tensor(self.depths[::-1], dtype=torch.float64))
-
-
-def _without_mask(optics: TiDyOptics) -> Tensor:
-    """Return the in-focus PSFs of the same lens with a flat mask, (1, C, P, P)."""
-    from kornia_tidy.camera.tidy_optics import TiDyOptics
-    from kornia_tidy.masks.pixelwise import PixelwiseMask
-
-    rows, columns = optics.masks.phase.shape[-2:]
-    masks = PixelwiseMask(1, (rows, columns), initial="flat")
-    plain = TiDyOptics(
-        masks, optics.camera, fidelity=optics.fidelity, spectrum=optics.spectrum, aperture=optics.aperture
-    )
-    return plain.psf_bank(defocus=[0.0]).psfs
-
-
-def _in_metres(psi: float, optics: TiDyOptics) -> str:
-    from kornia_tidy.figures.depth import depth_at
-    from kornia_tidy.optics.thin_lens import ThinLensCamera
-
-    if not isinstance(optics.camera, ThinLensCamera):
-        return "-"
-    depth = depth_at(psi, optics.camera)
-    return "inf" if math.isinf(depth) else f"{depth:.3g} m"
-
-
-def _channels(optics: TiDyOptics) -> list[str]:
-    """Return the names of the channels: a wavelength, or a colour if a channel has several."""
-    seen = [
-        [wavelength for wavelength, weight in zip(optics.spectrum.wavelengths, weights, strict=True) if weight]
-        for weights in optics.spectrum.weights
-    ]
-    names = ("red", "green", "blue") if len(seen) == 3 else tuple(f"{c + 1}" for c in range(len(seen)))
-    return [f"{own[0] * 1e9:.0f} nm" if len(own) == 1 else name for own, name in zip(seen, names, strict=True)]
-
-
-def _half_contrast(contrast: Tensor) -> str:
-    """Return the frequency at which contrast first falls to one half, in cycles per pixel, in words.
-
-    Example:
-        >>> import torch
-        >>> _half_contrast(torch.tensor([0.9, 0.6, 0.4, 0.1]))
-        '0.250'
-    """
-    from kornia_tidy.figures.psf import ring_centres
-
-    frequency, values = [0.0, *ring_centres(len(contrast))], [1.0, *contrast.tolist()]
-    for i in range(1, len(values)):
-        if values[i] <= 0.5:
-            share = (values[i - 1] - 0.5) / (values[i - 1] - values[i])
-            return f"{frequency[i - 1] + share * (frequency[i] - frequency[i - 1]):.3f}"
-    return "above 0.5"

@@ -15,7 +15,6 @@ from kornia_tidy.settings import Unit
 if TYPE_CHECKING:
     from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
 
-STRAIGHT = 0.99  # R² above which the curve is reported as a straight line
 DOTS_PER_INCH = 150
 
 
@@ -78,35 +77,10 @@ In Python:
             write_json(output, result)
             if plot is not None:
                 _draw(result, plot)
-        for topic, text in in_words(result):
+        for topic, text in result.in_words():
             tell(topic, text)
         tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
         tell("time", stages.summary())
-
-
-def in_words(result: PhotonTransfer) -> list[tuple[str, str]]:
-    """Return the results of a calibration as topics and texts."""
-    line = result.line
-    iso = "" if result.iso is None else f", ISO {result.iso:g}"
-    single = result.method == "single"
-    limit = "" if result.read_noise_resolved else " (no more than a guess: rounding to counts may hide it)"
-    topics = [
-        ("camera", (result.camera or "unknown") + iso),
-        ("levels", f"black {result.black:g}, white {result.white:g}"),
-        ("gain", f"{line.gain:.4g} ± {line.gain_error:.2g} electrons a count"),
-        ("read", f"{line.read_noise:.4g} ± {line.read_noise_error:.2g} electrons{limit}"),
-        ("white", f"stands for {result.full_well:.4g} electrons"),
-    ]
-    if single:
-        pattern = f"{line.fixed_pattern:.2%} of the level" if line.fixed_pattern else "not seen"
-        topics.append(("pattern", f"{pattern}; fixed pattern and fine texture cannot be told apart in one picture"))
-    for name, own in result.channels.items():
-        topics.append(
-            (f"  {name}", f"gain {own.gain:.4g}, read noise {own.read_noise:.3g} electrons, R² {own.r_squared:.4f}")
-        )
-    straight = "a straight line" if line.r_squared >= STRAIGHT else f"below {STRAIGHT}: not quite a straight line"
-    topics.append(("R²", f"{line.r_squared:.4f} over {len(result.points)} points, {straight}"))
-    return topics
 
 
 def _draw(result: PhotonTransfer, path: Path) -> None:

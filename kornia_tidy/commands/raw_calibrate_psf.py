@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -14,14 +14,9 @@ from kornia_tidy.inference.settings import LensSettings
 from kornia_tidy.settings import Count, Electrons, Metres, Seconds, Unit
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
-    from kornia_tidy.calibration.psf.point_images import Tile
-    from kornia_tidy.optics.thin_lens import ThinLensCamera
+    from kornia_tidy.calibration.psf.point_files import Picture
     from kornia_tidy.sensor.noise import SensorNoise
-
-GOOD_NOISE = 0.02  # in L1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,10 +115,9 @@ In Python:
 
     def run(self) -> None:
         """Measure the PSFs and write the bank."""
-        places = self._check()
-        import torch
-
-        from kornia_tidy.calibration.psf.measured_psfs import measure_psfs
+        self._check()
+        from kornia_tidy.calibration.psf.measured_psfs import channel_cutoffs, measure_psfs
+        from kornia_tidy.calibration.psf.point_files import images_of_files
         from kornia_tidy.commands.report import Stages, tell
         from kornia_tidy.files import replacing
         from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -132,32 +126,24 @@ In Python:
         depths = (0.99 * min(self.distances), 1.01 * max(self.distances))
         focus = float(lens.focus_distance)
         camera = ThinLensCamera(lens.focal_length, lens.aperture_diameter, focus, lens.pixel_pitch, depths)
+        sensor, calibration = self._sensor()
         stages = Stages()
         with stages("measure"):
-            images = self._images(places)
-            channels = 1 + max(next(iter(images.values()))[0].channels)
-            measured = measure_psfs(images, camera, self.window, _cutoff(camera, channels), self.diameter)
-        tell("camera", camera.extra_repr())
-        for report in measured.reports:
-            if report.rejected is not None:
-                where = f"row {report.row:.1f}, column {report.column:.1f}"
-                tell("left out", f"the point at {report.distance:g} m, {where}: {report.rejected}")
-        noise = (2 / torch.pi) ** 0.5 * measured.uncertainty.sum((2, 3))
-        for distance, psi, own in zip(measured.distances, measured.bank.defocus, noise, strict=True):
-            used = [r for r in measured.reports if r.distance == float(distance) and r.rejected is None]
-            times = (sum(r.misfit or 0.0 for r in used) / len(used)) ** 0.5
-            words = " ".join(f"{100 * float(x):.2g}" for x in own)
-            where = f"{float(distance):g} m, psi {float(psi):+.2f} rad"
-            tell(
-                "PSF",
-                f"{where}: {len(used)} point images, residuals {times:.2g} times the noise, noise {words} % in L1",
+            images = images_of_files(
+                partial(self._read, calibration=calibration),
+                self.files,
+                self.distances,
+                self.exposures,
+                sensor,
+                window=self.window,
+                points=self.points,
+                references=self.reference,
             )
-            worst = float(own.max())
-            if worst > GOOD_NOISE:
-                more = math.ceil(len(used) * (worst / GOOD_NOISE) ** 2)
-                tell(
-                    "", f"about {more} point images, or one more and far longer exposure, bring it to {GOOD_NOISE:.0%}"
-                )
+            channels = 1 + max(next(iter(images.values()))[0].channels)
+            measured = measure_psfs(images, camera, self.window, channel_cutoffs(camera, channels), self.diameter)
+        tell("camera", camera.extra_repr())
+        for topic, text in measured.in_words():
+            tell(topic, text)
         measured.save(self.output)
         tell(
             "wrote", f"{self.output}, PSFs sum to one: light outside their {self.window} x {self.window} px is not seen"
@@ -182,8 +168,8 @@ In Python:
             tell("wrote", self.picture)
         tell("time", stages.summary())
 
-    def _check(self) -> int:
-        """Check the settings before any work; return the number of point positions at each distance."""
+    def _check(self) -> None:
+        """Check the settings before any work."""
         from kornia_tidy.checks import check_choice
         from kornia_tidy.files import check_file
 
@@ -210,30 +196,6 @@ In Python:
                 f"--reference needs one file for each of {places * len(self.distances)} places, got "
                 f"{len(self.reference)}"
             )
-        return places
-
-    def _images(self, places: int) -> dict[float, list[Any]]:
-        """Read the pictures of one position after another, and keep only crops around the points."""
-        import torch
-
-        from kornia_tidy.calibration.psf.point_images import point_images
-
-        sensor, calibration = self._sensor()
-        exposures = torch.tensor(self.exposures)
-        files = iter(self.files)
-        references = iter(self.reference)
-        images: dict[float, list[Any]] = {}
-        for distance in self.distances:
-            images[distance] = []
-            for _ in range(places):
-                frames, tiles = zip(*[self._read(next(files), calibration) for _ in self.exposures], strict=True)
-                if len({frame.shape for frame in frames}) > 1:
-                    raise ValueError(f"the exposures of one place differ in size: {[tuple(f.shape) for f in frames]}")
-                reference = self._read(next(references))[0] if self.reference else None
-                images[distance] += point_images(
-                    torch.stack(frames), exposures, sensor, self.window, self.points, reference, tiles[0]
-                )
-        return images
 
     def _sensor(self) -> tuple[SensorNoise, PhotonTransfer | None]:
         """Return the noise of the settings, and its calibration if it was measured."""
@@ -250,8 +212,9 @@ In Python:
         assert sensor is not None
         return sensor, calibration
 
-    def _read(self, path: str, calibration: PhotonTransfer | None = None) -> tuple[Tensor, Tile | None]:
+    def _read(self, path: str, calibration: PhotonTransfer | None) -> Picture:
         """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
+        from kornia_tidy.calibration.psf.point_files import planes_of_tile
         from kornia_tidy.data.image_files import SUFFIXES, read_image
 
         if Path(path).suffix.lower() in SUFFIXES:
@@ -259,21 +222,7 @@ In Python:
         raw = self.dump.open(path)
         if calibration is not None:
             calibration.check_taken_alike(raw, path)
-        rows, columns = raw.tile
-        if (rows, columns) not in {(1, 1), (2, 2)}:
-            raise ValueError(f"cannot measure PSFs on {path}: its tile is {rows}x{columns}, 2x2 or none is needed")
-        if raw.pattern is None:
-            return raw.planes(), None
-        letters = "".join(dict.fromkeys(raw.colors))  # both greens are one channel
-        return raw.planes(), tuple(tuple(letters.index(raw.colors[color]) for color in row) for row in raw.pattern)
-
-
-def _cutoff(camera: ThinLensCamera, channels: int) -> list[float]:
-    """Return the cutoff frequency of the lens at the shortest wavelength of the channels."""
-    from kornia_tidy.calibration.psf.measured_psfs import diffraction_cutoff
-
-    shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)
-    return [min(2.0, diffraction_cutoff(camera, wave)) for wave in shortest]
+        return planes_of_tile(raw, path)
 
 
 def _spectrum(channels: int) -> Any:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from io import BytesIO
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -18,16 +17,9 @@ from kornia_tidy.inference.head_names import CLOSED_FORMS
 from kornia_tidy.settings import Count, Metres, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
-    from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
+    from kornia_tidy.inference.light_head import LightHead
     from kornia_tidy.inference.trained import TrainedSystem
     from kornia_tidy.sensor.noise import SensorNoise
-
-PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".pam", ".bmp", ".webp"}
-PREVIEW_DPI = 150
-SMALLEST_DEVIATION = 1e-9  # m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,27 +131,28 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         from kornia_tidy.commands.file_jobs import Row, table, work_on_all
         from kornia_tidy.commands.report import tell
         from kornia_tidy.commands.system_options import load_system
+        from kornia_tidy.figures.reconstruction_files import reconstruction_suffixes
         from kornia_tidy.figures.style import require_matplotlib
-        from kornia_tidy.files import remove_leftovers, write_bytes
-        from kornia_tidy.inference.light_head import LightHead, reconstruct_light, with_noise_of
+        from kornia_tidy.files import remove_leftovers
+        from kornia_tidy.inference.light_head import LightHead, reconstruct_light
         from kornia_tidy.inference.measured import takes_psfs
         from kornia_tidy.reconstruction.head import takes_noise
 
         white_balance(self.white_balance)  # refuses what is none
         if self.noise == 0:
             raise ValueError("noise must be positive and finite in units of full scale, got 0.0")
-        sensor, calibration = read_noise(self.noise)
+        sensor, _ = read_noise(self.noise)
         system = load_system(self.head, self.psfs, sensor)
         if self.noise is not None and not takes_noise(system.head):
             raise ValueError(f"--noise is for a network that takes it, and that of {self.head} does not")
         if self.psfs is not None and not takes_psfs(system.head):
             raise ValueError(f"--psfs is for a network that deconvolves captures, and that of {self.head} does not")
         head = LightHead(system, orientations=self.orientations).to(torch.device(self.device))
-        suffixes = result_suffixes(system.settings.task, self.format, uncertain=head.uncertain)
+        suffixes = reconstruction_suffixes(system.settings.task, SUFFIXES[self.format], uncertain=head.uncertain)
         if "_depth_colors.png" in suffixes:
             require_matplotlib()
         folder = Path(self.output)
-        outputs = output_paths(self.files, folder, suffixes)
+        outputs = output_paths(self.files, folder, [*suffixes, ".json"])  # which is written last
         made_by = self._made_by()
         folder.mkdir(parents=True, exist_ok=True)
         if self.resume:
@@ -174,16 +167,8 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
             paths = outputs[path]
             if self.resume and is_finished(paths, said):
                 return Row(path, "kept")
-            light, upright, info, noise = self._light(path, sensor, calibration)
-            if self.psfs is not None:
-                _check_measured(path, len(light), noise, system)
-            own = with_noise_of(head, noise)  # no other thread's
-            budget = (self.memory << 20) // self.jobs
-            result = reconstruct_light(own, light, memory_budget=budget, overlap=self.overlap, progress=progress)
-            del light
-            size = write_results(paths, result, upright, info, head, self.depth_unit)
-            words = self._in_words(head) | ({} if noise is None else {"noise": noise.extra_repr()})
-            write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
+            options = {"memory_budget": (self.memory << 20) // self.jobs, "overlap": self.overlap, "progress": progress}
+            size = self._reconstruct(path, paths, said, head, system, options)
             return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
 
         rows = work_on_all("reconstruct", list(outputs), work, self.jobs)
@@ -193,6 +178,37 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
         if failed:
             raise ValueError(f"{failed} of {len(rows)} files failed")
+
+    def _reconstruct(
+        self, path: str, paths: list[Path], said: dict[str, Any], head: LightHead, system: TrainedSystem, options: dict
+    ) -> tuple[int, int]:
+        """Reconstruct a file, write its results and last their record; return columns and rows."""
+        import torch
+
+        from kornia_tidy.commands.system_options import CLOSED_FORM
+        from kornia_tidy.figures.reconstruction_files import reconstruction_in_words, write_reconstruction
+        from kornia_tidy.files import write_bytes
+        from kornia_tidy.inference.capture_file import PICTURES, read_light
+        from kornia_tidy.inference.light_head import reconstruct_light, with_noise_of
+
+        sensor, calibration = read_noise(self.noise)
+        balance = white_balance(self.white_balance)
+        is_picture = self.dump.size is None and Path(path).suffix.lower() in PICTURES
+        raw = None if is_picture else self.dump.open(path)
+        capture = read_light(
+            path, raw=raw, linear=self.linear, white_balance=balance, sensor=sensor, calibration=calibration
+        )
+        del raw  # its counts take memory
+        if self.psfs is not None:
+            _check_measured(path, len(capture.light), capture.noise, system)
+        own = with_noise_of(head, capture.noise)  # no other thread's
+        result, capture = reconstruct_light(own, capture.light, **options), capture._replace(light=torch.empty(0))
+        size = write_reconstruction(paths[:-1], result, capture, head, self.depth_unit)
+        words = {"head": self.head or CLOSED_FORM, **reconstruction_in_words(head, self.depth_unit)}
+        words |= {"psfs": f"measured: {self.psfs}"} if self.psfs is not None else {}
+        words |= {"noise": capture.noise.extra_repr()} if capture.noise is not None else {}
+        write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
+        return size
 
     def _made_by(self) -> dict[str, Any]:
         """Return what results depend on beside their file, to recognise them on resuming."""
@@ -207,114 +223,6 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
             "white_balance": self.white_balance or None,
             "dump": {name: value or None for name, value in vars(self.dump).items()},
         }
-
-    def _light(
-        self, path: str, sensor: SensorNoise | None = None, calibration: PhotonTransfer | None = None
-    ) -> tuple[Tensor, Callable[[Tensor], Tensor], dict[str, Any], SensorNoise | None]:
-        """Read a capture as linear light, with its upright orientation, its camera and exposure data, and its noise.
-
-        Args:
-            path: of the file.
-            sensor: noise that was given. None: that of the noise profile of a raw file, if it has one.
-            calibration: measurement of the noise, whose sensor has the units of the raw file before it is developed.
-        """
-        import torch
-        from kornia.color import rgb_to_linear_rgb
-
-        from kornia_tidy.data.image_files import read_image
-        from kornia_tidy.raw.develop import develop
-        from kornia_tidy.raw.developed_noise import developed_noise
-
-        if self.dump.size is None and Path(path).suffix.lower() in PICTURES:
-            picture = read_image(path)
-            light = picture if self.linear else rgb_to_linear_rgb(picture.expand(3, -1, -1))[: len(picture)]
-            return light, _as_it_is, {}, sensor
-        raw = self.dump.open(path)
-        balance = white_balance(self.white_balance)
-        light = develop(raw, white_balance=balance, encoded=False, upright=False)
-        bare = replace(raw, counts=torch.empty(0))  # keeps the orientation without the counts
-        if calibration is not None:
-            calibration.check_taken_alike(raw, path)
-        noise = sensor if sensor is not None and calibration is None else developed_noise(raw, balance, sensor)
-        return light, bare.upright, vars(raw.info), noise
-
-    def _in_words(self, head: LightHead) -> dict[str, str]:
-        """Describe the results of a file for the summary."""
-        from kornia_tidy.commands.system_options import CLOSED_FORM
-        from kornia_tidy.inference.tasks import MAPS
-
-        unit, (near, far) = self.depth_unit, head.camera.depth_range
-        words = {"head": self.head or CLOSED_FORM}
-        if self.psfs is not None:
-            words["psfs"] = f"measured: {self.psfs}"
-        if "image" in MAPS[head.task]:
-            words["image"] = "all in focus, 16 bits, encoded as sRGB"
-        if "depth" in MAPS[head.task]:
-            words["depth_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or farther"
-            if head.uncertain:
-                words["deviation_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or more, or unbounded"
-            words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
-        return words
-
-
-def result_suffixes(task: str, picture: str, *, uncertain: bool = False) -> list[str]:
-    """Return the suffixes of a file's results; the last result is written when all others exist.
-
-    Args:
-        task: of the network.
-        picture: ``--format``.
-        uncertain: whether the network estimates the uncertainty of depth.
-
-    Example:
-        >>> result_suffixes("edof", "tiff")
-        ['.tif', '.jpg', '.json']
-    """
-    from kornia_tidy.inference.tasks import MAPS
-
-    image = [SUFFIXES[picture], ".jpg"] if "image" in MAPS[task] else []
-    depth = ["_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png"] if "depth" in MAPS[task] else []
-    deviation = ["_deviation.png", "_deviation.pfm", "_deviation.npy"] if uncertain else []
-    return [*image, *depth, *deviation, ".json"]
-
-
-def write_results(
-    paths: list[Path],
-    result: Reconstruction | UncertainReconstruction,
-    upright: Callable[[Tensor], Tensor],
-    info: dict[str, Any],
-    head: LightHead,
-    depth_unit: float,
-) -> tuple[int, int]:
-    """Write pictures and depth with their suffixes; return columns and rows."""
-    from kornia_tidy.data.depth_files import write_depth
-    from kornia_tidy.data.image_files import write_image
-    from kornia_tidy.figures.depth import draw_depth
-    from kornia_tidy.files import write_bytes
-    from kornia_tidy.inference import light_head
-
-    image = None if result.image is None else upright(result.image)
-    depth = None if result.depth is None else upright(result.depth)
-    deviation = unknown = None
-    if isinstance(result, light_head.UncertainReconstruction):
-        # A depth file holds no zero.
-        deviation = upright(result.deviation).clamp(min=SMALLEST_DEVIATION)
-        unknown = upright(result.relative_deviation)
-    for path in paths:
-        if path.name.endswith("_depth_colors.png"):
-            assert depth is not None
-            drawn = BytesIO()
-            draw_depth(depth, head.camera, unknown).savefig(drawn, format="png", dpi=PREVIEW_DPI)
-            write_bytes(path, drawn.getvalue())
-        elif path.stem.endswith("_depth") and depth is not None:
-            write_depth(path, depth, depth_unit if path.suffix == ".png" else 1.0, saturate=True)
-        elif path.stem.endswith("_deviation"):
-            assert deviation is not None
-            write_depth(path, deviation, depth_unit if path.suffix == ".png" else 1.0, saturate=True)
-        elif path.suffix != ".json":
-            assert image is not None
-            write_image(path, image, 8 if path.suffix == ".jpg" else 16, info)
-    height, width = next(part for part in (image, depth) if part is not None).shape[-2:]
-    return width, height
 
 
 def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
@@ -346,7 +254,3 @@ def _check_measured(path: str, colors: int, noise: SensorNoise | None, system: T
         raise ValueError(f"the PSFs were measured in {channels} colours, and {path} has {colors}")
     if noise is None and not system.step:
         raise ValueError(f"the noise of {path} is not known: give --noise")
-
-
-def _as_it_is(image: Tensor) -> Tensor:
-    return image

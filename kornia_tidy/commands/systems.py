@@ -16,10 +16,7 @@ from kornia_tidy.settings import Seed, Unit
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kornia_tidy.systems.system import System
-
 DOTS_PER_INCH = 120
-HEADINGS = ("name", "lens", "mask", "depth, m", "psi, rad", "noise", "guessed", "source")
 
 
 def names_of(text: str) -> tuple[str, ...]:
@@ -84,7 +81,7 @@ class Systems:
         from kornia_tidy.figures.systems import Portrait, draw_systems
         from kornia_tidy.files import write_bytes
         from kornia_tidy.inference.tasks import metres
-        from kornia_tidy.systems.presets import published_system
+        from kornia_tidy.systems.presets import published_system, systems_table
 
         systems = [published_system(name) for name in self.systems or SYSTEMS]
         require_matplotlib()
@@ -109,7 +106,7 @@ class Systems:
                 picture = BytesIO()
                 suffix = Path(self.output).suffix[1:]
                 draw_systems(portraits, image, inverse_depth, scene).savefig(picture, dpi=DOTS_PER_INCH, format=suffix)
-        print("\n".join(table([portrait.system for portrait in portraits])))
+        print("\n".join(systems_table([portrait.system for portrait in portraits])))
         print()
         write_bytes(self.output, picture.getvalue())
         tell("wrote", f"{self.output}: look at it")
@@ -137,31 +134,3 @@ class Systems:
             image = resize(image[None], self.size, side="long", antialias=True)[0].clamp(0, 1)
             inverse_depth = resize(inverse_depth[None], self.size, side="long", interpolation="nearest")[0]
         return image, inverse_depth, name
-
-
-def table(systems: list[System]) -> list[str]:
-    """Return the systems as lines of aligned columns, the headings first.
-
-    Example:
-        >>> from kornia_tidy.systems.presets import published_system
-        >>> print(table([published_system("ikoma2021")])[1][:68])
-        ikoma2021  50 mm f/6.3, focus 1.7 m  radial profile, 61 radii, noise
-    """
-    rows = [HEADINGS]
-    for system in systems:
-        camera = system.camera()
-        (near, far), (lo, hi) = camera.depth_range, camera.defocus_range
-        rows.append(
-            (
-                system.name,
-                f"{camera.focal_length * 1e3:.3g} mm f/{camera.f_number:.3g}, focus {camera.focus_distance:.3g} m",
-                system.mask,
-                f"{near:.3g} to {far:g}",
-                f"{hi:+.1f} to {lo:+.1f}",
-                f"{system.sigma:g}",
-                str(len(system.guesses)),
-                system.paper,
-            )
-        )
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

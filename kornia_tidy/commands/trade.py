@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 
     from kornia_tidy.camera.tidy_optics import TiDyOptics
     from kornia_tidy.data.rgbd import Scene
-    from kornia_tidy.tradeoff.conditions import Conditions
-    from kornia_tidy.tradeoff.files import TradeRun
-    from kornia_tidy.tradeoff.measure import TradeRow
     from kornia_tidy.tradeoff.sweep_settings import Setting
 
 NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
@@ -99,7 +96,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         from kornia_tidy.files import write_bytes
         from kornia_tidy.tradeoff.conditions import Conditions
         from kornia_tidy.tradeoff.figure import draw_trade
-        from kornia_tidy.tradeoff.files import TradeRun, markdown
+        from kornia_tidy.tradeoff.files import TradeRun, known_rows, markdown, rows_beside, write_trade
         from kornia_tidy.tradeoff.measure import missing, sweep
 
         require_matplotlib()
@@ -111,7 +108,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         name = f"dead leaves, seed {self.seed}" if self.scene.image is None else Path(self.scene.image).name
         conditions = Conditions.here_and_now(name, optics, image, depth, self.reference)
         settings = self._settings(optics, image, depth)
-        known, why = _known(folder / "trade.json", conditions)
+        known, why = known_rows(folder, conditions)
 
         tell("scene", f"{name}, {scene_in_words(scene)}")
         tell("camera", optics.camera.extra_repr())
@@ -121,7 +118,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         tell("settings", f"{len(settings)}, {todo} different ones to be measured{why}")
         folder.mkdir(parents=True, exist_ok=True)
 
-        rows: list[TradeRow] = []
+        rows = []
         steps = sweep(
             optics,
             image,
@@ -140,7 +137,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
                     step = f"{setting.knob} {setting.value}"
                     progress.set_postfix_str(f"reference, then {step}" if todo and not rows else step)
                     rows.append(next(steps))
-                    _write(folder, TradeRun(conditions, (*rows, *_others(known, rows))))
+                    write_trade(folder, TradeRun(conditions, (*rows, *rows_beside(known, rows))))
                     progress.update()
             except KeyboardInterrupt:
                 progress.close()
@@ -199,28 +196,3 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         if PLAN in knobs:
             settings += planned(optics, linear_light(optics, image)[None], depth[None])
         return settings
-
-
-def _known(path: Path, conditions: Conditions) -> tuple[tuple[TradeRow, ...], str]:
-    """Return the valid rows of an earlier run, and a remark about them."""
-    from kornia_tidy.tradeoff.files import read_json
-
-    if not path.exists():
-        return (), ""
-    earlier = read_json(path)
-    if earlier.conditions.same(conditions):
-        return earlier.rows, f"; {path} goes on"
-    return (), f"; {path} is of another scene, machine or code and will be replaced"
-
-
-def _others(known: tuple[TradeRow, ...], rows: list[TradeRow]) -> list[TradeRow]:
-    """Return the rows of earlier runs that these do not replace."""
-    done = {(row.knob, row.value, row.fidelity) for row in rows}
-    return [row for row in known if (row.knob, row.value, row.fidelity) not in done]
-
-
-def _write(folder: Path, run: TradeRun) -> None:
-    from kornia_tidy.tradeoff.files import write_csv, write_json
-
-    write_json(folder / "trade.json", run)
-    write_csv(folder / "trade.csv", run.rows)

@@ -10,6 +10,7 @@ from typing import Any
 
 from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.data.depth_files import check_depth_options
+from kornia_tidy.data.patches import central_crop
 from kornia_tidy.data.rgbd import Scene, check_pairing_options, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import find_files, read_json
@@ -153,6 +154,21 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
         if not _fits(name, value):
             raise ValueError(f"cannot read {path}: {name} must be {_kind(name)}, got {value!r:.80}")
     return RGBDFolder(root, transform=transform, **about)
+
+
+def scenes_in(root: str | os.PathLike[str], largest: int = 512) -> list[Scene]:
+    """Return the scenes of a folder with ``rgbd.json``, of large ones the middle.
+
+    Args:
+        root: see :func:`described_folder`.
+        largest: pixels along a side.
+    """
+    scenes = []
+    for sample in described_folder(root):
+        height, width = sample["image"].shape[-2:]
+        cut = central_crop(sample, (min(height, largest), min(width, largest)))
+        scenes.append(Scene(cut["image"], cut["depth"], cut["mask"]))
+    return scenes
 
 
 def _kind(name: str) -> str:

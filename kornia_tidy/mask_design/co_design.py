@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -164,6 +165,23 @@ def planned_work(task: DesignTask, effort: Effort, scenes: int = 0) -> dict[str,
     steps = len(task.f_numbers()) * effort.coarse_steps
     steps += (len(CODED_FINALISTS) + len(effort.starts) - 1 + 2) * effort.steps  # and two other foci
     return {"search": steps, "captures": (len(FLAT_FINALISTS) + len(CODED_FINALISTS)) * (effort.scenes + scenes)}
+
+
+def expected_in_words(task: DesignTask, effort: Effort, work: dict[str, int]) -> str:
+    """Return the work of :func:`planned_work` and its time in words, from a few steps and one capture."""
+    f_number = task.f_numbers()[1]
+    times = []
+    for steps in (1, 3):  # the first step also computes what the others find
+        start = time.perf_counter()
+        coded_candidate(task, "focal sweep", f_number, 0.5, steps)
+        times.append(time.perf_counter() - start)
+    step = times[1] / 4
+    scenes = leaf_scenes(2, effort.size, task.depth_range)
+    start = time.perf_counter()
+    list(score_candidate(task, flat_candidate(task, task.balanced_f_number, 0.5), scenes))
+    seconds = work["search"] * step + work["captures"] * (time.perf_counter() - start) / 2
+    told = f"{seconds:.0f} s" if seconds < 100 else f"{math.ceil(seconds / 60)} minutes"
+    return f"{work['search']} gradient steps and {work['captures']} captures, about {told}"
 
 
 def _search(

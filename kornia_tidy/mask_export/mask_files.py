@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,9 +19,13 @@ from kornia_tidy.checks import check_choice
 from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.files import read_bytes, write_bytes
 from kornia_tidy.mask_export.slm_frames import checked_heights
+from kornia_tidy.mask_export.timing import FrameTime, frame_times
 from kornia_tidy.masks.base import metres_to_radians
 from kornia_tidy.modulator.modulator import DwellTimes, LearnableDwellTimes
+from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.modulator.switching import Switching
 from kornia_tidy.optics.materials import Material, constant_index
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.tensor_files import read_tensors
 
@@ -38,6 +43,62 @@ class SavedMasks(NamedTuple):
     """None where the file does not tell it, or its class is none of this package."""
     dwell: list[float] | None = None
     """Share of each mask, summing to one; None where all are equal."""
+
+    def levels(
+        self,
+        wavelength: float = REFERENCE_WAVELENGTH,
+        bits: int | None = None,
+        phase_range: float | None = None,
+        response: Sequence[float] | None = None,
+    ) -> GreyLevels:
+        """Return the grey levels that show the masks: those of the camera's panel, unless others are given.
+
+        Args:
+            wavelength: metres, at which the panel works.
+            bits: of a level. Default: as saved, or 8.
+            phase_range: radians at the wavelength that the levels span. Default: as saved, or one wave.
+            response: instead: the phase of each level.
+        """
+        if response is not None:
+            return GreyLevels(8 if bits is None else bits, response=response)
+        known = next((part for part in self._parts() if isinstance(part, GreyLevels)), None)
+        if known is None or bits is not None or phase_range is not None:
+            return GreyLevels(8 if bits is None else bits, 2 * math.pi if phase_range is None else phase_range)
+        if wavelength == REFERENCE_WAVELENGTH:
+            return known
+        scale = metres_to_radians(self.material, wavelength) / metres_to_radians(self.material)
+        if known.response is None:
+            return GreyLevels(known.bits, known.phase_range * scale)
+        return GreyLevels(known.bits, response=(known.levels * scale).tolist())
+
+    def times(
+        self,
+        exposure: float | None = None,
+        switching_time: float | None = None,
+        dwell: Sequence[float] = (),
+        cyclic: bool = False,
+    ) -> list[FrameTime]:
+        """Return when the masks are shown: as the camera's modulator shows them, unless it is given otherwise.
+
+        Args:
+            exposure: seconds. Default: as saved, or 0.1.
+            switching_time: seconds of a swap. Default: as saved, or 0.
+            dwell: share of each mask. Default: as saved, or equal.
+            cyclic: the swap back to the first falls into the exposure too.
+
+        Raises:
+            ValueError: if there are other numbers of shares and masks.
+        """
+        known = next((part for part in self._parts() if isinstance(part, Switching)), Switching(0.0))
+        exposure = known.exposure if exposure is None else exposure
+        switching_time = known.switching_time if switching_time is None else switching_time
+        shares = dwell or self.dwell or [1.0] * len(self.heights)
+        if len(shares) != len(self.heights):
+            raise ValueError(f"there are {len(shares)} dwell shares for {len(self.heights)} masks")
+        return frame_times(shares, exposure, switching_time, cyclic or known.cyclic)
+
+    def _parts(self) -> list[nn.Module]:
+        return [] if self.modulator is None else list(self.modulator.modules())
 
 
 def masks_in_state(state: Mapping[str, Tensor], material: Material | None = None) -> SavedMasks:

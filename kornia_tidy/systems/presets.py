@@ -8,7 +8,7 @@ systems here start from a mask with their characteristic property instead, and t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import nn
@@ -339,6 +339,7 @@ _ALL = (
     ),
 )
 
+HEADINGS = ("name", "lens", "mask", "depth, m", "psi, rad", "noise", "guessed", "source")
 SYSTEMS: dict[str, System] = {system.name: system for system in _ALL}
 """The published systems by name."""
 
@@ -355,3 +356,30 @@ def published_system(name: str) -> System:
     """
     check_choice("the name of a published system", name, tuple(SYSTEMS))
     return SYSTEMS[name]
+
+
+def systems_table(systems: Sequence[System]) -> list[str]:
+    """Return the systems as lines of aligned columns, the headings first.
+
+    Example:
+        >>> print(systems_table([published_system("ikoma2021")])[1][:68])
+        ikoma2021  50 mm f/6.3, focus 1.7 m  radial profile, 61 radii, noise
+    """
+    rows = [HEADINGS]
+    for system in systems:
+        camera = system.camera()
+        (near, far), (lo, hi) = camera.depth_range, camera.defocus_range
+        rows.append(
+            (
+                system.name,
+                f"{camera.focal_length * 1e3:.3g} mm f/{camera.f_number:.3g}, focus {camera.focus_distance:.3g} m",
+                system.mask,
+                f"{near:.3g} to {far:g}",
+                f"{hi:+.1f} to {lo:+.1f}",
+                f"{system.sigma:g}",
+                str(len(system.guesses)),
+                system.paper,
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

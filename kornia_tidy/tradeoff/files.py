@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from kornia_tidy.fidelity import Fidelity
@@ -225,3 +226,30 @@ def _parsed(text: str, hint: Any) -> Any:
         if kind in kinds:
             return kind(text)
     return text
+
+
+def known_rows(folder: str | os.PathLike[str], conditions: Conditions) -> tuple[tuple[TradeRow, ...], str]:
+    """Return the rows of an earlier run in a folder that are still valid, and a remark about them.
+
+    Raises:
+        ValueError: if ``trade.json`` there is no sweep.
+    """
+    path = Path(folder) / "trade.json"
+    if not path.exists():
+        return (), ""
+    earlier = read_json(path)
+    if earlier.conditions.same(conditions):
+        return earlier.rows, f"; {path} goes on"
+    return (), f"; {path} is of another scene, machine or code and will be replaced"
+
+
+def rows_beside(known: Sequence[TradeRow], rows: Sequence[TradeRow]) -> list[TradeRow]:
+    """Return the known rows that others do not replace."""
+    done = {(row.knob, row.value, row.fidelity) for row in rows}
+    return [row for row in known if (row.knob, row.value, row.fidelity) not in done]
+
+
+def write_trade(folder: str | os.PathLike[str], run: TradeRun) -> None:
+    """Write a run as ``trade.json`` and ``trade.csv``, atomically."""
+    write_json(Path(folder) / "trade.json", run)
+    write_csv(Path(folder) / "trade.csv", run.rows)

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main, read_command
-from kornia_tidy.commands import design
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.data.rgbd_folder import scenes_in
 from kornia_tidy.mask_design import Effort
 from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
 from kornia_tidy.modulator.switching import Switching
@@ -57,7 +57,7 @@ class TestDesign(BaseTester):
         write_image(tmp_path / "a.png", torch.rand(3, 100, 600))
         write_depth(tmp_path / "a_depth.png", torch.full((1, 100, 600), 1.5), scale=0.001)
         (tmp_path / "rgbd.json").write_text('{"image": "*.png", "depth": "*_depth.png", "scale": 0.001}')
-        (scene,) = design._own_scenes(str(tmp_path))
+        (scene,) = scenes_in(tmp_path)
         assert scene.image.shape == (3, 100, 512)
         assert scene.depth.unique().tolist() == pytest.approx([1.5])
 

@@ -19,6 +19,7 @@ import torch
 import kornia_tidy.files
 from kornia_tidy.cli import main, read_command
 from kornia_tidy.data import read_depth, read_image
+from kornia_tidy.inference.capture_file import read_light
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
 from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.inference.state_file import write_state
@@ -243,8 +244,8 @@ class TestRawReconstruct(BaseTester):
         counts[0, 0] = 64
         counts.tofile(tmp_path / "a.raw")
         options = ["--size", "80x64", "--pattern", "GRBG", "--black", "64", "--white", "1024"]
-        command = read_command(["raw", "reconstruct", str(tmp_path / "a.raw"), "-o", str(tmp_path), *options])
-        light, _, _, _ = command._light(str(tmp_path / "a.raw"))
+        dump = read_command(["raw", "reconstruct", "a.raw", "-o", "out", *options]).dump
+        light = read_light(tmp_path / "a.raw", raw=dump.open(str(tmp_path / "a.raw"))).light
         assert light.shape == (3, 64, 80)
         self.assert_close(light[:, 8:], torch.full((3, 56, 80), 0.25), atol=1e-3)
         weights = checkpoint(tmp_path / "edof.safetensors", task="edof")

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.commands.systems import table
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.inference.tasks import metres
 from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.systems.presets import systems_table
 from tests.base import BaseTester, shared
 
 
@@ -49,7 +49,7 @@ class TestSystems(BaseTester):
             self.assert_close(psi, torch.tensor([lo, 0.75 * lo + 0.25 * hi, hi]), rtol=0, atol=2e-3)
 
     def test_feature_the_table_has_a_line_for_each_system_and_its_guesses(self):
-        lines = table(list(SYSTEMS.values()))
+        lines = systems_table(list(SYSTEMS.values()))
         assert [line.split("  ")[0] for line in lines[1:]] == list(SYSTEMS)
         column = lines[0].index("guessed")
         assert [int(line[column:].split()[0]) for line in lines[1:]] == [len(s.guesses) for s in SYSTEMS.values()]

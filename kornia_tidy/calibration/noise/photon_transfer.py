@@ -36,6 +36,7 @@ ROUNDING = 1 / 12  # variance that rounding to whole counts adds
 RESOLVED = 0.24  # counts squared; EMVA 1288: with less variance, rounding hides the read noise
 SAME_LEVEL = 0.02  # captures whose levels differ by at most this fraction plus one count have the same exposure
 SAME_WHITE = 0.01  # relative: readers correct the saturation count of a file by its brightest pixels
+STRAIGHT = 0.99  # R² above which the curve is reported as a straight line
 LEAST_POINTS, LEAST_POINTS_SINGLE = 3, 8  # a point from a single picture is less certain than one from flats
 WORST_R_SQUARED, WORST_GAIN_ERROR = 0.9, 0.25  # a worse fit is refused
 _BISQUARE = 4.685  # Tukey's constant: 95 % efficient for Gaussian noise
@@ -128,6 +129,30 @@ class PhotonTransfer:
         """
         bits = min(max(round(math.log2(self.white - self.black + 1)), 1), 16)
         return SensorNoise(self.line.read_noise / self.full_well, full_well=self.full_well, bits=bits)
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """Return the results as topics and texts."""
+        line = self.line
+        iso = "" if self.iso is None else f", ISO {self.iso:g}"
+        single = self.method == "single"
+        limit = "" if self.read_noise_resolved else " (no more than a guess: rounding to counts may hide it)"
+        topics = [
+            ("camera", (self.camera or "unknown") + iso),
+            ("levels", f"black {self.black:g}, white {self.white:g}"),
+            ("gain", f"{line.gain:.4g} ± {line.gain_error:.2g} electrons a count"),
+            ("read", f"{line.read_noise:.4g} ± {line.read_noise_error:.2g} electrons{limit}"),
+            ("white", f"stands for {self.full_well:.4g} electrons"),
+        ]
+        if single:
+            pattern = f"{line.fixed_pattern:.2%} of the level" if line.fixed_pattern else "not seen"
+            topics.append(("pattern", f"{pattern}; fixed pattern and fine texture cannot be told apart in one picture"))
+        for name, own in self.channels.items():
+            topics.append(
+                (f"  {name}", f"gain {own.gain:.4g}, read noise {own.read_noise:.3g} electrons, R² {own.r_squared:.4f}")
+            )
+        straight = "a straight line" if line.r_squared >= STRAIGHT else f"below {STRAIGHT}: not quite a straight line"
+        topics.append(("R²", f"{line.r_squared:.4f} over {len(self.points)} points, {straight}"))
+        return topics
 
 
 def photon_transfer(captures: Sequence[RawCapture], darks: Sequence[RawCapture] = ()) -> PhotonTransfer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -41,6 +42,9 @@ ONE_DISTANCE = 0.01  # of it, on either side: the range of a camera that was mea
 TAIL, TAIL_DOUBT = 0.4, 0.3
 LEVEL = (1 + TAIL) ** 2 + 1.8 * TAIL**2  # variance of the background so corrected, by that of the annulus
 MOST_MISFIT = 25.0  # residuals of five times the noise; with larger ones the PSF does not describe the captures
+
+
+GOOD_NOISE = 0.02  # in L1
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,26 @@ class MeasuredPSFs:
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
 
+    def in_words(self) -> list[tuple[str, str]]:
+        """Return what was left out, and the accuracy at each distance, as topics and texts."""
+        topics = [
+            ("left out", f"the point at {r.distance:g} m, row {r.row:.1f}, column {r.column:.1f}: {r.rejected}")
+            for r in self.reports
+            if r.rejected is not None
+        ]
+        noise = (2 / torch.pi) ** 0.5 * self.uncertainty.sum((2, 3))
+        for distance, psi, own in zip(self.distances, self.bank.defocus, noise, strict=True):
+            used = [r for r in self.reports if r.distance == float(distance) and r.rejected is None]
+            times = (sum(r.misfit or 0.0 for r in used) / len(used)) ** 0.5
+            words = " ".join(f"{100 * float(x):.2g}" for x in own)
+            told = f"{len(used)} point images, residuals {times:.2g} times the noise, noise {words} % in L1"
+            topics.append(("PSF", f"{float(distance):g} m, psi {float(psi):+.2f} rad: {told}"))
+            if (worst := float(own.max())) > GOOD_NOISE:
+                more = math.ceil(len(used) * (worst / GOOD_NOISE) ** 2)
+                remedy = f"about {more} point images, or one more and far longer exposure"
+                topics.append(("", f"{remedy}, bring it to {GOOD_NOISE:.0%}"))
+        return topics
+
 
 def _lens(text: str, measured: MeasuredPSFs) -> ThinLensCamera:
     """Return the lens of a file over the distances that were measured."""
@@ -185,6 +209,21 @@ def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil |
     pupil = Pupil(circular_aperture(23), MASK_SPAN / 23) if pupil is None else pupil
     frequency = camera.aperture_radius * camera.pixel_pitch / (wavelength * float(camera.image_distance))
     return pupil.diameter * frequency
+
+
+def channel_cutoffs(camera: ThinLensCamera, channels: int) -> list[float]:
+    """Return the diffraction cutoff of a lens at the shortest wavelength of each channel, at most 2 cycles per pixel.
+
+    Args:
+        camera: the lens.
+        channels: 3 of red, green and blue, or of all visible light.
+
+    Example:
+        >>> [round(cutoff, 2) for cutoff in channel_cutoffs(ThinLensCamera(), 3)]
+        [0.78, 0.93, 1.11]
+    """
+    shortest = {3: (570e-9, 480e-9, 400e-9)}.get(channels, (400e-9,) * channels)
+    return [min(2.0, diffraction_cutoff(camera, wave)) for wave in shortest]
 
 
 def measure_psfs(
