@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,15 +50,11 @@ class App:
             ImportError: if Gradio or matplotlib are missing.
             OSError: if the port is taken.
         """
-        from tqdm import tqdm
-
-        from kornia_tidy.commands.report import tell
+        from kornia_tidy.commands.report import progress_bar, tell
         from kornia_tidy.figures.style import require_matplotlib
 
         require_matplotlib()
-        bar = tqdm(
-            total=100, desc="app", bar_format="{desc}: {bar} {postfix}", file=sys.stderr, leave=False, disable=None
-        )
+        bar = progress_bar("app", total=100, bar_format="{desc}: {bar} {postfix}")
 
         def progress(share: float, stage: str) -> None:
             bar.update(round(100 * share) - bar.n)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,9 +55,8 @@ class Demo:
         """Simulate captures, restore them, and write the two pages."""
         folder = check_folder(self.output)
         import torch
-        from tqdm import tqdm
 
-        from kornia_tidy.commands.report import Stages, clamped_in_words, scene_in_words, tell
+        from kornia_tidy.commands.report import Stages, clamped_in_words, progress_bar, scene_in_words, tell
         from kornia_tidy.figures.demonstration import (
             comparison_page,
             explained_page,
@@ -74,14 +72,7 @@ class Demo:
 
         require_matplotlib()
         stages = Stages()
-        progress = tqdm(
-            total=6,
-            desc="demo",
-            bar_format="{desc}: {bar} {n}/{total} {postfix}",
-            file=sys.stderr,
-            leave=False,
-            disable=None,
-        )
+        progress = progress_bar("demo", total=6, bar_format="{desc}: {bar} {n}/{total} {postfix}")
 
         def step(name: str) -> Any:
             progress.update(int(bool(stages.seconds)))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.choices import BETWEEN
 from kornia_tidy.commands.shared import Folder, check_folder
@@ -15,14 +13,12 @@ from kornia_tidy.settings import DepthRange, Electrons, FNumber, Metres, Seconds
 
 if TYPE_CHECKING:
     from torch import nn
-    from tqdm import tqdm
 
     from kornia_tidy.data.rgbd import Scene
     from kornia_tidy.mask_design.co_design import CoDesign, Effort
     from kornia_tidy.mask_design.design_task import DesignTask
 
 PROGRESS = "progress.json"
-DOTS_PER_INCH = 150
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,18 +212,16 @@ def _with_progress(
     task: DesignTask, scenes: list[Scene], effort: Effort, number: int, progress_file: Path, work: dict[str, int]
 ) -> CoDesign:
     """Run the co-design with a progress bar for each stage."""
-    from tqdm import tqdm
-
-    from kornia_tidy.commands.report import tell
+    from kornia_tidy.commands.report import progress_bar, tell
     from kornia_tidy.mask_design.co_design import co_design
 
-    bars: dict[str, tqdm] = {}
+    bars: dict[str, Any] = {}
 
     def progress(stage: str, amount: int) -> None:
         if stage not in bars:
             for bar in bars.values():
                 bar.close()
-            bars[stage] = tqdm(total=work[stage], desc=stage, file=sys.stderr, leave=False, disable=None)
+            bars[stage] = progress_bar(stage, total=work[stage])
         bars[stage].update(amount)
 
     try:
@@ -242,10 +236,9 @@ def _with_progress(
 
 def _write(folder: Path, design: CoDesign) -> None:
     from kornia_tidy.figures.co_design import draw_co_design
+    from kornia_tidy.figures.style import encoded_figure
     from kornia_tidy.files import write_bytes
     from kornia_tidy.mask_design.design_report import PICTURE, design_files
 
-    picture = BytesIO()
-    draw_co_design(design).savefig(picture, dpi=DOTS_PER_INCH)
-    for name, data in {**design_files(design), PICTURE: picture.getvalue()}.items():
+    for name, data in {**design_files(design), PICTURE: encoded_figure(draw_co_design(design))}.items():
         write_bytes(folder / name, data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -76,9 +75,7 @@ Closed forms: {", ".join(CLOSED_FORMS)}.
     def run(self) -> None:
         """Evaluate the system, write results and pictures, and print a summary."""
         folder = check_folder(self.output or Path(self.system).parent / "evaluation")
-        from tqdm import tqdm
-
-        from kornia_tidy.commands.report import tell
+        from kornia_tidy.commands.report import progress_bar, tell
         from kornia_tidy.commands.system_options import load_system
         from kornia_tidy.inference.tasks import MAPS
         from kornia_tidy.training.data_sets import make_scenes
@@ -96,7 +93,7 @@ Closed forms: {", ".join(CLOSED_FORMS)}.
         tell("system", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, {system.step} steps")
         folder.mkdir(parents=True, exist_ok=True)
         numbers = count()
-        with tqdm(desc="evaluate", file=sys.stderr, leave=False, unit="scene", disable=None) as progress:
+        with progress_bar("evaluate", unit="scene") as progress:
 
             def each(result: SceneResult) -> None:
                 if next(numbers) < self.pictures:

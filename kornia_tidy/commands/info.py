@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
-from pathlib import Path
 
 PACKAGES = (
     *("torch", "kornia", "numpy", "opencv-contrib-python-headless", "colour-science", "rawpy", "safetensors"),
@@ -45,12 +43,13 @@ def lines() -> Iterator[tuple[str, str]]:
 
     import kornia_tidy
     from kornia_tidy.kernels.build import REALS, build, vector_bytes
+    from kornia_tidy.tradeoff.conditions import device_name
 
     sources = (import_module(f"kornia_tidy.kernels.{name}").SOURCE for name in SOURCES)
     yield "package", f"kornia_tidy {kornia_tidy.__version__}, Python {platform.python_version()}"
     yield "uses", ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
     yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}"
-    yield "processor", f"{_processor_name()}, {os.cpu_count()} cores"
+    yield "processor", device_name(torch.device("cpu"))
     yield (
         "torch",
         f"{torch.get_num_threads()} threads, vectors of {torch.backends.cpu.get_cpu_capability()}, "
@@ -75,14 +74,6 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
-
-
-def _processor_name() -> str:
-    try:
-        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    return found[1] if found else platform.processor() or "unknown"
 
 
 def _accelerator() -> str:

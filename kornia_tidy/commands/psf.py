@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 
     from kornia_tidy.camera.tidy_optics import TiDyOptics
 
-DOTS_PER_INCH = 150
 COLUMNS = 7
 
 
@@ -89,8 +87,7 @@ class Psf:
         from kornia_tidy.commands.report import Stages, tell
         from kornia_tidy.figures.psf import draw_psfs
         from kornia_tidy.figures.psf_measures import measures_of_psfs
-        from kornia_tidy.figures.style import require_matplotlib
-        from kornia_tidy.files import write_bytes
+        from kornia_tidy.figures.style import require_matplotlib, save_figure
 
         check_output(self.output, self.camera)
         require_matplotlib()
@@ -102,13 +99,11 @@ class Psf:
             measured = measures_of_psfs(optics, psi)
         title = f"PSFs of {Path(self.camera).name}, window {optics.window} x {optics.window} px"
         with stages("picture"):
-            picture = BytesIO()
-            draw_psfs(measured.sheet(title)).savefig(picture, dpi=DOTS_PER_INCH, format=Path(self.output).suffix[1:])
+            save_figure(self.output, draw_psfs(measured.sheet(title)))
         tell("camera", optics.camera.extra_repr())
         tell("masks", optics.masks.extra_repr())
         tell("window", f"{optics.window} x {optics.window} px, fidelity {optics.fidelity.name!r}")
         print("", *measured.table(), "", sep="\n")
-        write_bytes(self.output, picture.getvalue())
         tell("wrote", f"{self.output}: look at it")
         tell("time", stages.summary())
 

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from kornia_tidy.commands.parser import Optional
 from kornia_tidy.commands.raw_options import Dump, RawFiles
 from kornia_tidy.commands.shared import File, check_outputs
 from kornia_tidy.settings import Unit
-
-if TYPE_CHECKING:
-    from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer
-
-DOTS_PER_INCH = 150
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +61,8 @@ In Python:
         _check_outputs(output, plot, [*self.files, *self.dark])
         from kornia_tidy.calibration.noise.photon_transfer import photon_transfer, write_json
         from kornia_tidy.commands.report import Stages, tell
+        from kornia_tidy.figures.style import save_figure
+        from kornia_tidy.figures.transfer import draw_transfer
 
         stages = Stages()
         with stages("read"):
@@ -76,20 +72,11 @@ In Python:
         with stages("write"):
             write_json(output, result)
             if plot is not None:
-                _draw(result, plot)
+                save_figure(plot, draw_transfer(result))
         for topic, text in result.in_words():
             tell(topic, text)
         tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
         tell("time", stages.summary())
-
-
-def _draw(result: PhotonTransfer, path: Path) -> None:
-    from kornia_tidy.figures.transfer import draw_transfer
-    from kornia_tidy.files import write_bytes
-
-    picture = BytesIO()
-    draw_transfer(result).savefig(picture, dpi=DOTS_PER_INCH, format=path.suffix[1:])
-    write_bytes(path, picture.getvalue())
 
 
 def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:

@@ -119,7 +119,6 @@ In Python:
         from kornia_tidy.calibration.psf.measured_psfs import channel_cutoffs, measure_psfs
         from kornia_tidy.calibration.psf.point_files import images_of_files
         from kornia_tidy.commands.report import Stages, tell
-        from kornia_tidy.files import replacing
         from kornia_tidy.optics.thin_lens import ThinLensCamera
 
         lens = LensSettings(**self.lens).camera()
@@ -162,9 +161,9 @@ In Python:
             tell("wrote", self.fit_mask)
         if self.picture is not None:
             from kornia_tidy.figures.measured_psfs import draw_measured
+            from kornia_tidy.figures.style import save_figure
 
-            with replacing(self.picture) as temporary:
-                draw_measured(measured, fit).savefig(temporary, dpi=150, format="png")
+            save_figure(self.picture, draw_measured(measured, fit))
             tell("wrote", self.picture)
         tell("time", stages.summary())
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -139,11 +138,9 @@ In Python, in a data loader:
 
     def run(self) -> None:
         """Render the data set, and print a summary."""
-        from tqdm import tqdm
-
         from kornia_tidy.coded_datasets.layout import Layout
         from kornia_tidy.coded_datasets.render_scenes import render_scenes, shard_items_within
-        from kornia_tidy.commands.report import tell
+        from kornia_tidy.commands.report import progress_bar, tell
         from kornia_tidy.training.data_sets import make_scenes
 
         rank, world = _place()
@@ -162,9 +159,7 @@ In Python, in a data loader:
             tell("masks", optics.masks.extra_repr())
             tell("scenes", f"{len(scenes)} of {settings.data!r}, {self.split}")  # ty: ignore[invalid-argument-type]
         start = time.perf_counter()
-        with tqdm(
-            desc=f"render{who}", file=sys.stderr, leave=False, unit="scene", disable=None if rank == 0 else True
-        ) as bar:
+        with progress_bar(f"render{who}", unit="scene", disable=None if rank == 0 else True) as bar:
 
             def each(done: int, total: int) -> None:
                 if bar.total is None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from typing import Any
 
 from torch import Tensor
+from tqdm import tqdm
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.rgbd import Scene
@@ -38,6 +41,11 @@ class Stages:
         """Return the stages and their times in one line."""
         parts = [f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items()]
         return ", ".join([*parts, f"together {sum(self.seconds.values()):.2f} s"])
+
+
+def progress_bar(what: str, **options: Any) -> tqdm:
+    """Return a bar of progress on standard error, which vanishes at the end; none where that is no terminal."""
+    return tqdm(desc=what, file=sys.stderr, leave=False, **{"disable": None, **options})
 
 
 def tell(topic: str, text: str) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -72,21 +70,19 @@ class Systems:
         """List the systems, compute their statistics, and draw them."""
         check_output(self.output, self.scene.image, self.scene.depth)
         import torch
-        from tqdm import tqdm
 
         from kornia_tidy.camera.tidy_optics import TiDyOptics
-        from kornia_tidy.commands.report import Stages, tell
-        from kornia_tidy.figures.style import require_matplotlib
+        from kornia_tidy.commands.report import Stages, progress_bar, tell
+        from kornia_tidy.figures.style import require_matplotlib, save_figure
         from kornia_tidy.figures.system_statistics import system_statistics
         from kornia_tidy.figures.systems import Portrait, draw_systems
-        from kornia_tidy.files import write_bytes
         from kornia_tidy.inference.tasks import metres
         from kornia_tidy.systems.presets import published_system, systems_table
 
         systems = [published_system(name) for name in self.systems or SYSTEMS]
         require_matplotlib()
         stages, portraits = Stages(), []
-        progress = tqdm(systems, desc="systems", file=sys.stderr, leave=False, unit="system", disable=None)
+        progress = progress_bar("systems", iterable=systems, unit="system")
         with torch.no_grad(), progress:
             with stages("scene"):
                 image, inverse_depth, scene = self._scene()
@@ -103,12 +99,10 @@ class Systems:
                     capture = optics(image, metres(camera, inverse_depth), generator=generator)
                 portraits.append(Portrait(system, optics, seen, capture))
             with stages("picture"):
-                picture = BytesIO()
-                suffix = Path(self.output).suffix[1:]
-                draw_systems(portraits, image, inverse_depth, scene).savefig(picture, dpi=DOTS_PER_INCH, format=suffix)
+                figure = draw_systems(portraits, image, inverse_depth, scene)
+                save_figure(self.output, figure, DOTS_PER_INCH)
         print("\n".join(systems_table([portrait.system for portrait in portraits])))
         print()
-        write_bytes(self.output, picture.getvalue())
         tell("wrote", f"{self.output}: look at it")
         tell("time", stages.summary())
 

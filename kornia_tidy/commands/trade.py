@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
     from kornia_tidy.tradeoff.sweep_settings import Setting
 
 NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
-DOTS_PER_INCH = 150
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,11 +86,8 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
     def run(self) -> None:
         """Measure the sweep, write files after every row, and print the table."""
         folder = check_folder(self.output)
-        from tqdm import tqdm
-
-        from kornia_tidy.commands.report import scene_in_words, tell
-        from kornia_tidy.figures.style import require_matplotlib
-        from kornia_tidy.files import write_bytes
+        from kornia_tidy.commands.report import progress_bar, scene_in_words, tell
+        from kornia_tidy.figures.style import require_matplotlib, save_figure
         from kornia_tidy.tradeoff.conditions import Conditions
         from kornia_tidy.tradeoff.figure import draw_trade
         from kornia_tidy.tradeoff.files import TradeRun, known_rows, markdown, rows_beside, write_trade
@@ -129,9 +123,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
             reference=self.reference,
             known=known,
         )
-        with tqdm(
-            total=len(settings), desc="trade", file=sys.stderr, leave=False, unit="setting", disable=None
-        ) as progress:
+        with progress_bar("trade", total=len(settings), unit="setting") as progress:
             try:
                 for setting in settings:
                     step = f"{setting.knob} {setting.value}"
@@ -148,9 +140,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
                 raise
 
         shown = TradeRun(conditions, tuple(rows))
-        picture = BytesIO()
-        draw_trade(shown).savefig(picture, dpi=DOTS_PER_INCH)
-        write_bytes(folder / "trade.png", picture.getvalue())
+        save_figure(folder / "trade.png", draw_trade(shown))
         print(f"\n{markdown(rows)}\n")
         tell("bold", "no other setting is both faster and closer to the reference")
         tell("wrote", f"{folder / 'trade.png'}: look at this one")

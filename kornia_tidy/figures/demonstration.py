@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from io import BytesIO
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.figures.comparison import Panel, draw_comparison
 from kornia_tidy.figures.depth import depth_colors
 from kornia_tidy.figures.explained import explain
+from kornia_tidy.figures.style import encoded_figure
 from kornia_tidy.inference.compared_cameras import REFERENCE_F_NUMBER, Camera, Result
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
@@ -36,9 +36,7 @@ def explained_page(camera: Camera, scene: Scene, result: Result, noise: int) -> 
         border=optics.border,
     )  # fmt: skip
     alone = first(scene.image, scene.depth, generator=torch.Generator().manual_seed(noise))
-    page = BytesIO()
-    explain(scene.image, scene.depth, small, alone, result.capture, CAPTION).savefig(page, dpi=DOTS_PER_INCH)
-    return page.getvalue()
+    return encoded_figure(explain(scene.image, scene.depth, small, alone, result.capture, CAPTION), DOTS_PER_INCH)
 
 
 def comparison_page(
@@ -62,10 +60,8 @@ def comparison_page(
         "A network was trained for its camera. White square: the detail in the corner, three times as large. "
         f"Masks against no masks: {verdict_in_words(results, scene)}.",
     ]
-    page = BytesIO()
     subtitle = "One scene, the same exposure time, the same light: from the capture to an image in focus everywhere"
-    draw_comparison(rows, TITLE, subtitle, notes).savefig(page, dpi=DOTS_PER_INCH)
-    return page.getvalue()
+    return encoded_figure(draw_comparison(rows, TITLE, subtitle, notes), DOTS_PER_INCH)
 
 
 def _panels(

@@ -75,9 +75,9 @@ def measures_of_psfs(optics: TiDyOptics, defocus: Tensor) -> PSFMeasures:
         defocus: (D,) radians, ascending.
 
     Example:
-        >>> measured = measures_of_psfs(TiDyOptics(fidelity="draft"), torch.tensor([-20.0, 0.0]))
+        >>> measured = measures_of_psfs(TiDyOptics(fidelity="draft"), torch.tensor([0.0, 20.0]))
         >>> measured.depths, measured.psfs.shape[:2]
-        (('0.595 m', 'inf'), torch.Size([2, 3]))
+        (('0.298 m', '0.595 m'), torch.Size([2, 3]))
     """
     psfs = optics.psf_bank(defocus=defocus.tolist()).psfs.flip(0)  # nearest first
     focus = torch.linspace(*optics.camera.defocus_range, SLICES, dtype=torch.float64)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.figures.depth import draw_depth
-from kornia_tidy.files import write_bytes
+from kornia_tidy.figures.style import save_figure
 from kornia_tidy.inference.capture_file import CaptureLight
 from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
 from kornia_tidy.inference.tasks import MAPS
 
-PREVIEW_DPI = 150
 SMALLEST_DEVIATION = 1e-9  # m
 
 
@@ -66,9 +64,7 @@ def write_reconstruction(
     for path in paths:
         if path.name.endswith("_depth_colors.png"):
             assert depth is not None
-            drawn = BytesIO()
-            draw_depth(depth, head.camera, unknown).savefig(drawn, format="png", dpi=PREVIEW_DPI)
-            write_bytes(path, drawn.getvalue())
+            save_figure(path, draw_depth(depth, head.camera, unknown))
         elif path.stem.endswith("_depth") and depth is not None:
             write_depth(path, depth, depth_unit if path.suffix == ".png" else 1.0, saturate=True)
         elif path.stem.endswith("_deviation"):

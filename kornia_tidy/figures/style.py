@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kornia_tidy.files import write_bytes
 from kornia_tidy.runtime.search_path import import_installed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, FAINT, ACCENT = "#1c2733", "#66727f", "#c2410c"
 DEPTH_COLORS, PHASE_COLORS = "inferno", "twilight"
@@ -25,6 +30,18 @@ def require_matplotlib() -> None:
         import_installed("matplotlib.figure")
     except ImportError:
         raise ImportError("pictures need matplotlib: pip install 'kornia-tidy[plot]'") from None
+
+
+def encoded_figure(figure: Figure, dpi: float = 150, format: str = "png") -> bytes:  # noqa: A002 (as matplotlib has it)
+    """Return a figure as the bytes of a picture file."""
+    picture = BytesIO()
+    figure.savefig(picture, dpi=dpi, format=format)
+    return picture.getvalue()
+
+
+def save_figure(path: str | os.PathLike[str], figure: Figure, dpi: float = 150) -> None:
+    """Write a figure atomically, in the format of the path's suffix."""
+    write_bytes(path, encoded_figure(figure, dpi, Path(path).suffix[1:]))
 
 
 def quiet(axes: Axes, spines: bool = True) -> None:

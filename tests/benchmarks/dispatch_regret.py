@@ -25,11 +25,11 @@ from unittest import mock
 
 import torch
 
-from kornia_tidy.commands.info import _processor_name
 from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.render.backends import compiled
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
 from kornia_tidy.render.scene import LayeredScene, layered_scene
+from kornia_tidy.tradeoff.conditions import device_name
 
 GOOD, BAD = 1.15, 2.0
 WINDOWS, LAYERS, SIDES = (5, 9, 15, 23, 33, 41, 65, 97, 129), (1, 3, 8, 21), (256, 512, 1024, 2048)
@@ -137,7 +137,7 @@ def time_once(scene: LayeredScene, method: str) -> float:
 def report(results: list[Result]) -> Iterator[str]:
     regrets = [result.regret for result in results]
     yield ""
-    yield f"{_processor_name()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
+    yield f"{device_name(torch.device('cpu'))}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     yield f"| scenes | <= {GOOD} | <= {BAD} | geometric mean | worst |"
     yield "| --- | ---: | ---: | ---: | ---: |"
     for kind in ("gather", "scatter", "occlusion", None):

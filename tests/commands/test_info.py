@@ -38,7 +38,7 @@ class TestInfo(BaseTester):
     def test_smoke(self, capsys):
         topics = self.told(capsys)
         assert f"torch {torch.__version__.split('+', maxsplit=1)[0]}" in topics["uses"][0]
-        assert f"{os.cpu_count()} cores" in topics["processor"][0]
+        assert f"{os.cpu_count()} CPUs" in topics["processor"][0]
         assert len(topics["kernel"]) == 2 * len(info.SOURCES)
 
     @pytest.mark.skipif(compiled.build(gather_ops.SOURCE, torch.float32).library is None, reason="no C compiler")

@@ -27,8 +27,8 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from kornia_tidy.commands.info import _processor_name
 from kornia_tidy.files import write_bytes
+from kornia_tidy.tradeoff.conditions import device_name
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, sensor_of
 from tests.benchmarks.results.figure import draw_results
 from tests.benchmarks.results.measure import Measurement
@@ -145,7 +145,7 @@ def _provenance() -> Provenance:
     done = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False, cwd=here
     )
-    processor, cpuinfo = _processor_name(), Path("/proc/cpuinfo")
+    processor, cpuinfo = device_name(torch.device("cpu")), Path("/proc/cpuinfo")
     virtual = ", virtual machine" if cpuinfo.is_file() and "hypervisor" in cpuinfo.read_text() else ""
     threads = torch.get_num_threads()
     words = f"{os.cpu_count()} cores of {processor}{virtual}, {threads} thread{'s' * (threads > 1)}"
