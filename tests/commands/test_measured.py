@@ -30,7 +30,7 @@ from tests.measured import HEIGHTS, measured_noise, measured_psfs, sweep, write_
 PSFS, NOISE = ["--psfs", "bank.safetensors"], ["--noise", "noise.json"]
 MEASURED = [*PSFS, *NOISE]
 AT_ONE_METRE = ["--distances", "1", "-o", "b.safetensors"]
-LENS = {"depth_range": (0.4, 2.5), "f_number": 50e-3 / 2.835e-3, "focus": 0.595}
+LENS = {"depth_range": (0.4, 2.5), "f_number": 50e-3 / 2.835e-3, "focus_distance": 0.595}
 SCENE = ["--depth", "depth.png", "--depth-scale", "0.001"]
 
 

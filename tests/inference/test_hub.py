@@ -19,7 +19,7 @@ from tests.base import BaseTester
 
 SETTINGS = SystemSettings(
     task="joint", masks=2, head="plain", width=4, window=9, fidelity="draft", depth_range=(0.5, math.inf), sigma=0.003,
-    focus=math.inf,
+    focus_distance=math.inf,
 )  # fmt: skip
 RECORD = {"scores": {"test scenes": {"image_psnr": 21.5, "depth_rmse": math.nan}}, "minutes": 3}
 

@@ -53,11 +53,11 @@ class TestDesignedSettings(BaseTester):
     def test_feature_a_recommended_lens_has_no_masks(self, tmp_path):
         settings = designed_settings(folder_of_design(tmp_path / "a", -0.5))
         assert (settings["masks"], settings["start"], settings["f_number"]) == (1, "flat", 41.0)
-        assert settings["focus"] == pytest.approx(1 / (0.25 + 0.3 * 1.75))
+        assert settings["focus_distance"] == pytest.approx(1 / (0.25 + 0.3 * 1.75))
 
     def test_feature_a_focus_at_infinity(self, tmp_path):
         folder = folder_of_design(tmp_path / "a", 1.5, DesignTask(masks=2))
-        assert designed_settings(folder)["focus"] == math.inf
+        assert designed_settings(folder)["focus_distance"] == math.inf
         assert designed_settings(folder)["depth_range"] == (0.2975, math.inf)
 
     def test_exception_a_modulator_that_trained_systems_do_not_have(self, tmp_path):

