@@ -191,7 +191,11 @@ class TestTasks(BaseTester):
 class TestSettings(BaseTester):
     def test_feature_json_brings_back_what_was_written(self, tmp_path):
         settings = TrainingSettings(
-            task="joint", depth_range=(0.5, float("inf")), f_number=48.0, focus_distance=float("inf"), electrons=(500.0, 57e3)
+            task="joint",
+            depth_range=(0.5, float("inf")),
+            f_number=48.0,
+            focus_distance=float("inf"),
+            electrons=(500.0, 57e3),
         )
         settings.write(tmp_path / "a.json")
         assert TrainingSettings.read(tmp_path / "a.json") == settings
