@@ -185,7 +185,7 @@ class TestCaptures(BaseTester):
             (["raw", "simulate", "--image", "scene.png", "-o", "a.dng"], "--image and --depth go together"),
             (["raw", "simulate", "--points", "2", "-o", "a.dng"], "--points and --distance go together"),
             (["raw", "simulate", "--flat", "0", *SCENE, "-o", "a.dng"], "--image and --depth go together"),
-            (["raw", "simulate", "--flat", "2", "-o", "a.dng"], "--flat must be from 0 to 1"),
+            (["raw", "simulate", "--flat", "2", "-o", "a.dng"], "--flat must be a number from 0 to 1"),
             (["raw", "simulate", "--image", "scene.png", *SCENE, "--size", "9x9", "-o", "a.dng"], "--size is of"),
             (["raw", "simulate", "--points", "1", "--distance", "1", *MEASURED, "-o", "a.dng"], "between pixels"),
             (["raw", "simulate", "--flat", "0", "--like", "iso100.dng", *NOISE, "-o", "a.dng"], "at ISO 800"),
