@@ -130,7 +130,7 @@ class TestMistakes(BaseTester):
         ("argv", "sentence"),
         [
             ([], "the following arguments are required: COMMAND; see kornia-tidy --help"),
-            (["trian"], "there is no command trian (did you mean train?); see kornia-tidy --help"),
+            (["trainn"], "there is no command trainn (did you mean train?); see kornia-tidy --help"),
             (["raw", "simulat"], "there is no command simulat (did you mean simulate?); see kornia-tidy raw --help"),
             (
                 ["train", "--task", "depht"],
