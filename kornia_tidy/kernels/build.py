@@ -42,7 +42,7 @@ from kornia_tidy.kernels.processor import levels_here, processor_features
 REALS = {torch.float32: "float", torch.float64: "double"}
 KERNELS = Path(__file__).parent  # the folder of the C sources
 SHARED = KERNELS / "vectors.h"  # what sources include
-FLAGS = ("-O3", "-std=gnu11", "-ffp-contract=fast", "-fPIC", "-shared", f"-I{SHARED.parent}")
+FLAGS = ("-O3", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", f"-I{SHARED.parent}")
 NATIVE = {"x86_64": "-march=native", "AMD64": "-march=native"}
 LIBRARIES = "libraries"  # the folder beside the sources that a wheel has
 NO_LIBRARIES = "the wheel that `make wheel` makes in a checkout needs no compiler"

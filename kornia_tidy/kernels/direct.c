@@ -20,7 +20,6 @@ enum { ROW_CHUNK = 4 };  // rows of light that are summed separately
 enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
 enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share one sum
 
-typedef REAL loose __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(REAL)), may_alias));
 
 // The fields of `_Scene` in gather_ops.py. Strides count elements; widths and heights are those of the output.
 typedef struct {

@@ -10,37 +10,7 @@
 
 #include "vectors.h"
 
-enum { SINGLE = sizeof(REAL) == 4, FRACTION = SINGLE ? 23 : 52, BIAS = SINGLE ? 127 : 1023 };
 enum { CORRECTIONS = SINGLE ? 1 : 2, BLOCK = 4096 };
-
-typedef __typeof__(__builtin_choose_expr(SINGLE, (int32_t)0, (int64_t)0)) lane;
-typedef lane bits __attribute__((vector_size(VECTOR_BYTES)));
-typedef vec loose __attribute__((aligned(1), may_alias));
-
-INLINE vec all(REAL x) { return x - (vec){0}; }
-
-INLINE bits bits_of(vec x) {
-    bits same;
-    memcpy(&same, &x, sizeof same);
-    return same;
-}
-
-INLINE vec real_of(bits x) {
-    vec same;
-    memcpy(&same, &x, sizeof same);
-    return same;
-}
-
-INLINE vec select(bits condition, vec yes, vec no) {
-    return real_of((bits_of(yes) & condition) | (bits_of(no) & ~condition));
-}
-
-INLINE vec polynomial(const REAL *coefficients, int degree, vec x) {
-    vec sum = all(coefficients[degree]);
-#pragma GCC unroll 4
-    for (int n = degree - 1; n >= 0; n--) sum = sum * x + coefficients[n];
-    return sum;
-}
 
 // log2(1.5 + x) and exp2(x) for |x| <= 1/2, through Chebyshev's points.
 static const REAL LOG2[] = {0.5849625, 0.96097399, -0.32013948, 0.15538812, -0.07844068};
@@ -61,31 +31,31 @@ INLINE vec decode(vec x, int slope) {
     const double scale = 1 / 1.055;
     const REAL high = scale, low = scale - high, linear = 12.92, joint = 0.04045;
     const vec most = all(SINGLE ? 0x1p100 : 0x1p850);  // what is below overflows for more, and no sooner
-    vec bounded = select(x < most, x, most), y = bounded * high + (bounded * low + (REAL)(0.055 * scale));
+    vec bounded = choose(x < most, x, most), y = bounded * high + (bounded * low + (REAL)(0.055 * scale));
     vec u = rough_power(y, -0.6), root;
     for (int n = 0; n < CORRECTIONS; n++) {
         root = u * y;
         vec lack = 1 - root * root * root * (u * u), correction = lack * ((REAL)0.2 + (REAL)0.12 * lack);
         u += u * correction, root += root * correction;
     }
-    if (slope) return select(x > joint, (REAL)(2.4 * scale) * y * root, all(1 / linear));
-    return select(x > joint, y * y * root, x / linear);
+    if (slope) return choose(x > joint, (REAL)(2.4 * scale) * y * root, all(1 / linear));
+    return choose(x > joint, y * y * root, x / linear);
 }
 
 // Computes the encoding of sRGB or, with `slope`, its derivative.
 INLINE vec encode(vec x, int slope) {
     const REAL high = 1.055, low = 1.055 - high, linear = 12.92, joint = 0.0031308;
     const vec most = all(SINGLE ? FLT_MAX : DBL_MAX);
-    vec bounded = select(x < most, x, most), u = rough_power(bounded, (REAL)(-7. / 12)), root, correction;
+    vec bounded = choose(x < most, x, most), u = rough_power(bounded, (REAL)(-7. / 12)), root, correction;
     for (int n = 0; n < CORRECTIONS; n++) {
         root = u * bounded;
         vec sixth = u * root, half = sixth * sixth * sixth, lack = 1 - half * bounded * half;
         correction = lack * ((REAL)(1. / 12) + (REAL)(13. / 288) * lack);
         u += u * correction;
     }
-    if (slope) return select(x > joint, (REAL)(1.055 * 5 / 12) * u, all(linear));
+    if (slope) return choose(x > joint, (REAL)(1.055 * 5 / 12) * u, all(linear));
     vec rest = root * (low + high * correction) - (REAL)0.055 + (x - bounded);  // the last: infinity stays
-    return select(x > joint, root * high + rest, linear * x);
+    return choose(x > joint, root * high + rest, linear * x);
 }
 
 INLINE vec curve(vec x, int encoding, int slope) { return encoding ? encode(x, slope) : decode(x, slope); }

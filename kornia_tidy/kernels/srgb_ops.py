@@ -14,7 +14,6 @@ Source: IEC 61966-2-1.
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import torch
@@ -22,6 +21,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
+from kornia_tidy.kernels.elementwise import call_elementwise
 from kornia_tidy.runtime.mode import Mode, torch_mode
 
 SOURCE = KERNELS / "srgb.c"
@@ -79,26 +79,13 @@ def _by_torch(image: Tensor, encode: bool) -> Tensor:
 
 
 def _srgb(image: Tensor, encode: bool) -> Tensor:
-    return _call(_new(image), image, None, encode)
+    out = _new(image)
+    return call_elementwise(load(SOURCE, out.dtype).convert, out, (image, None), encode)
 
 
 def _srgb_gradient(image: Tensor, gradient: Tensor, encode: bool) -> Tensor:
-    return _call(_new(image, gradient), image, gradient, encode)
-
-
-def _call(out: Tensor, image: Tensor, gradient: Tensor | None, encode: bool) -> Tensor:
-    given = [None if x is None else _in_order(x, out) for x in (image, gradient)]
-    load(SOURCE, out.dtype).convert(
-        *(ctypes.c_void_p(None if x is None else x.data_ptr()) for x in (*given, out)),
-        *map(ctypes.c_int64, (out.numel(), encode, torch.get_num_threads())),
-    )
-    return out
-
-
-def _in_order(x: Tensor, out: Tensor) -> Tensor:
-    """Return numbers that lie in memory as those of a dense tensor do."""
-    x = x.resolve_neg()
-    return x if x.stride() == out.stride() else torch.empty_like(out).copy_(x)
+    out = _new(image, gradient)
+    return call_elementwise(load(SOURCE, out.dtype).convert, out, (image, gradient), encode)
 
 
 def _new(image: Tensor, gradient: Tensor | None = None) -> Tensor:

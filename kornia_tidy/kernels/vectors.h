@@ -19,12 +19,42 @@
 enum { LANES = VECTOR_BYTES / sizeof(REAL) };
 enum { REGISTERS = VECTOR_BYTES == 64 ? 32 : 16 };  // for vectors
 
+enum { SINGLE = sizeof(REAL) == 4, FRACTION = SINGLE ? 23 : 52, BIAS = SINGLE ? 127 : 1023 };  // of a number's bits
+
+typedef __typeof__(__builtin_choose_expr(SINGLE, (int32_t)0, (int64_t)0)) lane;
 typedef REAL vec __attribute__((vector_size(VECTOR_BYTES)));
+typedef lane bits __attribute__((vector_size(VECTOR_BYTES)));
+typedef vec loose __attribute__((aligned(1), may_alias));
 
 // For callers that want to know.
 const int64_t vector_bytes = VECTOR_BYTES;
 
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
+
+INLINE vec all(REAL x) { return x - (vec){0}; }
+
+INLINE bits bits_of(vec x) {
+    bits same;
+    memcpy(&same, &x, sizeof same);
+    return same;
+}
+
+INLINE vec real_of(bits x) {
+    vec same;
+    memcpy(&same, &x, sizeof same);
+    return same;
+}
+
+INLINE vec choose(bits condition, vec yes, vec no) {
+    return real_of((bits_of(yes) & condition) | (bits_of(no) & ~condition));
+}
+
+INLINE vec polynomial(const REAL *coefficients, int degree, vec x) {
+    vec sum = all(coefficients[degree]);
+#pragma GCC unroll 4
+    for (int n = degree - 1; n >= 0; n--) sum = sum * x + coefficients[n];
+    return sum;
+}
 
 INLINE REAL sum_of(vec lanes) {
     typedef REAL quarter __attribute__((vector_size(16)));

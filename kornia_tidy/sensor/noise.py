@@ -9,40 +9,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_number, check_positive
 from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at
-from kornia_tidy.sensor.shot import shot_noise
-
-
-def quantize(image: Tensor, bits: int) -> Tensor:
-    r"""Quantise values to the levels of an analogue-to-digital converter.
-
-    .. math:: q(x) = \mathrm{round}\left( x \, (2^b - 1) \right) / (2^b - 1)
-
-    Args:
-        image: values, any shape; 1.0 is the highest level.
-        bits: bits b of the converter, 1 to 16.
-
-    Returns:
-        Rounded values, same shape and dtype. [0, 1] has the levels 0 to 2^b - 1. Values outside are rounded in the same
-        steps and not clipped.
-
-    Raises:
-        TypeError: if ``image`` is not a floating-point tensor.
-        ValueError: if ``bits`` is not a whole number from 1 to 16.
-
-    Convention:
-        - The gradient is a straight-through estimate: dq/dx = 1 everywhere.
-
-    Example:
-        >>> quantize(torch.tensor([0.0, 0.2, 0.6, 1.0, 1.2]), bits=2) * 3
-        tensor([0., 1., 2., 3., 4.])
-    """
-    check_float_tensor("image", image, image.ndim, "")
-    _check_bits(bits)
-    value = image.to(torch.promote_types(image.dtype, torch.float32))
-    top = 2**bits - 1
-    rounded = (value.detach() * top).round() / top
-    return (rounded + (value - value.detach())).to(image.dtype)  # adds 0, and a gradient of 1
-
+from kornia_tidy.sensor.recording import check_bits, record
 
 STRIP = 64  # rows of noise drawn in one call
 
@@ -117,7 +84,7 @@ class SensorNoise(nn.Module):
         elif dark:
             raise ValueError(f"dark needs full_well, the number of electrons at full scale, got dark = {dark} alone")
         if bits is not None:
-            _check_bits(bits)
+            check_bits(bits)
         self.sigma, self.full_well, self.dark, self.bits, self.clip = sigma, full_well, dark, bits, clip
         for name, plane in (("response", response), ("offset", offset)):
             check_pattern(name, plane)
@@ -182,20 +149,18 @@ class SensorNoise(nn.Module):
             fields = {name: self._field(params, name, value) for name in self._field_names()}
         if self.response is not None:
             value = value * pattern_at("response", self.response, value, origin)
-        if self.full_well is not None:
-            electrons = shot_noise(value.clamp(min=0) * self.full_well + self.dark, fields["shot"])
-            if self.clip:
-                electrons = electrons.clamp(max=self.full_well)
-            value = (electrons - self.dark) / self.full_well
-        if self.sigma > 0:
-            value = value + self.sigma * fields["read"]
-        if self.offset is not None:
-            value = value + pattern_at("offset", self.offset, value, origin)
-        if self.bits is not None:
-            value = quantize(value, self.bits)
-        if self.clip:
-            value = value.clamp(0, 1)
-        return value.to(image.dtype)
+        offset = self.offset if self.offset is None else pattern_at("offset", self.offset, value, origin)
+        return record(
+            value,
+            fields.get("shot"),
+            fields.get("read"),
+            None if offset is None else offset.expand_as(value),
+            1.0 if self.full_well is None else self.full_well,
+            self.dark,
+            self.sigma,
+            self.bits,
+            self.clip,
+        ).to(image.dtype)
 
     def std(self, image: Tensor) -> Tensor:
         r"""Return the standard deviation of the noise in each pixel, before the clip; a fixed pattern is none.
@@ -296,11 +261,6 @@ class SensorNoise(nn.Module):
         words += [f"pixels with {' and '.join(pattern)} of their own"] if pattern else []
         words += ["clipped to [0, 1]" if self.clip else "not clipped"]
         return ", ".join(words)
-
-
-def _check_bits(bits: int) -> None:
-    if not isinstance(bits, int) or not 1 <= bits <= 16:
-        raise ValueError(f"bits must be a whole number from 1 to 16, got {bits}")
 
 
 def _check_not_negative(name: str, value: float, unit: str) -> None:

@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_values
 from kornia_tidy.runtime.precision import widest
 
 # Expected electrons from which a Gaussian replaces the Poisson distribution. Its mean and variance are exact; its skew
@@ -18,52 +17,19 @@ GAUSSIAN_FROM = 25.0
 _MAX_COUNT = 80  # P(more than 72 | 25 expected) is 7e-15, the tail that poisson_quantile neglects
 
 
-def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
-    r"""Draw shot noise by inversion: the quantile of the Poisson distribution at a uniform random number.
-
-    .. math::
-        k = \begin{cases}
-            \min\{k : P(X \le k) \ge u\}, \; X \sim \mathrm{Poisson}(\lambda) & \lambda < 25 \\
-            \max(0, \lambda + \sqrt{\lambda} \, \Phi^{-1}(u)) & \lambda \ge 25
-        \end{cases}
+def drawn_electrons(rate: Tensor, uniform: Tensor) -> Tensor:
+    """Return the electrons of :func:`~kornia_tidy.sensor.recording.shot_noise`, by plain operations of torch.
 
     Args:
-        electrons: expected electrons λ, any shape. Negative values (FFT round-off) count as zero.
-        uniform: uniform random numbers u in [0, 1], same shape; the same u gives the same draw.
-
-    Returns:
-        Electrons, same shape and dtype as ``electrons``, computed in float32 or wider, never negative. Below λ = 25
-        they are whole numbers; from 25 on they are not rounded. λ = 0 gives exactly 0.
-
-    Raises:
-        ValueError: if the two shapes differ.
-
-    Convention:
-        - The gradient below 25 is a straight-through estimate: dk/dλ = 1, the derivative of the mean.
-        - The gradient from 25 on is that of the formula, 1 + Φ⁻¹(u) / (2 √λ). It is zero for λ < 0 and where the draw
-          is clamped at 0.
-        - A pixel below 25 costs as many terms as the largest count drawn, in all under a microsecond of a CPU core. A
-          pixel above costs a tenth of that.
-
-    Source: inversion by sequential search, Devroye, Non-Uniform Random Variate Generation (1986), III.2.
-
-    Example:
-        >>> shot_noise(torch.tensor([0.0, 2.0, 2.0, 900.0]), torch.tensor([0.9, 0.1, 0.9, 0.5]))
-        tensor([  0.,   0.,   4., 900.])
+        rate: expected electrons, not negative, float32 or float64, any shape.
+        uniform: uniform random numbers, same shape and dtype.
     """
-    check_values("electrons", electrons)
-    if uniform.shape != electrons.shape:
-        raise ValueError(
-            f"uniform must have the shape of electrons, {tuple(electrons.shape)}, got {tuple(uniform.shape)}"
-        )
-    rate = electrons.to(torch.promote_types(electrons.dtype, torch.float32)).clamp(min=0)
-    uniform = uniform.to(rate.dtype)
     dim = rate < GAUSSIAN_FROM
     draw = _dim_counts_operator if torch.compiler.is_compiling() else _dim_counts
     counted = draw(rate.detach(), uniform.detach()) + (rate - rate.detach())  # adds 0, and a gradient of 1
     bright = torch.where(dim, GAUSSIAN_FROM, rate)  # the square root has an infinite derivative at zero
     gaussian = (bright + bright.sqrt() * _normal_quantile(uniform)).clamp(min=0)
-    return torch.where(dim, counted, gaussian).to(electrons.dtype)
+    return torch.where(dim, counted, gaussian)
 
 
 def poisson_quantile(rate: Tensor, uniform: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from scipy import stats
 from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
@@ -324,7 +325,14 @@ def srgb_by_definition(image: Tensor, encode: bool) -> Tensor:
 
 def _colours(draw: random.Random) -> tuple[Tensor, bool, str]:
     """An image in any order of memory, mostly of [0, 1], whether it is to be encoded, and all this in words."""
-    dtype, encode = draw.choice(DTYPES), draw.random() < 0.5
+    image, about = _light(draw)
+    encode = draw.random() < 0.5
+    return image, encode, f"{about} encode {encode}"
+
+
+def _light(draw: random.Random) -> tuple[Tensor, str]:
+    """An image in any order of memory, mostly of [0, 1], and what it is in words."""
+    dtype = draw.choice(DTYPES)
     shape = *(draw.randint(2, 9) for _ in range(draw.randint(0, 2))), draw.choice((1, 2, 15, 16, 17, 40, 999))
     image = 2 * torch.rand(shape, dtype=dtype) ** 3 * draw.choice((1, 1, 1, 40)) - draw.choice((0, 0.1))
     memory = draw.choice(("dense", "turned", "cut out", "shared"))
@@ -334,7 +342,113 @@ def _colours(draw: random.Random) -> tuple[Tensor, bool, str]:
         image = torch.nn.functional.pad(image, (1, 2))[..., 1:-2]
     elif memory == "shared":
         image = image[..., :1].expand(shape)
-    return image, encode, f"{dtype} {shape} {memory} encode {encode}"
+    return image, f"{dtype} {shape} {memory}"
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """What a sensor makes of light.
+
+    Args:
+        values: recorded, in float64.
+        off: how far round-off may move them; infinity where it may change a count of electrons.
+        slope: derivative to the light.
+        torn: where round-off may change the derivative: beside a step of the converter, and where values are clipped.
+    """
+
+    values: Tensor
+    off: Tensor
+    slope: Tensor
+    torn: Tensor
+
+
+def sensor(draw: random.Random) -> Call:
+    """``record`` of sensor.c."""
+    arguments, about = _sensed(draw)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        recorded = _recorded(*arguments)
+        return recorded.values, recorded.off
+
+    return Call(about, "record", arguments, arguments[0].numel(), truth)
+
+
+def sensor_gradient(draw: random.Random) -> Call:
+    """``record`` of sensor.c with a gradient."""
+    arguments, about = _sensed(draw)
+    light, *rest = arguments
+    gradient = torch.randn_like(light)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        recorded = _recorded(*arguments)
+        expected = recorded.slope * gradient.double()
+        off = gamma(32, light.dtype) * (1 + recorded.slope.abs()) * gradient.double().abs()
+        return expected, torch.where(recorded.torn, torch.inf, off)
+
+    return Call(about, "record_gradient", (light, gradient, *rest), light.numel(), truth)
+
+
+def _sensed(draw: random.Random) -> tuple[tuple[Any, ...], str]:
+    """The arguments of ``record``, and what they are in words."""
+    light, about = _light(draw)
+    fields = [
+        random_field(light.shape, dtype=light.dtype) if draw.random() < 0.6 else None
+        for random_field in (torch.rand, torch.randn, torch.randn)
+    ]
+    fields[2] = None if fields[2] is None else 0.1 * fields[2]
+    well, sigma = draw.choice((1.0, 40.0, 1e4)), draw.choice((0.01, 0.3))
+    numbers = well, draw.choice((0.0, 0.3)) * well, sigma, draw.choice((0, 0, 1, 8, 12)), draw.random() < 0.5
+    kinds = [name for name, field in zip(("shot", "read", "offset"), fields, strict=True) if field is not None]
+    return (light, *fields, *numbers), f"{about} {kinds} {numbers}"
+
+
+def _recorded(
+    light: Tensor,
+    shot: Tensor | None,
+    read: Tensor | None,
+    offset: Tensor | None,
+    well: float,
+    dark: float,
+    sigma: float,
+    bits: int,
+    clip: bool,
+) -> _Recorded:
+    """The formulas of ``recording.py`` by SciPy's distributions; the rate is rounded as that of the sensor is."""
+    share, eps = gamma(24, light.dtype), torch.finfo(light.dtype).eps
+    value, slope, torn = light.double(), torch.ones_like(light).double(), torch.zeros_like(light, dtype=torch.bool)
+    off = torch.zeros_like(value)
+    if shot is not None:
+        rate = (light.clamp(min=0) * well + dark).double()
+        u, dim = shot.double(), rate < 25
+        counts = torch.from_numpy(stats.poisson.ppf(u.clamp(max=1 - 2**-47).numpy(), rate.numpy())).clamp(min=0)
+        beside = [(torch.from_numpy(stats.poisson.cdf(counts.numpy() - n, rate.numpy())) - u).abs() for n in (0, 1)]
+        unsure = dim & (torch.minimum(*beside) < 1e-12)
+        quantile = torch.from_numpy(stats.norm.ppf(u.clamp(eps / 4, 1 - eps / 2).numpy()))
+        drawn = rate + rate.sqrt() * quantile
+        electrons = torch.where(dim, counts, drawn.clamp(min=0))
+        off = torch.where(dim, 0, share * (rate + rate.sqrt() * quantile.abs()))
+        slope = torch.where(dim, 1, torch.where(drawn >= 0, 1 + quantile / (2 * rate.clamp(min=25).sqrt()), 0))
+        slope = torch.where(light >= 0, slope, 0)
+        torn = unsure | (~dim & (drawn.abs() <= off))
+        if clip:
+            torn = torn | ((electrons - well).abs() <= off) & ~dim
+            slope, electrons = torch.where(electrons <= well, slope, 0), electrons.clamp(max=well)
+        value = (electrons - dark) / well
+        off = torch.where(unsure, torch.inf, (off + share * (electrons + dark)) / well)
+    for added in (None if read is None else sigma * read.double(), None if offset is None else offset.double()):
+        if added is not None:
+            value, off = value + added, off + share * (value.abs() + added.abs())
+    if bits:
+        top = 2**bits - 1
+        level, moved = value * top, off * top + share * (value * top).abs()
+        split = ((level - level.floor()) - 0.5).abs() <= moved
+        value = level.round() / top
+        off = share * value.abs() + torch.where(split, 1.0, 0.0) / top
+        torn = torn | split
+    if clip:
+        torn = torn | ((value.abs() <= off) | ((value - 1).abs() <= off)) & (off > 0)
+        slope, value = torch.where((value >= 0) & (value <= 1), slope, 0), value.clamp(0, 1)
+    return _Recorded(value, off + share * value.abs(), slope, torn)
 
 
 def _in_double(case: tuple[Tensor, Tensor, Tensor]) -> list[Tensor]:
@@ -368,6 +482,8 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "mutual_intensity.c: gradient": field_gradient,
     "srgb.c: values": srgb,
     "srgb.c: gradient": srgb_gradient,
+    "sensor.c: values": sensor,
+    "sensor.c: gradient": sensor_gradient,
 }
 
 

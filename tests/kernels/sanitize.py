@@ -74,12 +74,12 @@ def call(shapes: int, seed: int, kernel: str) -> None:
     """Call the kernels and print how often; raises if a value is wrong. Threads are one and two by turns."""
     import torch
 
-    from kornia_tidy.kernels import gather_ops, mutual_intensity_ops, occlusion_ops, overlap_ops, srgb_ops
     from kornia_tidy.kernels.build import compiled
     from tests.kernels.kernel_shapes import CHEAP, DTYPES, KERNELS
+    from tests.kernels.operator_tester import MODULES
 
     chosen = {name: function for name, function in KERNELS.items() if name.startswith(kernel)}
-    for source in (ops.SOURCE for ops in (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, srgb_ops)):
+    for source in (ops.SOURCE for ops in MODULES):
         for dtype in DTYPES if any(name.startswith(source.name) for name in chosen) else ():
             assert compiled(source, dtype) is not None, f"{source.name} was not compiled with: {os.environ['CC']}"
     for name, function in chosen.items():

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from kornia_tidy.sensor.noise import SensorNoise, quantize
+from kornia_tidy.sensor import SensorNoise, quantize
 from tests.base import BaseTester
 
 needs_more_than_half = pytest.mark.parametrize("wide", [torch.float32, torch.float64], ids=str)

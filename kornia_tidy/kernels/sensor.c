@@ -1,0 +1,192 @@
+// What a sensor records of light, with its derivative. The formulas are in sensor/recording.py and sensor/shot.py.
+//
+// Counts below 25 electrons are found term by term in double, as float32 would change one in 3e5. Above, the normal
+// quantile is (2 u - 1) G(w) with w = -log(4 u (1 - u)), G a polynomial of w, or of its root beyond 5.
+//
+// Compiled by build.py with REAL as float or double; without fast-math, as NaN stays NaN.
+
+#include <float.h>
+#include <math.h>
+
+#include "vectors.h"
+
+enum { BLOCK = 4096, MOST_COUNTED = 80, WIDE = VECTOR_BYTES / sizeof(double) };
+
+typedef double wide __attribute__((vector_size(VECTOR_BYTES)));
+typedef REAL narrow __attribute__((vector_size(WIDE * sizeof(REAL)), may_alias));
+typedef int64_t wide_bits __attribute__((vector_size(VECTOR_BYTES)));
+
+typedef struct {
+    REAL full_well, dark, sigma, top;  // top: of the converter's levels, 0 for none
+    int clip;
+} sensor;
+
+static const REAL CENTRE[] = {2.12331348,     0.348802028,     -0.00590772566, -0.00177162265, 0.000308792663,
+                              -7.03206336e-06, -4.89881495e-06, 6.62037701e-07, 3.30020413e-08, -1.26316508e-08};
+static const REAL TAIL[] = {5.60594723, 1.42802381, 0.00136654142, -0.00101984785, 0.000365878197,
+                            -0.000140019447, 5.05272798e-05, -6.6594985e-06, 1.26468975e-05, -1.74652517e-05,
+                            4.91692618e-06, 1.39590506e-06, -5.92056351e-07};
+
+// Keeps a product from being contracted with a sum, so that it is rounded as without a compiler.
+INLINE vec rounded(vec x) {
+    __asm__("" : "+m"(x));
+    return x;
+}
+
+INLINE vec root(vec x) {
+    REAL lanes[LANES];
+    memcpy(lanes, &x, sizeof x);
+    for (int i = 0; i < LANES; i++) lanes[i] = SINGLE ? sqrtf(lanes[i]) : sqrt(lanes[i]);
+    memcpy(&x, lanes, sizeof x);
+    return x;
+}
+
+INLINE int any(const void *condition) {
+    int64_t words[VECTOR_BYTES / 8], found = 0;
+    memcpy(words, condition, sizeof words);
+    for (int i = 0; i < VECTOR_BYTES / 8; i++) found |= words[i];
+    return found != 0;
+}
+
+INLINE vec bounded(vec x, vec lowest, vec highest) {
+    x = choose(x < lowest, lowest, x);
+    return choose(x > highest, highest, x);
+}
+
+// log(x) of positive normal numbers, by 2 artanh((m - 1) / (m + 1)) of the mantissa m, to 1e-8.
+INLINE vec logarithm(vec x) {
+    const bits half = bits_of(all((REAL)0.70710678));
+    bits exponent = (bits_of(x) - half) >> FRACTION;
+    vec mantissa = real_of(bits_of(x) - (exponent << FRACTION));
+    vec z = (mantissa - 1) / (mantissa + 1), square = z * z;
+    vec series = 1 + square * ((REAL)(1. / 3) + square * ((REAL)0.2 + square * ((REAL)(1. / 7) + square * (REAL)(1. / 9))));
+    return (REAL)0.69314718056 * __builtin_convertvector(exponent, vec) + 2 * z * series;
+}
+
+// The normal quantile of u: Halley's method takes 1e-7 to the precision of double.
+INLINE vec normal_quantile(vec u) {
+    const REAL epsilon = SINGLE ? 0x1p-23 : 0x1p-52;
+    u = bounded(u, all(epsilon / 4), all(1 - epsilon / 2));
+    vec w = -logarithm(4 * u * (1 - u)), gain = polynomial(CENTRE, 9, w - (REAL)2.5);
+    bits rare = w > 5;
+    if (any(&rare)) gain = choose(rare, polynomial(TAIL, 12, root(w) - (REAL)4.12303399), gain);
+    vec quantile = (2 * u - 1) * gain;
+    if (SINGLE) return quantile;
+    for (int i = 0; i < LANES; i++) {
+        const double p = u[i] < 0.5 ? u[i] : 1 - u[i];
+        double q = -fabs(quantile[i]);
+        for (int n = 0; n < 2; n++) {
+            const double off = (0.5 * erfc(-q * M_SQRT1_2) - p) * sqrt(2 * M_PI) * exp(0.5 * q * q);
+            q -= off / (1 + 0.5 * q * off);
+        }
+        quantile[i] = u[i] < 0.5 ? q : -q;
+    }
+    return quantile;
+}
+
+// exp(-x) for x from 0 to 25 in double: the series of what is left below a power of two.
+INLINE wide decayed(wide x) {
+    const double unit = 0x1.8p52;
+    wide power = x * -M_LOG2E + unit, rest = -x - (power - unit) * 0x1.62e42fefap-1 - (power - unit) * 0x1.cf79abc9e3b3ap-40;
+    wide sum = 1 + rest * (1. / 13);
+#pragma GCC unroll 12
+    for (int n = 12; n >= 1; n--) sum = 1 + rest * (1. / n) * sum;
+    wide_bits shift, result;
+    memcpy(&shift, &power, sizeof shift), memcpy(&result, &sum, sizeof result);
+    result += shift << 52;
+    memcpy(&sum, &result, sizeof sum);
+    return sum;
+}
+
+// Counts electrons below 25: the least k with P(X <= k) >= u, zero where the rate is zero.
+INLINE vec counted(vec rate, vec u) {
+    const double most = 1 - 32 * DBL_EPSILON;  // the sum of all terms is not exact to more
+    vec counts;
+    for (int part = 0; part < LANES / WIDE; part++) {
+        narrow rates, uniforms, made;
+        memcpy(&rates, (const narrow *)&rate + part, sizeof rates);
+        memcpy(&uniforms, (const narrow *)&u + part, sizeof uniforms);
+        wide mean = __builtin_convertvector(rates, wide), uniform = __builtin_convertvector(uniforms, wide);
+        uniform += __builtin_convertvector(uniform > most, wide) * (uniform - most);
+        wide term = decayed(mean), below = term, count = {0};
+        for (int k = 1; k <= MOST_COUNTED; k += 4) {
+            wide_bits more = uniform > below;
+            if (!any(&more)) break;
+            for (int own = k; own < k + 4; own++) {
+                count -= __builtin_convertvector(uniform > below, wide);
+                term *= mean * (1. / own);
+                below += term;
+            }
+        }
+        made = __builtin_convertvector(count, narrow);
+        memcpy((narrow *)&counts + part, &made, sizeof made);
+    }
+    return counts;
+}
+
+// Records light x or, with `slope`, computes the derivative.
+INLINE vec recorded(vec x, const REAL *shot, const REAL *read, const REAL *offset, const sensor *s, int slope) {
+    vec derivative = all(1);
+    if (shot) {
+        vec u = *(const loose *)shot, zero = all(0), threshold = all(25), light = choose(x < 0, zero, x);
+        vec rate = rounded(light * s->full_well) + s->dark, electrons = zero, slope_of = all(1);
+        bits dim = rate < threshold, others = ~dim;
+        if (any(&dim)) electrons = counted(choose(dim, rate, zero), u);
+        if (any(&others)) {
+            vec bright = choose(dim, threshold, rate), width = root(bright), quantile = normal_quantile(u);
+            vec drawn = bright + width * quantile;
+            electrons = choose(dim, electrons, choose(drawn < 0, zero, drawn));
+            if (slope) slope_of = choose(dim, slope_of, choose(drawn >= 0, 1 + quantile / (2 * width), zero));
+        }
+        if (slope) derivative = choose(x >= 0, slope_of, zero);
+        if (s->clip) {
+            vec well = all(s->full_well);
+            if (slope) derivative = choose(electrons <= well, derivative, zero);
+            electrons = choose(electrons > well, well, electrons);
+        }
+        x = (electrons - s->dark) / s->full_well;
+    }
+    if (read) x += rounded(s->sigma * *(const loose *)read);
+    if (offset) x += *(const loose *)offset;
+    if (s->top > 0) {
+        const vec whole = all(SINGLE ? 0x1p23 : 0x1p52);  // larger numbers are whole
+        vec level = rounded(x * s->top), size = choose(level < 0, -level, level);
+        vec nearest = rounded(size + whole) - whole;
+        level = choose(size < whole, choose(level < 0, -nearest, nearest), level);
+        x = level / s->top;
+    }
+    if (!s->clip) return slope ? derivative : x;
+    if (slope) return choose((x >= 0) & (x <= 1), derivative, all(0));
+    return bounded(x, all(0), all(1));
+}
+
+INLINE const REAL *at(const REAL *field, int64_t n) { return field ? field + n : 0; }
+
+// A vector of a field whose last `count` numbers are left; zeros behind them.
+INLINE const REAL *padded(const REAL *field, int64_t count, REAL *own) {
+    if (!field) return 0;
+    memset(own, 0, LANES * sizeof(REAL));
+    memcpy(own, field, count * sizeof(REAL));
+    return own;
+}
+
+// Records `count` numbers; with a gradient, multiplies it by the derivative instead. All fields but `x` may be null.
+void record(const REAL *x, const REAL *gradient, const REAL *shot, const REAL *read, const REAL *offset, REAL *out,
+            int64_t count, double full_well, double dark, double sigma, int64_t top, int64_t clip, int64_t threads) {
+    const sensor s = {full_well, dark, sigma, top, clip};
+#pragma omp parallel for num_threads(threads) if (count > 8 * BLOCK)
+    for (int64_t first = 0; first < count; first += BLOCK) {
+        const int64_t end = first + least(BLOCK, count - first);
+        int64_t n = first;
+        for (; n + LANES <= end; n += LANES) {
+            vec made = recorded(*(const loose *)(x + n), at(shot, n), at(read, n), at(offset, n), &s, gradient != 0);
+            *(loose *)(out + n) = gradient ? made * *(const loose *)(gradient + n) : made;
+        }
+        if (n == end) continue;
+        REAL own[4][LANES];
+        vec last = *(const loose *)padded(x + n, end - n, own[0]);
+        last = recorded(last, padded(at(shot, n), end - n, own[1]), padded(at(read, n), end - n, own[2]),
+                        padded(at(offset, n), end - n, own[3]), &s, gradient != 0);
+        for (int64_t i = 0; n + i < end; i++) out[n + i] = gradient ? last[i] * gradient[n + i] : last[i];
+    }
+}
