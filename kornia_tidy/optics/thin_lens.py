@@ -48,7 +48,7 @@ def thin_lens_defocus(depth: Tensor, aperture_radius: float, focus_distance: flo
     focus = _at_least_float32(focus_distance) if isinstance(focus_distance, Tensor) else focus_distance
     wide = depth.to(torch.promote_types(depth.dtype, torch.float32))
     # Infinite depth has an inverse of exactly zero.
-    return (scale * (wide.clamp(min=NEAREST_DEPTH).reciprocal() - 1 / focus)).to(depth.dtype)
+    return (wide.clamp(min=NEAREST_DEPTH).reciprocal_() - 1 / focus).mul_(scale).to(depth.dtype)
 
 
 def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
