@@ -4,8 +4,6 @@ r"""Operator of the energy of many waves by their mutual intensity in C.
 
 The formula and its derivation are in :mod:`kornia_tidy.psf.energies`. The gradient of the field is made in C, too.
 Those of weights and kernels, and gradients of gradients, are made of the waves, one depth at a time.
-
-The operator is defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
 """
 
 from __future__ import annotations
@@ -17,12 +15,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, load
+from kornia_tidy.kernels.operators import define
 
 SOURCE = KERNELS / "mutual_intensity.c"
-
-_WAVES = "Tensor field, Tensor weights, Tensor kernels"
-torch.library.define("kornia_tidy::mutual_intensity_energies", f"({_WAVES}) -> Tensor")
-torch.library.define("kornia_tidy::mutual_field_gradient", f"({_WAVES}, Tensor gradient) -> Tensor")
 
 
 def mutual_intensity_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
@@ -65,15 +60,7 @@ def _new_energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
 
 def _energies(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
     energies = _new_energies(field, weights, kernels)
-    field, weights, kernels = field.contiguous(), weights.contiguous(), kernels.contiguous()
-    depths, window, order, cells = kernels.shape
-    failed = load(SOURCE, energies.dtype).mutual_energies(
-        *(ctypes.c_void_p(x.data_ptr()) for x in (field, weights, kernels, energies)),
-        *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
-    )
-    if failed:
-        raise MemoryError(f"no memory for PSFs of {window}x{window} pixels")
-    return energies
+    return _call("mutual_energies", energies, field, weights, kernels)
 
 
 def _new_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor) -> Tensor:
@@ -82,15 +69,20 @@ def _new_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Ten
 
 def _field_gradient(field: Tensor, weights: Tensor, kernels: Tensor, gradient: Tensor) -> Tensor:
     """Return (K, N, N), summed in the same order every time."""
-    tensors = [x.resolve_conj().contiguous() for x in (field, weights, kernels, gradient)]
+    out = _new_gradient(field, weights, kernels, gradient)
+    return _call("mutual_field_gradient", out, field, weights, kernels, gradient)
+
+
+def _call(function: str, out: Tensor, field: Tensor, weights: Tensor, kernels: Tensor, *gradient: Tensor) -> Tensor:
+    """Call a function of mutual_intensity.c that writes to ``out``, and return it."""
+    given = [x.resolve_conj().contiguous() for x in (field, weights, kernels, *gradient)]
     depths, window, order, cells = kernels.shape
-    out = torch.empty_like(tensors[0])
-    failed = load(SOURCE, weights.dtype).mutual_field_gradient(
-        *(ctypes.c_void_p(x.data_ptr()) for x in (*tensors, out)),
+    failed = getattr(load(SOURCE, weights.dtype), function)(
+        *(ctypes.c_void_p(x.data_ptr()) for x in (*given, out)),
         *map(ctypes.c_int64, (len(field), depths, window, order, cells, torch.get_num_threads())),
     )
     if failed:
-        raise MemoryError(f"no memory for the gradient of PSFs of {window}x{window} pixels")
+        raise MemoryError(f"no memory for PSFs of {window}x{window} pixels")
     return out
 
 
@@ -119,8 +111,6 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return of_field, of_weights, torch.stack(of_kernels).view(kernels.shape)
 
 
-torch.library.impl("kornia_tidy::mutual_intensity_energies", "CPU", _energies)
-torch.library.register_fake("kornia_tidy::mutual_intensity_energies", _new_energies)
-torch.library.register_autograd("kornia_tidy::mutual_intensity_energies", _backward, setup_context=_keep)
-torch.library.impl("kornia_tidy::mutual_field_gradient", "CPU", _field_gradient)
-torch.library.register_fake("kornia_tidy::mutual_field_gradient", _new_gradient)
+_WAVES = "Tensor field, Tensor weights, Tensor kernels"
+define("mutual_intensity_energies", f"({_WAVES}) -> Tensor", _energies, _new_energies, _backward, _keep)
+define("mutual_field_gradient", f"({_WAVES}, Tensor gradient) -> Tensor", _field_gradient, _new_gradient)

@@ -2,20 +2,20 @@
 
 Sums are of positive terms only, so float32 keeps their relative accuracy however small the divisor that they become.
 A second operator makes the gradients of PSFs and stray light. Those of light and layers the renderer makes by tiles.
-
-The operator is defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
 """
 
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import KERNELS, load, vector_bytes
+from kornia_tidy.kernels.operators import Parameters, define
+from kornia_tidy.kernels.scene_checks import check_dtypes, check_light, check_psfs, check_shape, check_smallest
 from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "occlusion.c"
@@ -25,13 +25,6 @@ SMALLEST_SIDE = BLOCK_ROWS - 1  # px, of PSFs; smaller ones are padded to it
 # Operations for each pixel of a block, as many as take as long: to begin and end the sums of a layer, for a column of a
 # PSF that meets a row of light, and for an end of a run of whole weights.
 _BLOCK, _COLUMN, _END = 170, 1, 3
-
-_SCENE = (
-    "Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, Tensor? mean, Tensor? stray_light,"
-    " Tensor? inside"
-)
-torch.library.define("kornia_tidy::occlusion_direct", f"({_SCENE}) -> Tensor")
-torch.library.define("kornia_tidy::occlusion_direct_gradients", f"({_SCENE}, Tensor gradient) -> Tensor[]")
 
 
 def occlusion_direct(
@@ -124,12 +117,11 @@ def count_operations(
         True
     """
     plane = psfs.new_empty(()).expand(batch, 1, *layer_index.shape[1:])
-    scene, kept = _scene(plane, psfs[:, :1], layer_index, layer_weight, None)
+    scene = _parameters(plane, psfs[:, :1], layer_index, layer_weight)
     every = max(1, scene.images * scene.height // (BLOCK_ROWS * bands))
     counts, library = (ctypes.c_int64 * 4)(), load(SOURCE, psfs.dtype)
     if library.count(ctypes.byref(scene), ctypes.c_int64(every), counts):
         raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
-    del kept
     alone, pairs, columns, ends = counts  # blocks of one layer, pairs of another block and a layer, ...
     of_pixel = alone * (2 * scene.side**2 + _BLOCK) + pairs * _BLOCK + columns * _COLUMN + ends * _END
     return float(every * BLOCK_ROWS * vector_bytes(library) // psfs.itemsize * of_pixel)
@@ -145,7 +137,7 @@ def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
     return BLOCK_ROWS, size_step(dtype)
 
 
-class _Scene(ctypes.Structure):
+class _Scene(Parameters):
     """The struct ``scene_parameters`` in occlusion.c."""
 
     _fields_ = (
@@ -156,10 +148,15 @@ class _Scene(ctypes.Structure):
     )
 
 
-def _scene(
-    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, inside: Tensor | None
-) -> tuple[_Scene, list[Tensor]]:
-    """Return the scene for C, and the tensors whose memory it names."""
+def _parameters(
+    plane: Tensor,
+    psfs: Tensor,
+    layer_index: Tensor,
+    layer_weight: Tensor | None,
+    mean: Tensor | None = None,
+    stray_light: Tensor | None = None,
+    inside: Tensor | None = None,
+) -> _Scene:
     index, weight = layer_index.to(plane.dtype), layer_weight
     if weight is not None:  # a pixel with a weight of one lies in the next layer alone
         full = weight == 1
@@ -170,151 +167,77 @@ def _scene(
     if extra[0]:  # no light comes from there
         psfs, plane, index = pad(psfs, extra), pad(plane, extra), pad(index, extra, mode="replicate")
         weight = None if weight is None else pad(weight, extra, mode="replicate")
-    plane, index, columns = (x.contiguous() for x in (plane, index, psfs.flip((-2, -1)).transpose(-2, -1)))
+    side = psfs.shape[-1]
     scene = _Scene(
         images=plane.shape[0],
         channels=plane.shape[1],
-        height=plane.shape[2] - psfs.shape[-1] + 1,
-        width=plane.shape[3] - psfs.shape[-1] + 1,
-        layers=psfs.shape[0],
-        side=psfs.shape[-1],
-        threads=torch.get_num_threads(),
-        plane_image=plane.stride(0),
-        plane_channel=plane.stride(1),
-        plane_row=plane.stride(2),
-        map_image=index.stride(0) if len(index) > 1 else 0,
-        map_row=index.stride(1),
-        plane=plane.data_ptr(),
-        psfs=columns.data_ptr(),
-        index=index.data_ptr(),
+        height=plane.shape[2] - side + 1,
+        width=plane.shape[3] - side + 1,
+        layers=len(psfs),
+        side=side,
+        map_image=index[0].numel() if len(index) > 1 else 0,
+        map_row=index.shape[2],
     )
-    if weight is None:
-        return scene, [plane, index, columns]
-    weight = weight.contiguous()
-    scene.weight = weight.data_ptr()
-    return scene, [plane, index, columns, weight]
+    scene.point_to(plane=plane.contiguous(), psfs=psfs.flip((-2, -1)).mT, index=index, weight=weight)
+    scene.point_to(mean=mean, stray_light=stray_light)
+    return scene
 
 
-def _new_light(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-) -> Tensor:
-    """Check the arguments and return the memory of the result, which is also the fake implementation."""
-    if plane.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"plane must be float32 or float64, got {plane.dtype}")
-    for name, tensor in (("psfs", psfs), ("layer_weight", layer_weight), ("mean", mean), ("stray_light", stray_light)):
-        if tensor is not None and tensor.dtype != plane.dtype:
-            raise TypeError(f"{name} must be of the plane's dtype {plane.dtype}, got {tensor.dtype}")
-    if plane.ndim != 4 or 0 in plane.shape[1:]:
-        raise ValueError(f"plane must have shape (B, C, H + P - 1, W + P - 1), got {tuple(plane.shape)}")
+def _new_light(*scene: Any) -> Tensor:
+    """Check a scene and return the memory of its light, which is also the fake implementation."""
+    plane, psfs, layer_index, layer_weight, mean, stray_light, inside = scene
+    check_light("plane", plane)
+    check_dtypes(plane, layer_weight=layer_weight, mean=mean, stray_light=stray_light)
+    check_psfs(psfs, plane)
     batch, channels, rows, columns = plane.shape
-    if psfs.ndim != 4 or psfs.shape[1] != channels or psfs.shape[2] != psfs.shape[3] or psfs.shape[3] % 2 == 0:
-        raise ValueError(f"psfs must have shape (D, {channels}, P, P) with P odd, got {tuple(psfs.shape)}")
-    height, width = rows - psfs.shape[-1] + 1, columns - psfs.shape[-1] + 1
-    smallest = smallest_output(plane.dtype)
-    if height < smallest[0] or width < smallest[1]:
-        raise ValueError(f"the output must have at least {smallest[0]}x{smallest[1]} pixels, got {height}x{width}")
-    if tuple(layer_index.shape) not in ((batch, rows, columns), (1, rows, columns)):
-        raise ValueError(
-            f"layer_index must have shape {(batch, rows, columns)} or {(1, rows, columns)}, "
-            f"got {tuple(layer_index.shape)}"
-        )
+    light = batch, channels, rows - psfs.shape[-1] + 1, columns - psfs.shape[-1] + 1
+    check_smallest(light, smallest_output(plane.dtype))
+    check_shape("layer_index", layer_index, (batch, rows, columns), (1, rows, columns))
     if (mean is None) != (stray_light is None):
-        raise ValueError(f"stray_light needs a mean and a mean needs stray_light, got only {_one_of(mean)}")
-    for name, tensor, shape in (
-        ("layer_weight", layer_weight, tuple(layer_index.shape)),
-        ("mean", mean, (batch, channels)),
-        ("stray_light", stray_light, (psfs.shape[0], channels)),
-        ("inside", inside, (1, rows, columns)),
-    ):
-        if tensor is not None and tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
-    return plane.new_empty(batch, channels, height, width)
+        only = "stray_light" if mean is None else "mean"
+        raise ValueError(f"stray_light needs a mean and a mean needs stray_light, got only {only}")
+    check_shape("layer_weight", layer_weight, tuple(layer_index.shape))
+    check_shape("mean", mean, (batch, channels))
+    check_shape("stray_light", stray_light, (psfs.shape[0], channels))
+    check_shape("inside", inside, (1, rows, columns))
+    return plane.new_empty(light)
 
 
-def _one_of(mean: Tensor | None) -> str:
-    return "stray_light" if mean is None else "mean"
-
-
-def _occlude(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-) -> Tensor:
-    light = _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
-    scene, kept = _scene(plane, psfs, layer_index, layer_weight, inside)
-    scene.out = light.data_ptr()
-    if mean is not None and stray_light is not None:  # both or none
-        kept += [mean.contiguous(), stray_light.contiguous()]
-        scene.mean, scene.stray_light = (x.data_ptr() for x in kept[-2:])
-    if load(SOURCE, plane.dtype).occlude(ctypes.byref(scene)):
-        raise MemoryError(f"no memory to render with PSFs of {scene.side}x{scene.side} pixels")
-    del kept
+def _occlude(*scene: Any) -> Tensor:
+    light, parameters = _new_light(*scene), _parameters(*scene)
+    parameters.point_to(out=light)
+    if load(SOURCE, light.dtype).occlude(ctypes.byref(parameters)):
+        raise MemoryError(f"no memory to render with PSFs of {parameters.side}x{parameters.side} pixels")
     return light
 
 
-def _new_gradients(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-    gradient: Tensor,
-) -> list[Tensor]:
-    light = _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
-    if gradient.shape != light.shape or gradient.dtype != light.dtype:
-        raise ValueError(
-            f"gradient must be {light.dtype} of shape {tuple(light.shape)}, got {gradient.dtype} of shape "
-            f"{tuple(gradient.shape)}"
-        )
+def _new_gradients(*scene_and_gradient: Any) -> list[Tensor]:
+    *scene, gradient = scene_and_gradient
+    light = _new_light(*scene)
+    check_dtypes(light, gradient=gradient)
+    check_shape("gradient", gradient, tuple(light.shape))
+    psfs, stray_light = scene[1], scene[5]
     return [x.new_empty(x.shape) for x in (psfs, stray_light) if x is not None]
 
 
-def _gradients(
-    plane: Tensor,
-    psfs: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    mean: Tensor | None,
-    stray_light: Tensor | None,
-    inside: Tensor | None,
-    gradient: Tensor,
-) -> list[Tensor]:
-    found = _new_gradients(plane, psfs, layer_index, layer_weight, mean, stray_light, inside, gradient)
-    scene, kept = _scene(plane, psfs, layer_index, layer_weight, inside)
-    columns = psfs.new_empty(*psfs.shape[:2], scene.side, scene.side)
-    kept += [gradient.contiguous(), columns]
-    scene.gradient, scene.psf_gradient = (x.data_ptr() for x in kept[-2:])
-    if mean is not None and stray_light is not None:  # both or none
-        kept += [mean.contiguous(), stray_light.contiguous()]
-        scene.mean, scene.stray_light = (x.data_ptr() for x in kept[-2:])
-        scene.stray_light_gradient = found[1].data_ptr()
-    if load(SOURCE, plane.dtype).occlusion_gradients(ctypes.byref(scene)):
-        raise MemoryError(f"no memory for gradients of PSFs of {scene.side}x{scene.side} pixels")
-    extra, side = (scene.side - psfs.shape[-1]) // 2, psfs.shape[-1]
-    found[0].copy_(columns.mT.flip((-2, -1))[..., extra : extra + side, extra : extra + side])
+def _gradients(*scene_and_gradient: Any) -> list[Tensor]:
+    *scene, gradient = scene_and_gradient
+    found, parameters = _new_gradients(*scene_and_gradient), _parameters(*scene)
+    of_psfs, *of_stray_light = found
+    side, extra = of_psfs.shape[-1], (parameters.side - of_psfs.shape[-1]) // 2
+    columns = of_psfs.new_empty(*of_psfs.shape[:2], parameters.side, parameters.side)
+    parameters.point_to(gradient=gradient, psf_gradient=columns)
+    if of_stray_light:
+        parameters.point_to(stray_light_gradient=of_stray_light[0])
+    if load(SOURCE, columns.dtype).occlusion_gradients(ctypes.byref(parameters)):
+        raise MemoryError(f"no memory for gradients of PSFs of {parameters.side}x{parameters.side} pixels")
+    of_psfs.copy_(columns.mT.flip((-2, -1))[..., extra : extra + side, extra : extra + side])
     return found
 
 
-def _refuse(ctx: Any, gradient: Tensor) -> NoReturn:
-    raise NotImplementedError(
-        "kornia_tidy::occlusion_direct has no gradient: call kornia_tidy.render.occlusion, which makes it by tiles"
-    )
-
-
-torch.library.impl("kornia_tidy::occlusion_direct", "CPU", _occlude)
-torch.library.register_fake("kornia_tidy::occlusion_direct", _new_light)
-torch.library.impl("kornia_tidy::occlusion_direct_gradients", "CPU", _gradients)
-torch.library.register_fake("kornia_tidy::occlusion_direct_gradients", _new_gradients)
-torch.library.register_autograd("kornia_tidy::occlusion_direct", _refuse)
+_SCENE = (
+    "Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, Tensor? mean, Tensor? stray_light,"
+    " Tensor? inside"
+)
+define("occlusion_direct", f"({_SCENE}) -> Tensor", _occlude, _new_light)
+define("occlusion_direct_gradients", f"({_SCENE}, Tensor gradient) -> Tensor[]", _gradients, _new_gradients)

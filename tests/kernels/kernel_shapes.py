@@ -107,7 +107,6 @@ def gather(draw: random.Random) -> Call:
 def correlate(draw: random.Random) -> Call:
     """``correlate`` of direct.c: the gradient of a sum over pixels to the PSFs."""
     scene = _gathered(draw)
-    weight_gradient = scene.fraction is not None and draw.random() < 0.3
     own = torch.randn(len(scene.light), scene.light.shape[1], *scene.lower.shape[-2:], dtype=scene.light.dtype)
     if draw.random() < 0.3:
         own = own.transpose(-2, -1).contiguous().transpose(-2, -1)
@@ -116,18 +115,18 @@ def correlate(draw: random.Random) -> Call:
         sums = []
         for x in (Tensor.double, _magnitudes):
             psfs = x(scene.psfs).requires_grad_()
-            coded = _mixed(x(scene.light), psfs, x(_weights(scene, gradient=weight_gradient)))
+            coded = _mixed(x(scene.light), psfs, x(_weights(scene)))
             sums.append(torch.autograd.grad((coded * x(own)).sum(), psfs)[0])
         return sums[0], 2 * gamma(own.numel() + 4, own.dtype) * sums[1]
 
-    arguments = scene.light, own, scene.lower, scene.fraction, len(scene.psfs), weight_gradient
-    about = f"{scene.about} weight_gradient {weight_gradient}"
-    return Call(about, "gather_direct_psf_gradient", arguments, scene.products, truth)
+    arguments = scene.light, own, scene.lower, scene.fraction, len(scene.psfs)
+    return Call(scene.about, "gather_direct_psf_gradient", arguments, scene.products, truth)
 
 
 def overlap_gather(draw: random.Random) -> Call:
     """``gather`` of overlap.c."""
-    scene, size, correlate, weight_gradient = _overlapping(draw)
+    scene, size, correlate = _overlapping(draw)
+    weight_gradient = scene.fraction is not None and draw.random() < 0.3
 
     def truth() -> tuple[Tensor, float]:
         psfs, weights = scene.psfs.double(), _weights(scene, gradient=weight_gradient)
@@ -141,35 +140,35 @@ def overlap_gather(draw: random.Random) -> Call:
 
 def overlap_scatter(draw: random.Random) -> Call:
     """``scatter`` of overlap.c: the transpose of ``gather``."""
-    scene, size, correlate, weight_gradient = _overlapping(draw)
+    scene, size, correlate = _overlapping(draw)
     pixels = _pixels(draw, scene)
 
     def truth() -> tuple[Tensor, float]:
         light, psfs = scene.light.double().requires_grad_(), scene.psfs.double()
-        weights = _weights(scene, gradient=weight_gradient)
+        weights = _weights(scene)
         coded = _mixed(light, psfs if correlate else psfs.flip((-2, -1)), weights)
         expected = torch.autograd.grad((coded * pixels.double()).sum(), light)[0]
         return expected, 4 * len(psfs) * _transform_error(pixels, scene.psfs, size)  # windows of four tiles overlap
 
-    arguments = pixels, scene.psfs, scene.lower, scene.fraction, size, correlate, weight_gradient
-    about = f"{scene.about} size {size} correlate {correlate} weight_gradient {weight_gradient}"
+    arguments = pixels, scene.psfs, scene.lower, scene.fraction, size, correlate
+    about = f"{scene.about} size {size} correlate {correlate}"
     return Call(about, "scatter_overlap", arguments, scene.products, truth)
 
 
 def overlap_correlate(draw: random.Random) -> Call:
     """``correlate`` of overlap.c: the gradient of a sum over pixels to the PSFs."""
-    scene, size, correlate, weight_gradient = _overlapping(draw)
+    scene, size, correlate = _overlapping(draw)
     pixels = _pixels(draw, scene)
 
     def truth() -> tuple[Tensor, float]:
         psfs = scene.psfs.double().requires_grad_()
         turned = psfs.flip((-2, -1)) if correlate else psfs
-        coded = _mixed(scene.light.double(), turned, _weights(scene, gradient=weight_gradient))
+        coded = _mixed(scene.light.double(), turned, _weights(scene))
         expected = torch.autograd.grad((coded * pixels.double()).sum(), psfs)[0]
         return expected, 2 * _transform_error(scene.light, pixels, size)
 
-    arguments = scene.light, pixels, scene.lower, scene.fraction, len(scene.psfs), size, correlate, weight_gradient
-    about = f"{scene.about} size {size} correlate {correlate} weight_gradient {weight_gradient}"
+    arguments = scene.light, pixels, scene.lower, scene.fraction, len(scene.psfs), size, correlate
+    about = f"{scene.about} size {size} correlate {correlate}"
     return Call(about, "overlap_psf_gradient", arguments, scene.products, truth)
 
 
@@ -520,13 +519,13 @@ def _gathered(draw: random.Random) -> _Scene:
     return _Scene(light, psfs, lower, fraction, about, products)
 
 
-def _overlapping(draw: random.Random) -> tuple[_Scene, int, bool, bool]:
-    """A scene, the side of windows, whether PSFs are flipped, and whether the gradient of weights is meant."""
+def _overlapping(draw: random.Random) -> tuple[_Scene, int, bool]:
+    """A scene, the side of windows, and whether PSFs are flipped."""
     scene = _gathered(draw)
     step, side = size_step(scene.light.dtype), scene.psfs.shape[-1]
     sizes = [n for n in range(step, 400, step) if n >= side and is_window_size(n, scene.light.dtype)]
     size = draw.choice(sizes[: draw.choice((1, 4, len(sizes)))])  # small ones, in which tiles are many, more often
-    return scene, size, draw.random() < 0.5, scene.fraction is not None and draw.random() < 0.3
+    return scene, size, draw.random() < 0.5
 
 
 def _pixels(draw: random.Random, scene: _Scene) -> Tensor:
@@ -569,7 +568,7 @@ def _layers(
     return lower.contiguous(), fraction
 
 
-def _weights(scene: _Scene, *, gradient: bool) -> Tensor:
+def _weights(scene: _Scene, *, gradient: bool = False) -> Tensor:
     """(B, D, H, W) weights of each layer, or their derivatives with respect to the layer weight."""
     layers = len(scene.psfs)
     lower = one_hot(scene.lower, layers + 1).movedim(-1, 1).double()

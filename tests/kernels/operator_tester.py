@@ -87,3 +87,19 @@ class OperatorTester(BaseTester):
     def smallest(self) -> Tensor:
         """Call the operator with valid arguments."""
         raise NotImplementedError
+
+
+class SceneOperatorTester(OperatorTester):
+    """Tests of an operator of a layered scene, which is not differentiated: the renderer is."""
+
+    @needs_compiler
+    def test_exception_it_has_no_gradient(self):
+        call = self.draw(random.Random(0))
+        recorded = [x.detach().requires_grad_() if is_light(x) else x for x in call.arguments]
+        made = call.operator(*recorded)
+        with pytest.raises(NotImplementedError, match=rf"{call.name} has no gradient: differentiate .*\.render"):
+            (made[0] if isinstance(made, list) else made).sum().backward()
+
+
+def is_light(x: object) -> bool:
+    return isinstance(x, Tensor) and x.is_floating_point()

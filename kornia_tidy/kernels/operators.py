@@ -1,0 +1,71 @@
+"""Operators of torch in C: their definition, and the structs that they hand to C.
+
+Operators are defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+
+
+def define(
+    name: str,
+    schema: str,
+    on_processor: Callable[..., Any],
+    fake: Callable[..., Any],
+    backward: Callable[..., Any] | None = None,
+    keep: Callable[..., None] | None = None,
+) -> None:
+    """Define an operator ``kornia_tidy::<name>``.
+
+    Args:
+        name: of the operator.
+        schema: arguments and result, as ``torch.library.define`` takes them.
+        on_processor: the implementation.
+        fake: returns the memory of the result, for tensors without memory too.
+        backward: its gradient, as ``torch.library.register_autograd`` takes it. Without one it refuses to have any.
+        keep: saves what ``backward`` needs.
+    """
+    operator = f"kornia_tidy::{name}"
+
+    def refuse(ctx: Any, *gradients: Any) -> NoReturn:
+        raise NotImplementedError(
+            f"{operator} has no gradient: differentiate functions of kornia_tidy.render or kornia_tidy.psf instead"
+        )
+
+    torch.library.define(operator, schema)
+    torch.library.impl(operator, "CPU", on_processor)
+    torch.library.register_fake(operator, fake)
+    torch.library.register_autograd(operator, backward or refuse, setup_context=keep)
+
+
+class Parameters(ctypes.Structure):
+    """A struct of C. It keeps the tensors whose memory it names. Its field ``threads`` is filled in."""
+
+    def __init__(self, **numbers: int) -> None:
+        super().__init__(threads=torch.get_num_threads(), **numbers)
+        self.kept: list[Tensor] = []
+
+    def point_to(self, **tensors: Tensor | None) -> None:
+        """Write addresses of tensors to the fields of their names, and strides where there are fields for them.
+
+        Strides of ``plane`` are ``plane_image``, ``plane_channel`` and ``plane_row``: pixels of a row lie side by side.
+        Tensors without such fields are contiguous.
+        """
+        fields = {field[0] for field in self._fields_}
+        for name, tensor in tensors.items():
+            if tensor is None:
+                continue
+            strided = f"{name}_row" in fields
+            own = tensor if strided and tensor.stride(-1) == 1 else tensor.contiguous()
+            setattr(self, name, own.data_ptr())
+            self.kept.append(own)
+            if strided:
+                axes = ("image", "channel", "row") if own.ndim == 4 else ("image", "row")
+                for axis, stride in zip(axes, own.stride(), strict=False):
+                    setattr(self, f"{name}_{axis}", stride)
