@@ -221,7 +221,7 @@ def complaint_about(setting: Setting, value: Any) -> str:
     """Return what is wrong with the value of a setting, as the end of a sentence; nothing if it is allowed."""
     if setting.items is not None:
         if not isinstance(value, (tuple, list)) or (setting.items and len(value) != setting.items):
-            return f"must be {setting.items or 'some'} values, got {value!r:.80}"
+            return f"must be {'two' if setting.items == 2 else setting.items or 'some'} values, got {value!r:.80}"
         return next(filter(None, (_complaint(setting, item) for item in value)), "")
     return _complaint(setting, value)
 

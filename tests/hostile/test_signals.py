@@ -187,7 +187,7 @@ class TestStart(BaseTester):
         assert self.started("module", tmp_path, signal.SIGINT, ignored=True) == (7, "")
 
     def test_convention_a_program_that_imports_us_handles_its_own_signals(self, tmp_path):
-        (tmp_path / "mine.py").write_text("import kornia_tidy")
+        (tmp_path / "mine.py").write_text("import kornia_tidy.optics")
         self.write_torch(tmp_path, signal.SIGINT)
         assert self.run(["mine.py"], tmp_path)[0] == 8
 
