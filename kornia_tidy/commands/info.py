@@ -16,8 +16,8 @@ PACKAGES = (
     *("lightning", "matplotlib", "h5py", "OpenEXR"),
 )
 
-
-SOURCES = ("gather_ops", "overlap_ops", "occlusion_ops", "mutual_intensity_ops", "srgb_ops")  # in kornia_tidy.kernels
+# in kornia_tidy.kernels
+SOURCES = ("gather_ops", "overlap_ops", "occlusion_ops", "mutual_intensity_ops", "srgb_ops", "sensor_ops")
 
 
 @dataclass(frozen=True, kw_only=True)

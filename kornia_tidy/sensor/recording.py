@@ -17,16 +17,10 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor, check_values
-from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
-from kornia_tidy.kernels.elementwise import call_elementwise
+from kornia_tidy.kernels.build import REALS, compiled
+from kornia_tidy.kernels.sensor_ops import SOURCE, record_in_c
 from kornia_tidy.runtime.mode import Mode, torch_mode
 from kornia_tidy.sensor.shot import drawn_electrons
-
-SOURCE = KERNELS / "sensor.c"
-_GIVEN = "Tensor? shot, Tensor? read, Tensor? offset, float full_well, float dark, float sigma, int bits, bool clip"
-
-torch.library.define("kornia_tidy::record", f"(Tensor light, {_GIVEN}) -> Tensor")
-torch.library.define("kornia_tidy::record_gradient", f"(Tensor light, Tensor gradient, {_GIVEN}) -> Tensor")
 
 
 def record(
@@ -65,7 +59,7 @@ def record(
     learnt = any(isinstance(x, Tensor) and x.requires_grad for x in (*fields, *numbers))
     here = light.device.type == "cpu" and light.dtype in REALS and not (learnt or torch_mode() & Mode.TRACED)
     if here and compiled(SOURCE, light.dtype) is not None:
-        return torch.ops.kornia_tidy.record(light, *fields, *map(float, numbers), bits or 0, clip)
+        return record_in_c(light, *fields, *map(float, numbers), bits or 0, clip)
     return _by_torch(light, *fields, *numbers, bits, clip)
 
 
@@ -171,36 +165,6 @@ def check_bits(bits: int) -> None:
         raise ValueError(f"bits must be a whole number from 1 to 16, got {bits}")
 
 
-# ---------------------------------------------------------------------- the operator
-
-
-def _record(light: Tensor, *given: Any) -> Tensor:
-    return _call(_new(light, *given), light, None, *given)
-
-
-def _record_gradient(light: Tensor, gradient: Tensor, *given: Any) -> Tensor:
-    return _call(_new(light, gradient, *given), light, gradient, *given)
-
-
-def _call(out: Tensor, light: Tensor, gradient: Tensor | None, *given: Any) -> Tensor:
-    *fields, full_well, dark, sigma, bits, clip = given
-    numbers = full_well, dark, sigma, 2**bits - 1, clip
-    return call_elementwise(load(SOURCE, out.dtype).record, out, (light, gradient, *fields), *numbers)
-
-
-def _new(light: Tensor, *given: Any) -> Tensor:
-    """Check the arguments and return the memory of the result, which is also the fake implementation."""
-    if light.dtype not in REALS:
-        raise TypeError(f"light must be float32 or float64, got {light.dtype}")
-    for field in given:
-        if isinstance(field, Tensor) and (field.dtype, field.shape) != (light.dtype, light.shape):
-            raise ValueError(
-                f"fields must be {light.dtype} of shape {tuple(light.shape)} as the light, got {field.dtype} of shape "
-                f"{tuple(field.shape)}"
-            )
-    return torch.empty_like(light)
-
-
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:4])
     ctx.options = inputs[4:]
@@ -215,8 +179,4 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return *torch.autograd.grad(_by_torch(own, *given), own, gradient, create_graph=True), *[None] * len(given)
 
 
-torch.library.impl("kornia_tidy::record", "CPU", _record)
-torch.library.register_fake("kornia_tidy::record", _new)
 torch.library.register_autograd("kornia_tidy::record", _backward, setup_context=_keep)
-torch.library.impl("kornia_tidy::record_gradient", "CPU", _record_gradient)
-torch.library.register_fake("kornia_tidy::record_gradient", _new)

@@ -6,8 +6,9 @@ import pytest
 import torch
 from scipy import stats
 
+from kornia_tidy.kernels.sensor_ops import SOURCE
 from kornia_tidy.sensor import SensorNoise, recording
-from kornia_tidy.sensor.recording import SOURCE, record
+from kornia_tidy.sensor.recording import record
 from tests.base import BaseTester
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
