@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load
 from torch import Tensor
 
-from kornia_tidy.files import check_file, read_bytes
+from kornia_tidy.files import check_file, parse_json, read_bytes
 
 LONGEST_HEADER = 1 << 24  # bytes
 
@@ -50,6 +50,32 @@ def read_tensors(
         return {name: found.pop(name).clone().to(device) for name in sorted(found)}, header
     except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # KeyError: a data type that PyTorch lacks
         raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error!s:.300}") from None
+
+
+def parse_tensors(data: bytes, what: str = "safetensors file") -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return tensors by name and the metadata of a safetensors file that is in memory. See :func:`read_tensors`.
+
+    Args:
+        data: bytes of the file.
+        what: description of it, for the message.
+
+    Raises:
+        ValueError: if it is damaged, or its header is longer than 16 MiB.
+
+    Example:
+        >>> from safetensors.torch import save
+        >>> parse_tensors(save({"phase": torch.ones(2)}, {"of": "a mask"}))
+        ({'phase': tensor([1., 1.])}, {'of': 'a mask'})
+    """
+    try:
+        length = int.from_bytes(data[:8], "little")
+        if len(data) < 8 or length > LONGEST_HEADER:
+            raise SafetensorError(f"its header must have at most {LONGEST_HEADER} bytes, got {length}")
+        found = load(data)
+        header = parse_json(data[8 : 8 + length]).get("__metadata__") or {}
+        return {name: found.pop(name).clone() for name in sorted(found)}, header
+    except (SafetensorError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"cannot read {what}: it is damaged: {error!s:.300}") from None
 
 
 def _check_header(path: Path) -> None:

@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from kornia_tidy import TiDyOptics, reconstruction
+from kornia_tidy.optics.lens import made_lenses
 from tests.base import BaseTester
 from tests.reconstruction import test_joint_closed_form, test_layered_joint
 from tests.test_kinds import public_names
@@ -31,6 +32,7 @@ ARGUMENTS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "GreyLevels": lambda: (4,),
     "JointHead": lambda: (test_joint_closed_form.joint(),),
     "LearnableDwellTimes": lambda: ((0.5, 0.5),),
+    "Lens": lambda: made_lenses.ideal_parts("own", "", lambda *x: 0 * x[2], (530e-9,), 50e-3, 8.0, 1.0, 7e-3),
     "LinearCamera": lambda: (TiDyOptics(sensor=None), torch.ones(1, 1, 40, 40)),
     "PixelCrosstalk": lambda: (0.3,),
     "Preconditioned": lambda: (network(),),

@@ -14,6 +14,7 @@ from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.modulator.modulator import Timeline
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.camera_settings import (
@@ -24,6 +25,7 @@ from kornia_tidy.psf.camera_settings import (
     take_over,
     write_settings,
 )
+from kornia_tidy.psf.field_bank import FieldBank, check_field
 from kornia_tidy.psf.lens_limits import PARTS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
@@ -34,7 +36,7 @@ from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.runtime.mode import refuse_torchscript
 
-_SUBMODULES = ("masks", "camera", "modulator")
+_SUBMODULES = ("masks", "camera", "modulator", "lens")
 COLOR_SPACES = ("srgb", "linear", "paper")
 OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")  # of a camera, beside those of its PSF model
 
@@ -51,9 +53,9 @@ def _part(name: str, meaning: str, *, settable: bool = False) -> Any:
 class CameraState(nn.Module):
     """A camera with a PSF model, and a ``state_dict`` of weights, settings and PSF window.
 
-    Masks, camera and modulator of the model are its submodules, so that states hold ``masks.phase``, and optimisers and
-    ``to(device)`` reach the parts. To set one of them, or ``fidelity``, ``spectrum`` or ``aperture``, puts another PSF
-    model in the place of the present one.
+    Masks, camera, modulator and lens of the model are its submodules, so that states hold ``masks.phase``, and
+    optimisers and ``to(device)`` reach the parts. To set one of them, or ``fidelity``, ``spectrum`` or ``aperture``,
+    puts another PSF model in the place of the present one.
 
     The settings of its parts and its PSF window are one entry, ``_extra_state``, a tensor of bytes. Loading a state
 
@@ -73,6 +75,7 @@ class CameraState(nn.Module):
     masks: PhaseMasks
     camera: ThinLensCamera | DefocusRange
     modulator: nn.Module
+    lens: Lens | None
 
     fidelity: Fidelity = _part("fidelity", "How exactly to compute.", settable=True)
     spectrum: Spectrum = _part("spectrum", "Wavelengths, and how each channel weights them.", settable=True)
@@ -95,12 +98,12 @@ class CameraState(nn.Module):
         self.register_load_state_dict_post_hook(_measure_window)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; masks, camera and modulator are of the PSF model too."""
+        """Set an attribute; masks, camera, modulator and lens are of the PSF model too."""
         if name not in _SUBMODULES:
             super().__setattr__(name, value)
             return
         self._swap(**{name: value})
-        super().__setattr__(name, value)
+        super().__setattr__(name, getattr(self.psf_model, name))
 
     def _swap(self, **parts: Any) -> None:
         self.psf_model = self.psf_model.replace(**parts)
@@ -152,6 +155,17 @@ class CameraState(nn.Module):
         states: Literal[True],
     ) -> StateBank: ...
 
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: Literal[False] = False,
+        field: Sequence[tuple[float, float]],
+    ) -> FieldBank: ...
+
     def psf_bank(
         self,
         channels: int | None = None,
@@ -159,7 +173,8 @@ class CameraState(nn.Module):
         defocus: Sequence[float] | None = None,
         *,
         states: bool = False,
-    ) -> PSFBank | StateBank:
+        field: Sequence[tuple[float, float]] | None = None,
+    ) -> PSFBank | StateBank | FieldBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
@@ -170,7 +185,12 @@ class CameraState(nn.Module):
             dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
             defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
             states: return the PSFs of each state that the modulator shows, with their weights, not the average.
+            field: points (y, x) in sensor pixels from the axis, of cameras with a lens: (F, D, C, P, P). Default: the
+                axis.
         """
+        if field is not None:
+            points = check_field(field, self.psf_model.lens, states=states)
+            return self.psf_model.psf_bank(channels, dtype, defocus, field=points)
         if states:
             return self.psf_model.psf_bank(channels, dtype, defocus, states=True)
         return self.psf_model.psf_bank(channels, dtype, defocus)

@@ -28,6 +28,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.optics.holes import HOLES
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
@@ -82,6 +83,10 @@ class TiDyOptics(CameraState):
         holes: ``"error"`` refuses a depth of NaN, 0 or less; ``"fill"`` fills such pixels from the nearest known one,
             as :func:`kornia_tidy.data.fill_holes` does, with gradients and in compiled graphs. Like ``check_inputs`` it
             is not part of the state.
+        lens: a :class:`~kornia_tidy.optics.Lens` in whose stop the masks stand, or the name of one, such as
+            ``"double-gauss-50mm"``, made for the camera's aperture and focus. Its focal length, f-number and focus are
+            the camera's. Captures see the PSFs of its axis; :meth:`psf_bank` has those of the field. Default: an ideal
+            lens.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -139,6 +144,7 @@ class TiDyOptics(CameraState):
         check_inputs: bool = True,
         memory_budget: int = 512 << 20,
         holes: str = "error",
+        lens: Lens | str | None = None,
     ) -> None:
         check_positive("memory_budget", memory_budget, "bytes")
         fidelity = Fidelity.of(fidelity)
@@ -153,7 +159,7 @@ class TiDyOptics(CameraState):
                 f"fidelity 'paper' means color_space='paper' and compositing='gather', got {color_space!r} and "
                 f"{compositing!r}: leave them out, or use another fidelity"
             )
-        super().__init__(PSFModel(masks, camera, modulator, fidelity, spectrum, aperture))
+        super().__init__(PSFModel(masks, camera, modulator, fidelity, spectrum, aperture, lens))
         if compositing == "occlusion" and self.spectrum.basis is not None:
             # Occlusion divides by the sum of each PSF; the PSFs between two colours sum to zero.
             raise ValueError(

@@ -6,6 +6,7 @@ inputs in a wrong unit. Read ``thin_lens.py`` first.
 """
 
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
+from kornia_tidy.optics.lens.lens import Lens, LensRangeWarning
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, cauchy_through, constant_index
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera, thin_lens_defocus
@@ -17,6 +18,8 @@ __all__ = [
     "PMMA",
     "REFERENCE_WAVELENGTH",
     "DefocusRange",
+    "Lens",
+    "LensRangeWarning",
     "Material",
     "Spectrum",
     "ThinLensCamera",

@@ -6,6 +6,7 @@ propagations.
 """
 
 from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.paper import AliasingWarning, paper_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
@@ -14,6 +15,7 @@ from kornia_tidy.psf.state_bank import StateBank
 
 __all__ = [
     "AliasingWarning",
+    "FieldBank",
     "PSFBank",
     "PSFModel",
     "Pupil",

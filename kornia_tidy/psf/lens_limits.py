@@ -6,8 +6,11 @@ import math
 
 from torch import Tensor, nn
 
+from kornia_tidy.checks import check_part
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 
 PARTS: dict[str, tuple[type, str, str]] = {
     "masks": (nn.Module, "phase masks such as PixelwiseMask(5)", "dispersion"),
@@ -82,3 +85,58 @@ def check_layer_spacing(spacing: float, band: float, shortest_wavelength: float)
             f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
             f"{shortest_wavelength * 1e9:.0f} nm, got {spacing}"
         )
+
+
+def fitting_lens(
+    lens: Lens | str, camera: ThinLensCamera | DefocusRange, fidelity: Fidelity, spectrum: Spectrum
+) -> Lens:
+    """Return a lens that is the camera's: the one given, or the one of a name at the camera's aperture and focus.
+
+    Args:
+        lens: a lens, or a name.
+        camera: whose focal length, f-number and focus must be the lens's.
+        fidelity: how exactly to compute.
+        spectrum: wavelengths that the lens of a name is made for.
+
+    Raises:
+        TypeError: if it is neither.
+        ValueError: if there is no lens of this name, or it is not the camera's.
+
+    Example:
+        >>> fitting_lens("single-50mm", ThinLensCamera(), Fidelity(), Spectrum.rgb()).name
+        'single-50mm'
+        >>> fitting_lens("triplet-50mm", ThinLensCamera(35e-3), Fidelity(), Spectrum.rgb())
+        Traceback (most recent call last):
+        ValueError: the focal length of the lens 'triplet-50mm' must be the camera's, got 0.0499917 m and 0.035 m: \
+take lens.camera(pixel_pitch) or ThinLensCamera(focal_length=0.0499917, ...)
+    """
+    check_part("lens", lens, (Lens, str), "a Lens or the name of one such as 'double-gauss-50mm'")
+    if fidelity.propagation == "paper":
+        raise ValueError("fidelity 'paper' means an ideal lens, got a lens: leave it out, or use another fidelity")
+    own = camera.lens if isinstance(camera, DefocusRange) else camera
+    if isinstance(own.focus_distance, Tensor):
+        raise ValueError("the focus of a camera with a lens must be a number, got a parameter that is learnt")
+    if own.lens_material is not None:
+        raise ValueError(
+            f"a lens has its own colours, and the camera is a single element of {own.lens_material.name}: leave "
+            f"lens_material out"
+        )
+    if isinstance(lens, str):
+        waves = {*spectrum.wavelengths, REFERENCE_WAVELENGTH}
+        lens = Lens.named(lens, own.f_number, own.focus_distance, sorted(waves))
+    for attribute, words, unit in _LENS_VALUES:
+        its, cameras = getattr(lens, attribute), getattr(own, attribute)
+        if not (its == cameras or abs(its - cameras) <= _ALIKE * cameras):
+            raise ValueError(
+                f"the {words} of the lens {lens.name!r} must be the camera's, got {its:.6g}{unit} and "
+                f"{cameras:.6g}{unit}: take lens.camera(pixel_pitch) or ThinLensCamera({attribute}={its:.6g}, ...)"
+            )
+    return lens
+
+
+_ALIKE = 1e-3  # of lengths of a lens and its camera
+_LENS_VALUES = (
+    ("focal_length", "focal length", " m"),
+    ("f_number", "f-number", ""),
+    ("focus_distance", "focus", " m"),
+)

@@ -18,6 +18,7 @@ from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.scattered_transform import patches_of, scattered_axis, scattered_energies
+from kornia_tidy.runtime.default_device import on_cpu
 
 _LONGEST = 5.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
 _GRID = 41  # points along the stop at which the steepest phase is looked for
@@ -38,13 +39,14 @@ class Screen:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What samples the light: pixel pitch in metres, side of the window in pixels, and the error allowed to the field."""
+    """Pixel pitch in metres, side of the window in pixels, and the error allowed to the field on the sensor."""
 
     pitch: float
     window: int
     tolerance: float
 
 
+@on_cpu
 def lens_psfs(
     screens: Sequence[Screen],
     weights: Tensor,
@@ -82,7 +84,8 @@ def lens_psfs(
     sample = lens.sample(torch.tensor([0.0, height], dtype=torch.float64), psi, wavelength)
     axis, turned = (_Turned(sample, f, angle, psi, wavelength) for f, angle in ((0, 0.0), (1, azimuth)))
     steepest, complex_dtype = turned.steepest(sensor), screens[0].waves.dtype
-    stops = [_stop(turned, screen.spans, steepest, sensor.tolerance) for screen in screens]
+    widest = max(float((screen.spans[1] - screen.spans[0]).max()) for screen in screens)
+    stops = [_stop(turned, screen.spans, steepest * widest / 2, sensor.tolerance) for screen in screens]
     points = [stop for stop, _ in stops]
     frequencies = [turned.frequencies(basis) for _, basis in stops]
     columns, rows = (torch.cat([pair[i] * -sensor.pitch / wavelength for pair in frequencies]) for i in (0, 1))
@@ -95,18 +98,19 @@ def lens_psfs(
     amplitude = torch.cat([turned.amplitude(*stop) for stop in stops], 1)
     amplitude = amplitude * (sensor.pitch / wavelength / passed.sqrt())[:, None, None]
     phase = torch.cat([turned.phase(stop) for stop in stops], 1)
-    patches = patches_of(torch.polar(amplitude, phase).to(complex_dtype), rows, columns)
-    cells = torch.cat([s.waves[:, p.row, p.column] for s, p in zip(screens, points, strict=True)], 1)
-    energies = scattered_energies(cells, weights, patches, rows, columns)
-    return energies, (area / area_on_axis).to(weights.dtype)
+    device = weights.device
+    patches = patches_of(torch.polar(amplitude, phase).to(complex_dtype), rows, columns).to(device)
+    chosen = [(p.row.to(device), p.column.to(device)) for p in points]
+    cells = torch.cat([s.waves[:, row, column] for s, (row, column) in zip(screens, chosen, strict=True)], 1)
+    energies = scattered_energies(cells, weights, patches, rows.to(device), columns.to(device))
+    return energies, (area / area_on_axis).to(weights)
 
 
 Stop = tuple[StopQuadrature, Tensor]  # points in patches, (C, S), and polynomials there, (J, C, S)
 
 
-def _stop(turned: _Turned, spans: Tensor, steepest: float, tolerance: float) -> Stop:
-    """Return the open stop cell by cell, as finely as the phase is steep in radians per stop radius."""
-    half = steepest * float((spans[1] - spans[0]).max()) / 2
+def _stop(turned: _Turned, spans: Tensor, half: float, tolerance: float) -> Stop:
+    """Return the open stop cell by cell, as finely as the phase asks, which changes by so much over half a cell."""
     parts = max(1, math.ceil(half / _LONGEST))
     order = max(4, gauss_legendre_order(half / parts, tolerance))
     discs = tuple(map(tuple, turned.discs().tolist()))
@@ -158,7 +162,9 @@ class _Turned:
         """Return centre x, y and radius of the discs that light must pass, (E, 3): first the stop's own."""
         direction = torch.tensor([math.cos(self.azimuth), math.sin(self.azimuth)], dtype=torch.float64)
         centres = self.edges[:, :1] * direction
-        return torch.cat([torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), torch.cat([centres, self.edges[:, 1:]], 1)])
+        return torch.cat(
+            [torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), torch.cat([centres, self.edges[:, 1:]], 1)]
+        )
 
     def phase(self, stop: Stop) -> Tensor:
         """Return the wavefront in radians at the wavelength, (D, C, S)."""
@@ -177,10 +183,12 @@ class _Turned:
         return self._values("amplitude", polynomials) * points.weight
 
     def light(self, points: StopQuadrature, polynomials: Tensor, transmission: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the object's light that passes the stop, and the area of direction cosines that it fills, (D,) each."""
+        """Return the object's light that passes the stop, and the area of cosines that it fills, (D,) each."""
         weight = points.weight * transmission[points.row, points.column][:, None]
         light = self._values("illumination", polynomials)
-        return (light * weight).sum((1, 2)), (self._values("amplitude", polynomials).square() / light * weight).sum((1, 2))
+        return (light * weight).sum((1, 2)), (self._values("amplitude", polynomials).square() / light * weight).sum(
+            (1, 2)
+        )
 
     def steepest(self, sensor: Sensor) -> float:
         """Return a bound of the gradient of the phase over the stop and for all pixels, radians per stop radius."""

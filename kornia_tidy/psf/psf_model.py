@@ -18,6 +18,7 @@ from kornia_tidy.masks.base import PhaseMasks, central_square
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.aperture import check_aperture
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.camera_settings import digest_of, settings_of
@@ -28,8 +29,16 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolable_spacing,
     interpolated_bank,
 )
+from kornia_tidy.psf.field_bank import FieldBank, check_field, field_psf_bank
 from kornia_tidy.psf.geometric_psf import blur_radius
-from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, check_layer_spacing
+from kornia_tidy.psf.lens_limits import (
+    LEAST_WINDOW,
+    PARTS,
+    WIDEST_DISC,
+    check_defocus_range,
+    check_layer_spacing,
+    fitting_lens,
+)
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, nodes_around, plain_attributes
@@ -71,11 +80,14 @@ class PSFModel:
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
             Default: the pixels whose centres lie in the disc; the smooth disc for ``NoMask``.
+        lens: a :class:`~kornia_tidy.optics.Lens` whose stop the masks stand in, or the name of one, made for the
+            camera's aperture and focus. Its stop and its rims cut the masks exactly, besides ``aperture``. Default: an
+            ideal lens.
 
     Raises:
         TypeError: if a part is of another type.
-        ValueError: if the camera's defocus needs more than 4096 layers or PSFs eight times as wide as the largest
-            window, or a mask holds NaN.
+        ValueError: if the lens is not that of the camera, the camera's defocus needs more than 4096 layers or PSFs
+            eight times as wide as the largest window, or a mask holds NaN.
 
     Example:
         >>> model = PSFModel()
@@ -89,6 +101,7 @@ class PSFModel:
     fidelity: Fidelity
     spectrum: Spectrum
     aperture: Tensor | None
+    lens: Lens | None
     measured: PSFBank | None  # PSFs in the place of the masks' own
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
@@ -108,6 +121,7 @@ class PSFModel:
         fidelity: str | Fidelity = "balanced",
         spectrum: Spectrum | None = None,
         aperture: Tensor | None = None,
+        lens: Lens | str | None = None,
     ) -> None:
         vars(self).update(measured=None, state=None, moment=None, measured_cut=False, _memories={})
         parts = self.replace(
@@ -117,6 +131,7 @@ class PSFModel:
             modulator=DwellTimes() if modulator is None else modulator,
             spectrum=Spectrum.rgb() if spectrum is None else spectrum,
             aperture=aperture,
+            lens=lens,
         )
         vars(self).update(vars(parts))
         if self.fidelity.propagation == "paper":
@@ -135,10 +150,12 @@ class PSFModel:
         """Return this model with other parts. Its window is measured when it is first asked for.
 
         Args:
-            parts: by their names: ``masks``, ``camera``, ``modulator``, ``fidelity``, ``spectrum``, ``aperture``.
+            parts: by their names: ``masks``, ``camera``, ``modulator``, ``fidelity``, ``spectrum``, ``aperture``,
+                ``lens``.
 
         Raises:
             TypeError: if a part is of another type.
+            ValueError: if the lens is not that of the camera.
 
         Example:
             >>> model = PSFModel(fidelity="draft").replace(masks=PixelwiseMask(1, initial="flat"))
@@ -157,6 +174,10 @@ class PSFModel:
             fidelity, spectrum = parts.get("fidelity") or self.fidelity, parts.get("spectrum") or self.spectrum
             most = fidelity.wavelengths
             parts["_sampled"] = spectrum if most is None else bin_spectrum(spectrum, most)
+        present = {**vars(self), **parts}
+        if present["lens"] is not None:
+            given = (present[name] for name in ("lens", "camera", "fidelity", "_sampled"))
+            parts["lens"] = fitting_lens(*given)
         return self._replace(_derived=Derived(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
@@ -187,6 +208,17 @@ class PSFModel:
         states: Literal[True],
     ) -> StateBank: ...
 
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        states: Literal[False] = False,
+        field: Sequence[tuple[float, float]],
+    ) -> FieldBank: ...
+
     def psf_bank(
         self,
         channels: int | None = None,
@@ -194,7 +226,8 @@ class PSFModel:
         defocus: Sequence[float] | None = None,
         *,
         states: bool = False,
-    ) -> PSFBank | StateBank:
+        field: Sequence[tuple[float, float]] | None = None,
+    ) -> PSFBank | StateBank | FieldBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
@@ -206,9 +239,12 @@ class PSFModel:
             dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
             defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
             states: return the PSFs of each state that the modulator shows, with their weights, not the average.
+            field: points (y, x) in sensor pixels from the axis, of cameras with a lens. Default: the axis.
         """
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = self.bank_dtype(dtype)
+        if field is not None:
+            return self._field_bank(spectrum.flat(), dtype, defocus, check_field(field, self.lens, states=states))
         if self.measured is not None:
             if states:
                 raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
@@ -220,6 +256,32 @@ class PSFModel:
         weights = self.state_weights(dtype)
         banks = [self._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
         return StateBank.of([bank.with_stray_light(stray_light) for bank in banks], weights)
+
+    def _field_bank(
+        self,
+        spectrum: Spectrum,
+        dtype: torch.dtype,
+        defocus: Sequence[float] | None,
+        field: Sequence[tuple[float, float]],
+    ) -> FieldBank:
+        nodes, tolerance = self.defocus_nodes if defocus is None else tuple(defocus), self.fidelity.pixel_tolerance
+        bank = self._lens_psfs(spectrum, *self.states(dtype), nodes, self.window, field, tolerance)
+        return bank.with_stray_light(self.fidelity.stray_light)
+
+    def _lens_psfs(
+        self,
+        spectrum: Spectrum,
+        states: Tensor,
+        weights: Tensor,
+        nodes: Sequence[float],
+        window: int,
+        field: Sequence[tuple[float, float]],
+        tolerance: float,
+    ) -> FieldBank:
+        dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
+        lens, pupil = cast("Lens", self.lens), self.pupil
+        sensor = lens, self.camera.pixel_pitch, window, tolerance
+        return field_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, field, *sensor)
 
     def bank_dtype(self, dtype: torch.dtype | None) -> torch.dtype:
         """Return the type that was asked for, or float32 or float64 as the fidelity says."""
@@ -313,6 +375,7 @@ class PSFModel:
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
         fill_factor = getattr(self.modulator, "fill_factor", 1.0)
         setting = [side, self.fidelity, self._aperture_mark, fill_factor]
+        setting += [None if self.lens is None else self.lens.table]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
         key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), grid
@@ -338,6 +401,17 @@ class PSFModel:
         dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
         shift = [self.camera.chromatic_defocus(wavelength) for wavelength in spectrum.wavelengths]
         pupil = self.pupil
+        if self.lens is not None:
+            points = [(0.0, 0.0)]
+            shown = zip(states[:, None], torch.ones_like(weights), strict=True) if each_state else [(states, weights)]
+            banks = [
+                self._lens_psfs(
+                    spectrum, own, share.reshape(-1), nodes, window, points, tolerance or self.fidelity.pixel_tolerance
+                )
+                for own, share in shown
+            ]
+            psfs, energy = (torch.cat([getattr(bank, name)[0] for bank in banks], 1) for name in ("psfs", "energy"))
+            return PSFBank(psfs, states.new_tensor(nodes), energy)
         if self.fidelity.propagation == "paper":
             if pupil.fill_factor != 1:
                 raise ValueError(
@@ -566,6 +640,8 @@ class PSFModel:
         fill_factor, pupil = getattr(self.modulator, "fill_factor", 1.0), self._derived.pupil
         if pupil is None or pupil.fill_factor != fill_factor:
             aperture = getattr(self.masks, "iris", None) if self.aperture is None else self.aperture
+            if self.lens is not None and self.aperture is None:  # its stop is the edge
+                aperture = torch.ones(min(self.masks.phase.shape[-2:]), min(self.masks.phase.shape[-2:]))
             pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
         return pupil
 
@@ -612,7 +688,9 @@ class PSFModel:
 
     def _find_wide_blur(self) -> WideBlur | None:
         camera, known, step = self.camera, self._derived.window, self.pixel_step
-        if self.measured is not None or not self.fidelity.blurs_by_rays or self.spectrum.basis is not None:
+        if self.measured is not None or self.lens is not None or self.spectrum.basis is not None:
+            return None
+        if not self.fidelity.blurs_by_rays:
             return None
         # A focus that is learnt moves the PSFs' sampling; colours with focuses of their own have discs of their own.
         if isinstance(step, Tensor) or any(camera.chromatic_defocus(w) for w in self.spectrum.wavelengths):
@@ -648,6 +726,7 @@ class PSFModel:
             "mask_pixels": list(self.masks.phase.shape[-2:]),
             "aperture": settings_of(self.aperture),
             "measured PSFs": None if bank is None else digest_of(bank.psfs, bank.defocus, bank.energy),
+            **({} if self.lens is None else {"lens": settings_of(self.lens)}),
             "state": self.state,
             "moment": self.moment,
         }

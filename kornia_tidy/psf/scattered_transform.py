@@ -2,9 +2,9 @@ r"""Fourier transform of scattered points to the light in the pixels of a sensor
 
 .. math:: I(p) = \int_p \Big| \sum_j c_j e^{-2\pi i (\nu_j X + \mu_j Y)} \Big|^2 dX \, dY
 
-The points are spread on a grid with a kernel of a few samples, transformed by FFT, and the kernel's transform is divided
-out: a nonuniform FFT of type 1. The samples of the intensity lie denser than its bandwidth asks, so that the integral
-over a pixel is a short sum of them.
+The points are spread on a grid with a kernel of a few samples, transformed by FFT, and the kernel's transform is
+divided out: a nonuniform FFT of type 1. The samples of the intensity lie denser than its bandwidth asks, so that the
+integral over a pixel is a short sum of them.
 
 Source: Barnett, Magland and af Klinteberg, SIAM J. Sci. Comput. 41(5) C479 (2019), for the kernel; Kaiser's window for
 the interpolation between samples.
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -48,6 +48,12 @@ class Axis:
     correction: Tensor
     pixels: Tensor
 
+    def to(self, device: torch.device) -> Axis:
+        """Return the axis on a device."""
+        parts = (self.start, self.kernel, self.correction, self.pixels)
+        start, kernel, correction, pixels = (part.to(device) for part in parts)
+        return replace(self, start=start, kernel=kernel, correction=correction, pixels=pixels)
+
 
 def scattered_axis(
     frequency: Tensor, window: int, tolerance: float, dtype: torch.dtype, shifts: Sequence[float] = (0.0,)
@@ -64,7 +70,7 @@ def scattered_axis(
     Example:
         >>> axis = scattered_axis(torch.linspace(-0.4, 0.4, 64, dtype=torch.float64)[:, None], 9, 1e-6, torch.float64)
         >>> axis.pixels.shape[0], axis.size
-        (1, 60)
+        (1, 90)
     """
     low, span = float(frequency.min()), max(float(frequency.max() - frequency.min()), 1e-3)
     width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH) + 1)

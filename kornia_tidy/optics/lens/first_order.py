@@ -86,10 +86,8 @@ def first_order(prescription: Prescription, f_number: float, focus_distance: flo
     behind = _matrix(surfaces[stop + 1 :], vertices[stop + 1 :], indices[stop + 1 :], indices[stop])
     rear = _gap(sensor_z - vertices[-1], 1.0) @ behind @ _gap(vertices[stop + 1] - vertices[stop], indices[stop])
     rear = rear @ np.diag([1.0, indices[stop]])  # on slopes in the stop
-    stop_radius = pupil_radius * abs(to_stop[0, 0])
-    return FirstOrder(
-        prescription, vertices, focal_length, pupil_z, pupil_radius, stop_radius, sensor_z, focus_distance, rear
-    )
+    lengths = focal_length, pupil_z, pupil_radius, pupil_radius * abs(to_stop[0, 0]), sensor_z, focus_distance
+    return FirstOrder(prescription, vertices, *map(float, lengths), rear)
 
 
 def _matrix(surfaces: tuple[Surface, ...], vertices: Array, indices: list[float], before: float = 1.0) -> Array:

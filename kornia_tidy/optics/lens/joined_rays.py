@@ -92,15 +92,13 @@ def wavefronts(system: FirstOrder, wavelength: float, fields: Array, psi: Array,
     relative = direction - direction[:, :, :1]
     whole = path - path[:, :, :1]
     crossing = pupil.reshape(*shape, 2)
-    return Wavefronts(
-        whole[:, :, 1:], relative[:, :, 1:], crossing[:, :, 1:], tangent, chief, heights[..., 1:]
-    )
+    return Wavefronts(whole[:, :, 1:], relative[:, :, 1:], crossing[:, :, 1:], tangent, chief, heights[..., 1:])
 
 
 def _chief_lines(system: FirstOrder, fields: Array) -> tuple[Array, Array]:
     """Return slope and height at the entrance pupil of the rays of 530 nm from the stop's centre to the sensor."""
     indices, stop = system.prescription.indices(REFERENCE_WAVELENGTH), system.prescription.stop
-    centre = np.zeros((len(fields), 3)) + [0.0, 0.0, system.vertices[stop]]
+    centre = np.tile([0.0, 0.0, system.vertices[stop]], (len(fields), 1))
     target = np.stack([fields, np.zeros_like(fields)], 1)
 
     def landing(slopes: Array) -> Array:

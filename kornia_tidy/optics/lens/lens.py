@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import Any, Self
 
 import torch
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_finite, check_metres, check_number, check_positive
+from kornia_tidy.checks import check_number, described
 from kornia_tidy.files import write_bytes
-from kornia_tidy.optics.lens.first_order import first_order
+from kornia_tidy.optics.lens.ideal_table import read_zernike_table, seidel_wavefront
+from kornia_tidy.optics.lens.lens_file import lens_bytes, lens_parts
 from kornia_tidy.optics.lens.lens_table import LensSample, LensTable
-from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
+from kornia_tidy.optics.lens.made_lenses import (
+    RGB,
+    LensParts,
+    checked_wavelengths,
+    ideal_parts,
+    named_parts,
+    traced_parts,
+)
 from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.stop_quadrature import light_through_stop
-from kornia_tidy.optics.lens.table_fit import fit_table
-from kornia_tidy.optics.spectrum import LONGEST, REFERENCE_WAVELENGTH, SHORTEST
-from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
-from kornia_tidy.tensor_files import read_tensors
-
-RGB = (470e-9, REFERENCE_WAVELENGTH, 610e-9)
-WIDEST = 20.0  # radians; nearer depths than of this defocus are in a table only where focus is farther away
-_FORMAT = "kornia_tidy.lens/1"
-_ALIKE = 1e-3  # of lengths of a lens and its camera
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.runtime.default_device import on_cpu
+from kornia_tidy.tensor_files import parse_tensors, read_tensors
 
 
 class LensRangeWarning(UserWarning):
@@ -82,7 +81,7 @@ class Lens(nn.Module):
         self.focal_length = focal_length
         self.f_number = f_number
         self.focus_distance = focus_distance
-        self.residual = residual
+        self._residual = residual  # no setting: it is known as well as its digits are
         self._table = table
 
     # ------------------------------------------------------------------ where lenses come from
@@ -115,8 +114,7 @@ class Lens(nn.Module):
             >>> round(lens.focal_length * 1e3, 2)
             49.99
         """
-        check_choice("name of a lens", name, tuple(NAMED_LENSES))
-        return cls(*_named(name, f_number, focus_distance, tuple(wavelengths), field))
+        return cls(*named_parts(name, f_number, focus_distance, tuple(wavelengths), field))
 
     @classmethod
     def from_prescription(
@@ -147,19 +145,108 @@ class Lens(nn.Module):
         Convention:
             - The table reaches from infinity to the nearest depth.
         """
-        if field is None and isinstance(prescription, Mapping):
-            field = _half_diagonal(prescription)
-        if not isinstance(prescription, Prescription):
-            prescription = Prescription.read(prescription)
-        waves = _wavelengths(wavelengths)
-        check_positive("f_number", f_number)
-        if f_number < FASTEST:
-            raise ValueError(f"f_number must be at least {FASTEST}, got {f_number}")
-        _check_focus(focus_distance)
-        if field is None:
-            raise ValueError("field must be the largest height on the sensor in metres, got None")
-        _check_field(field)
-        return cls(*_traced(prescription, float(f_number), float(focus_distance), waves, float(field), nearest))
+        return cls(*traced_parts(prescription, f_number, focus_distance, wavelengths, field, nearest))
+
+    @classmethod
+    def from_seidel(
+        cls,
+        focal_length: float,
+        f_number: float,
+        focus_distance: float,
+        field: float,
+        spherical: float = 0.0,
+        coma: float = 0.0,
+        astigmatism: float = 0.0,
+        field_curvature: float = 0.0,
+        distortion: float = 0.0,
+        wavelengths: Sequence[float] = RGB,
+    ) -> Self:
+        r"""Return a thin lens with third-order aberrations, the same optical path at every wavelength and depth.
+
+        .. math:: W = W_{040} \rho^4 + W_{131} h \rho^3 \cos\varphi + W_{222} h^2 \rho^2 \cos^2\varphi
+            + W_{220} h^2 \rho^2
+
+        Args:
+            focal_length: in metres.
+            f_number: focal length over diameter of the pupil.
+            focus_distance: in metres; ``inf`` is allowed.
+            field: largest height on the sensor in metres, at which h is 1.
+            spherical: W040 in waves of 530 nm.
+            coma: W131 in waves of 530 nm.
+            astigmatism: W222 in waves of 530 nm.
+            field_curvature: W220 in waves of 530 nm.
+            distortion: by how much images are larger at the largest height, as a part of 1.
+            wavelengths: in metres.
+
+        Raises:
+            ValueError: if a value is not finite, or out of range.
+
+        Convention:
+            - A positive W is a longer path, as that of positive defocus. The azimuth runs from the direction of the
+              field on the sensor.
+
+        Source: Welford, Aberrations of Optical Systems (1986), chapter 7.
+
+        Example:
+            >>> Lens.from_seidel(50e-3, 4.0, 1.0, 10e-3, coma=2.0).residual
+            0.0
+        """
+        given = {
+            "spherical": spherical,
+            "coma": coma,
+            "astigmatism": astigmatism,
+            "field_curvature": field_curvature,
+        }
+        for name, value in {**given, "distortion": distortion}.items():
+            check_number(name, value)
+            if not abs(value) < 1e6:
+                raise ValueError(f"{name} must be finite and below 1e6, got {value}")
+        if not abs(distortion) < 1:
+            raise ValueError(f"distortion must be a part of 1 between -1 and 1, got {distortion}")
+        wavefront = seidel_wavefront(**given)
+        waves = checked_wavelengths(wavelengths)
+        return cls(
+            *ideal_parts("Seidel", "", wavefront, waves, focal_length, f_number, focus_distance, field, distortion)
+        )
+
+    @classmethod
+    def from_zernike_table(
+        cls,
+        path: str | os.PathLike[str],
+        focal_length: float,
+        f_number: float,
+        focus_distance: float,
+        order: str = "noll",
+        sign: int = -1,
+    ) -> Self:
+        r"""Return a thin lens with wavefronts by Zernike coefficients over field and wavelength, from a CSV file.
+
+        Args:
+            path: file with the columns ``field_mm`` (height on the sensor, along +y), ``wavelength_nm`` (may be
+                missing: 530) and ``Z1``, ``Z2``, ... in waves of that wavelength. Lines that start with # are left out.
+            focal_length: in metres.
+            f_number: focal length over diameter of the pupil.
+            focus_distance: in metres; ``inf`` is allowed.
+            order: ``"noll"`` (orthonormal) or ``"fringe"`` (of unit amplitude at the edge).
+            sign: -1 where positive coefficients are a wavefront ahead of the sphere, as Zemax and Optiland have it; 1
+                where they are a longer path.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if a value is missing, no number, or out of range.
+
+        Example:
+            >>> import tempfile
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     with open(f"{folder}/lens.csv", "w") as file:
+            ...         _ = file.write("field_mm,Z4,Z7\n0,0.1,0\n5,0.1,0.2\n10,0.1,0.4\n")
+            ...     lens = Lens.from_zernike_table(f"{folder}/lens.csv", 50e-3, 4.0, 1.0)
+            >>> lens.field
+            0.01
+        """
+        wavefront, waves, field = read_zernike_table(path, order, sign)
+        given = focal_length, f_number, focus_distance, field
+        return cls(*ideal_parts("Zernike table", os.path.basename(path), wavefront, waves, *given))
 
     # ------------------------------------------------------------------ what it does to light
 
@@ -167,6 +254,16 @@ class Lens(nn.Module):
     def field(self) -> float:
         """Largest height on the sensor in metres."""
         return float(self._table.field[0])
+
+    @property
+    def table(self) -> LensTable:
+        """Coefficients of the lens."""
+        return self._table
+
+    @property
+    def residual(self) -> float:
+        """Largest rms over the stop of what the table leaves of traced wavefronts, in waves; 0 where none were."""
+        return self._residual
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
@@ -198,6 +295,7 @@ class Lens(nn.Module):
             f_number=self.f_number,
         )
 
+    @on_cpu
     def sample(self, heights: Tensor, defocus: Tensor, wavelength: float) -> LensSample:
         """Return the coefficients of field points at heights (F,) in metres and defocus (D,), at a wavelength.
 
@@ -206,6 +304,7 @@ class Lens(nn.Module):
         self._warn_if_beyond(heights, defocus, wavelength)
         return self._table.at(heights, defocus, wavelength)
 
+    @on_cpu
     def relative_illumination(self, heights: Tensor, defocus: float = 0.0, wavelength: float = 530e-9) -> Tensor:
         """Return the irradiance of an even, white scene over that on the axis, (F,), with vignetting.
 
@@ -214,10 +313,13 @@ class Lens(nn.Module):
             defocus: of the scene in radians.
             wavelength: in metres.
         """
-        sample = self.sample(torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus]), wavelength)
+        sample = self.sample(
+            torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus]), wavelength
+        )
         areas = light_through_stop(sample)[:, 0]
         return areas[1:] / areas[0]
 
+    @on_cpu
     def distortion(self, heights: Tensor, defocus: float = 0.0) -> Tensor:
         """Return by how much images are larger than a pinhole at the entrance pupil makes them, (F,), as a part of 1.
 
@@ -226,9 +328,12 @@ class Lens(nn.Module):
             defocus: of the scene in radians.
         """
         self._warn_if_beyond(heights, torch.tensor([defocus]), None)
-        slopes = self._table.slopes(torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus]))[:, 0]
+        slopes = self._table.slopes(
+            torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus])
+        )[:, 0]
         return slopes[0] / slopes[1:] - 1
 
+    @on_cpu
     def lateral_colour(self, heights: Tensor, wavelength: float, defocus: float = 0.0) -> Tensor:
         """Return where light of a wavelength lands less where light of 530 nm does, in metres along the field, (F,).
 
@@ -264,7 +369,7 @@ class Lens(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the lens to a safetensors file of some tens of kilobytes."""
-        write_bytes(path, self._bytes())
+        write_bytes(path, lens_bytes(self._parts()))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -274,102 +379,58 @@ class Lens(nn.Module):
             FileNotFoundError: if there is no such file.
             ValueError: if the file is no lens, or a value is NaN or infinite.
         """
-        tensors, notes = read_tensors(path, "lens")
-        return cls._read(tensors, notes, str(path))
+        return cls(*lens_parts(*read_tensors(path, "lens"), str(path)))
 
-    def _bytes(self) -> bytes:
-        tensors = {name: part.float().contiguous() for name, part in self._table.tensors().items()}
-        tensors |= {name: getattr(self._table, name) for name in ("wavelengths", "defocus", "field")}
-        tensors["scalars"] = torch.tensor([getattr(self, name) for name in _SCALARS], dtype=torch.float64)
-        return save(tensors, {"format": _FORMAT, "name": self.name, "source": self.source})
+    def _parts(self) -> LensParts:
+        return LensParts(
+            self.name,
+            self.source,
+            self.focal_length,
+            self.f_number,
+            self.focus_distance,
+            self._table,
+            self._residual,
+        )
 
-    @classmethod
-    def _read(cls, tensors: dict[str, Tensor], notes: Mapping[str, str], path: str) -> Self:
-        names = {*LensTable.__dataclass_fields__, "scalars"}
-        if notes.get("format") != _FORMAT or set(tensors) != names:
-            raise ValueError(f"{path} is not a lens: its format is {notes.get('format')!r:.40} with {sorted(tensors)!r:.200}")
-        for name, value in tensors.items():
-            check_finite(f"{name} of {path}", value)
-        scalars = tensors.pop("scalars")
-        try:
-            if tuple(scalars.shape) != (len(_SCALARS),):
-                raise ValueError(f"scalars must have shape ({len(_SCALARS)},), got {tuple(scalars.shape)}")
-            table = LensTable(**{name: value.double() for name, value in tensors.items()})
-            given = dict(zip(_SCALARS, scalars.double().tolist(), strict=True))
-            for name in ("focal_length", "f_number", "focus_distance"):
-                check_positive(name, given[name])
-            return cls(notes.get("name", ""), notes.get("source", ""), table=table, **given)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from None
+    @on_cpu
+    def get_extra_state(self) -> Tensor:
+        """Return the lens as the bytes of its file, uint8."""
+        return torch.frombuffer(bytearray(lens_bytes(self._parts())), dtype=torch.uint8).clone()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take the lens of a state.
+
+        Raises:
+            ValueError: if it is damaged.
+        """
+        what = "the lens in the state"
+        if not isinstance(state, Tensor) or state.dtype != torch.uint8:
+            raise ValueError(f"{what} must be bytes, got {described(state)}")
+        parts = lens_parts(*parse_tensors(state.cpu().numpy().tobytes(), what), what)
+        given = parts._asdict()
+        self._table, self._residual = given.pop("table"), given.pop("residual")
+        vars(self).update(given)
+
+    def _load_from_state_dict(
+        self,
+        state_dict: Any,
+        prefix: str,
+        local_metadata: Any,
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        lists = missing_keys, unexpected_keys, error_msgs
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, *lists)
+        if (key := f"{prefix}_extra_state") in missing_keys:  # a state of masks alone leaves the lens as it is
+            missing_keys.remove(key)
 
     def extra_repr(self) -> str:
         """Return a one-line description."""
         low, high = self.defocus_range
         return (
-            f"{self.name}: {self.focal_length * 1e3:.4g} mm f/{self.f_number:.3g}, focus at {self.focus_distance:.4g} m, "
-            f"field to {self.field * 1e3:.3g} mm, psi {low:+.1f} to {high:+.1f}, "
+            f"{self.name}: {self.focal_length * 1e3:.4g} mm f/{self.f_number:.3g}, focus at {self.focus_distance:.4g} "
+            f"m, field to {self.field * 1e3:.3g} mm, psi {low:+.1f} to {high:+.1f}, "
             f"{', '.join(f'{w * 1e9:.0f}' for w in self.wavelengths)} nm, {self.residual:.4f} waves rms off"
         )
-
-
-_SCALARS = ("focal_length", "f_number", "focus_distance", "residual")
-
-
-Parts = tuple[str, str, float, float, float, LensTable, float]  # arguments of a lens
-
-
-@lru_cache(maxsize=16)
-def _named(name: str, f_number: float, focus: float, waves: tuple[float, ...], field: float | None) -> Parts:
-    entry = NAMED_LENSES[name]
-    lens = Lens.from_prescription(entry["prescription"], f_number, focus, waves, entry["field"] if field is None else field)
-    return lens.name, lens.source, lens.focal_length, lens.f_number, lens.focus_distance, lens._table, lens.residual
-
-
-def _traced(
-    prescription: Prescription,
-    f_number: float,
-    focus: float,
-    waves: tuple[float, ...],
-    field: float,
-    nearest: float | None,
-) -> Parts:
-    system = first_order(prescription, f_number, focus)
-    scale = math.pi * system.pupil_radius**2 / REFERENCE_WAVELENGTH
-    low = -scale / focus
-    high = max(WIDEST, -low) if nearest is None else scale / nearest + low
-    fit = fit_table(system, waves, field, (low, high))
-    return prescription.name, prescription.source, system.focal_length, f_number, focus, fit.table, fit.residual
-
-
-def _wavelengths(given: Sequence[float]) -> tuple[float, ...]:
-    if isinstance(given, (str, int, float)) or not len(given):
-        raise TypeError(f"wavelengths must be one or more numbers in metres such as {RGB}, got {given!r:.60}")
-    for wavelength in given:
-        check_number("wavelengths", wavelength, "metres")
-        if not SHORTEST <= wavelength <= LONGEST:
-            raise ValueError(f"wavelengths must be metres between {SHORTEST:g} and {LONGEST:g} (530 nm is 530e-9), got {wavelength}")
-    return tuple(sorted({float(wavelength) for wavelength in given}))
-
-
-def _check_focus(focus: float) -> None:
-    check_number("focus_distance", focus, "metres")
-    if not focus > 0:
-        raise ValueError(f"focus_distance must be positive metres, got {focus}")
-
-
-def _check_field(field: float) -> None:
-    check_number("field", field, "metres")
-    if field != 0:
-        check_metres("field", field, 1e-6, 1.0, "21.6 mm is 21.6e-3")
-
-
-def _half_diagonal(prescription: Mapping[str, Any]) -> float | None:
-    """Return half the diagonal of the sensor that a prescription names, in metres."""
-    sensor, pitch = prescription.get("sensor"), prescription.get("pitch_um")
-    if sensor is None or pitch is None:
-        return None
-    if not isinstance(sensor, Sequence) or len(sensor) != 2 or isinstance(sensor, str):
-        raise TypeError(f"sensor of the prescription must be (rows, columns), got {sensor!r:.60}")
-    for value in (*sensor, pitch):
-        check_positive("sensor and pitch_um of the prescription", value)
-    return 0.5e-6 * pitch * math.hypot(*sensor)

@@ -1,4 +1,4 @@
-"""Lens table: what a traced lens does to light, over field height, defocus and wavelength, in a few thousand numbers."""
+"""Lens table: what a lens does to light over field height, defocus and wavelength, in a few thousand numbers."""
 
 from __future__ import annotations
 

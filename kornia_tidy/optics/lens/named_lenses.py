@@ -23,7 +23,7 @@ def _aspheres(*rows: tuple[Any, ...]) -> list[dict[str, Any]]:
     """Return surfaces from rows (radius, conic constant, gap, glass behind, coefficients of r^3 to r^10)."""
     found: list[dict[str, Any]] = [{"kind": "stop", "t": 0.0}]
     for radius, conic, gap, glass, coefficients in rows:
-        powers = {power: value for power, value in enumerate(coefficients, 3)}
+        powers = dict(enumerate(coefficients, 3))
         found.append({"R": radius, "k": conic, "t": gap, "glass": glass, "poly": powers})
     return found
 
@@ -36,8 +36,8 @@ _DOUBLE_GAUSS = {
     "name": "double-gauss-50mm",
     "unit": "mm",
     "source": (
-        "JP 62-87922 A (1987), example 1: 50 mm f/1.8, six elements. Indices by Cauchy's equation through nd and Abbe's "
-        "number; clear radii as listed for it at photonstophotos.net"
+        "JP 62-87922 A (1987), example 1: 50 mm f/1.8, six elements. Indices by Cauchy's equation through nd and "
+        "Abbe's number; clear radii as listed for it at photonstophotos.net"
     ),
     "surfaces": _surfaces(
         (34.30, 4.5, "1", 15.495),

@@ -105,7 +105,9 @@ class Prescription:
         if not isinstance(rows, Sequence) or isinstance(rows, (str, bytes)):
             raise TypeError(f"surfaces of the prescription must be a list of mappings, got {described(rows)}")
         if not 2 <= len(rows) <= MOST_SURFACES:
-            raise ValueError(f"surfaces of the prescription must be 2 to {MOST_SURFACES} with the stop, got {len(rows)}")
+            raise ValueError(
+                f"surfaces of the prescription must be 2 to {MOST_SURFACES} with the stop, got {len(rows)}"
+            )
         surfaces = tuple(_surface(i, row, scale, last=i == len(rows) - 1) for i, row in enumerate(rows))
         stops = sum(surface.is_stop for surface in surfaces)
         if stops != 1:
@@ -113,7 +115,9 @@ class Prescription:
         if surfaces[-1].is_stop:
             raise ValueError("the stop of the prescription must have a surface behind it, got it as the last one")
         if surfaces[-1].glass != "air":
-            raise ValueError(f"the last surface of the prescription must have air behind it, got {surfaces[-1].glass!r}")
+            raise ValueError(
+                f"the last surface of the prescription must have air behind it, got {surfaces[-1].glass!r}"
+            )
         for i, surface in enumerate(surfaces):
             if surface.is_stop and i and surfaces[i - 1].glass != surface.glass:
                 raise ValueError(
@@ -171,9 +175,11 @@ def _term(what: str, power: Any, value: Any, scale: float) -> tuple[int, float]:
     if not (isinstance(power, int) or (isinstance(power, str) and power.isdecimal())) or isinstance(power, bool):
         raise TypeError(f"powers in poly of {what} must be whole numbers, got {power!r:.60}")
     if not 1 < int(power) <= HIGHEST_POWER:
-        raise ValueError(f"powers in poly of {what} must be from 2 to {HIGHEST_POWER}, got {power:.20}"
-                         if isinstance(power, str) else
-                         f"powers in poly of {what} must be from 2 to {HIGHEST_POWER}, got {power}")
+        raise ValueError(
+            f"powers in poly of {what} must be from 2 to {HIGHEST_POWER}, got {power:.20}"
+            if isinstance(power, str)
+            else f"powers in poly of {what} must be from 2 to {HIGHEST_POWER}, got {power}"
+        )
     coefficient = _number(f"coefficient of power {int(power)} of {what}", value)
     return int(power), coefficient * scale ** (1 - int(power))
 
@@ -183,7 +189,9 @@ def _glasses(given: Any, surfaces: Sequence[Surface]) -> dict[str, Material]:
     found = {}
     for glass in dict.fromkeys(s.glass for s in surfaces if s.glass != "air"):
         if glass not in given:
-            raise ValueError(f"index of the prescription must have the glass {glass!r:.60}, got {_words(map(str, given))}")
+            raise ValueError(
+                f"index of the prescription must have the glass {glass!r:.60}, got {_words(map(str, given))}"
+            )
         found[glass] = _material(glass, given[glass])
     return found
 
@@ -194,8 +202,10 @@ def _material(glass: str, given: Any) -> Material:
         return constant_index(_index(what, given))
     if set(given) == {"sellmeier"}:
         terms = given["sellmeier"]
-        if not isinstance(terms, Sequence) or not terms or any(
-            not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2 for pair in terms
+        if (
+            not isinstance(terms, Sequence)
+            or not terms
+            or any(not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2 for pair in terms)
         ):
             raise ValueError(f"{what} must have pairs of b and c under 'sellmeier', got {terms!r:.60}")
         pairs = tuple((_number(f"b in {what}", b), _number(f"c in {what}", c)) for b, c in terms)
@@ -209,7 +219,9 @@ def _material(glass: str, given: Any) -> Material:
     if not pairs:
         raise ValueError(f"{what} must be known at one wavelength or more, got none")
     if len(pairs) == 1:
-        return Material(glass, "prescription", DISPERSIONS["_power_series"], ((pairs[0][1], 0),), (pairs[0][0],) * 2)
+        return Material(
+            glass, "prescription", DISPERSIONS["_power_series"], ((pairs[0][1], 0),), (pairs[0][0], pairs[0][0])
+        )
     return cauchy_through(glass, "prescription", pairs)
 
 

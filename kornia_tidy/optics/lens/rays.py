@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kornia_tidy.optics.lens.prescription import Surface
 
-Array = NDArray[np.float64]
+Array = np.ndarray[Any, np.dtype[np.float64]]
 _STEPS, _CLOSE = 60, 1e-13  # of Newton's method on an aspheric surface; metres, before its last step
 
 

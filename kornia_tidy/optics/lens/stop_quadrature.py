@@ -45,8 +45,8 @@ def stop_quadrature(spans: Array, order: int, discs: Array) -> StopQuadrature:
 
     Example:
         >>> edges = np.linspace(-1.15, 1.15, 24)
-        >>> points = stop_quadrature(np.stack([edges[:-1], edges[1:]]), 4, np.array([[0.0, 0.0, 1.0]]))
-        >>> bool((points.weight.sum() - torch.pi).abs() < 1e-9)
+        >>> points = stop_quadrature(np.stack([edges[:-1], edges[1:]]), 6, np.array([[0.0, 0.0, 1.0]]))
+        >>> bool((points.weight.sum() - torch.pi).abs() < 1e-6)
         True
     """
     begin, end = spans
@@ -72,7 +72,7 @@ def stop_quadrature(spans: Array, order: int, discs: Array) -> StopQuadrature:
 
 
 def light_through_stop(sample: LensSample) -> Tensor:
-    """Return the area of direction cosines that the open stop fills on the sensor, (F, D), up to a factor of the lens."""
+    """Return the area of direction cosines that the open stop fills, (F, D), up to a factor of the lens."""
     found = []
     for f in range(len(sample.radial)):
         edges = sample.edges[f].numpy()
@@ -98,7 +98,7 @@ def _patches(box: Array, nodes: Array, weights: Array) -> tuple[Array, Array, Ar
     return np.tile(x, (1, size)), np.repeat(y, size, axis=1), weight
 
 
-def _intervals(box: Array, discs: Array) -> tuple[Array, Array]:
+def _intervals(box: Array, discs: Array) -> tuple[np.ndarray, Array]:
     """Return the intervals of x on which a cut cell has one edge below and one above: their cell, and (2, I)."""
     marks = [box[0], box[1]]
     for x, y, radius in discs:
@@ -107,7 +107,7 @@ def _intervals(box: Array, discs: Array) -> tuple[Array, Array]:
             half = np.sqrt(np.maximum(radius**2 - (side - y) ** 2, 0))
             marks += [x - half, x + half]
     marks += [np.full_like(box[0], at) for pair in combinations(discs, 2) for at in _crossings(*pair)]
-    sorted_marks = np.sort(np.clip(np.stack(marks), box[0], box[1]), axis=0)
+    sorted_marks: Array = np.sort(np.clip(np.stack(marks), box[0], box[1]), axis=0)
     begin, end = sorted_marks[:-1], sorted_marks[1:]
     which = np.argwhere((end - begin > _TOUCH).T)  # by cell, then by interval
     return which[:, 0], np.stack([begin[which[:, 1], which[:, 0]], end[which[:, 1], which[:, 0]]])

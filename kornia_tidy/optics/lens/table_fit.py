@@ -144,22 +144,28 @@ def _area(along: Tensor, across: Tensor, points: Array) -> Tensor:
 def _edges(traced: Wavefronts, points: Array) -> Tensor:
     """Return the discs that rims leave of the stop at each height, (H, surfaces, 2): centre along the field, radius.
 
-    Near its rim a surface is met at a height r with r^2 = p + q x + s (x^2 + y^2), whose contours are circles: exactly so
-    for paraxial rays. At the middle depth.
+    Near its rim a surface is met at a height r with r^2 = p + q x + s (x^2 + y^2), whose contours are circles:
+    exactly so for paraxial rays. At the middle depth.
     """
     squares = traced.heights[:, :, traced.heights.shape[2] // 2] ** 2  # (surfaces, H, N)
     x, y = points.T
     terms = np.stack([np.ones_like(x), x, x * x + y * y], 1)
     weights = (np.exp(-(((squares - 1) / _RIM) ** 2)) + 1e-3)[..., None]
     normal = np.einsum("ni,shnk,nj->shij", terms, weights, terms)
-    p, q, s = np.moveaxis(np.linalg.solve(normal, np.einsum("ni,shnk,shn->shi", terms, weights, squares)[..., None])[..., 0], -1, 0)
+    p, q, s = np.moveaxis(
+        np.linalg.solve(normal, np.einsum("ni,shnk,shn->shi", terms, weights, squares)[..., None])[..., 0], -1, 0
+    )
     centre = -q / (2 * np.maximum(s, 1e-12))
     radius = np.sqrt(np.maximum(centre**2 + (1 - p) / np.maximum(s, 1e-12), 0))
     return torch.from_numpy(np.stack([centre, radius, squares.max(-1)], -1).swapaxes(0, 1))
 
 
 def _table(
-    fitted: list[list[_Fitted]], wavelengths: tuple[float, ...], psi: Array, reach: tuple[float, float], field: tuple[float, float]
+    fitted: list[list[_Fitted]],
+    wavelengths: tuple[float, ...],
+    psi: Array,
+    reach: tuple[float, float],
+    field: tuple[float, float],
 ) -> LensTable:
     """Return the table of coefficients at heights, without those that are too small to matter."""
 
@@ -179,7 +185,9 @@ def _table(
     slope = tangent / heights[:, None].clamp(min=1e-9)
     if len(heights) > 2:  # the limit at the axis, from which both depart with the square of the height
         near, far = heights[1].square(), heights[2].square()
-        relative[:, 0], slope[0] = ((x[1] * far - x[2] * near) / (far - near) for x in (relative.transpose(0, 1), slope))
+        relative[:, 0], slope[0] = (
+            (x[1] * far - x[2] * near) / (far - near) for x in (relative.transpose(0, 1), slope)
+        )
     middle = len(psi) // 2
     radial, tangential = stacked("radial")[:, :, middle], stacked("tangential")[:, :, middle]
     size, amplitude = radial.abs().max(), over_defocus(stacked("amplitude"))
@@ -204,7 +212,11 @@ def _trimmed(values: Tensor, least: float, *, defocus: bool = False, sines: bool
     if defocus:
         rms = values.square().sum(-1).sqrt().amax((0, 2))
         values = values[:, : max(1, _needed(rms, least))]
-    degree = torch.tensor([n for n, _ in modes_of(values.shape[-1], sines=sines)]) if values.shape[-1] > 1 else torch.zeros(1)
+    degree = (
+        torch.tensor([n for n, _ in modes_of(values.shape[-1], sines=sines)])
+        if values.shape[-1] > 1
+        else torch.zeros(1)
+    )
     rms = torch.stack([values[..., degree == n].square().sum(-1).sqrt().amax() for n in range(int(degree.max()) + 1)])
     last = max(0, _needed(rms, least) - 1)
     return values[..., degree <= last]

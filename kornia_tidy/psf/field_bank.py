@@ -1,0 +1,202 @@
+"""PSFs over the field: a bank for each of several points of the picture, with the light that each receives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_psfs
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
+from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
+from kornia_tidy.runtime.default_device import on_cpu
+
+_LEAST, _MOST = 1e-7, 1e-3  # tolerance of the field
+
+
+@dataclass(frozen=True, eq=False)
+class FieldBank:
+    """Point spread functions over field, defocus and colour.
+
+    Args:
+        psfs: (F, D, C, P, P), light in each pixel in parts of that of an even scene on the axis; the centre is where
+            the chief ray of the colour lands.
+        defocus: (D,) nodes in radians at the pupil edge at 530 nm.
+        field: (F, 2) points of the field, y and x in sensor pixels from the axis.
+        energy: (F, D, C) share of the point's light inside the window, before anything is done about the rest.
+        light: (F, D, C) relative illumination: light of an even scene over that on the axis.
+
+    Convention:
+        - PSFs sum to ``energy * light``, so that vignetting stays; after ``with_stray_light("renormalize")`` to
+          ``light``.
+
+    Example:
+        >>> from kornia_tidy.psf import PSFModel
+        >>> model = PSFModel(lens="single-50mm", fidelity="draft")
+        >>> bank = model.psf_bank(defocus=[0.0], field=[(0.0, 0.0), (550.0, 630.0)])
+        >>> bank.psfs.shape[:3], round(float(bank.light[1, 0, 1]), 2)
+        (torch.Size([2, 1, 3]), 0.97)
+    """
+
+    psfs: Tensor
+    defocus: Tensor
+    field: Tensor
+    energy: Tensor
+    light: Tensor
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.psfs.shape)
+        if len(shape) != 5 or shape[3] != shape[4] or shape[3] % 2 == 0 or 0 in shape:
+            raise ValueError(f"psfs must have shape (F, D, C, P, P) with P odd, got {shape}")
+        if tuple(self.defocus.shape) != shape[1:2]:
+            raise ValueError(f"defocus must have shape ({shape[1]},) as psfs have, got {tuple(self.defocus.shape)}")
+        if tuple(self.field.shape) != (shape[0], 2):
+            raise ValueError(f"field must have shape ({shape[0]}, 2) as psfs have, got {tuple(self.field.shape)}")
+        for name, value in (("energy", self.energy), ("light", self.light)):
+            if tuple(value.shape) != shape[:3]:
+                raise ValueError(f"{name} must have shape {shape[:3]} as psfs have, got {tuple(value.shape)}")
+
+    @property
+    def window(self) -> int:
+        """Side P of the PSFs in pixels."""
+        return self.psfs.shape[-1]
+
+    def at(self, index: int) -> PSFBank:
+        """Return the bank of one point of the field; its PSFs keep the light that they have there."""
+        return PSFBank(self.psfs[index], self.defocus, self.energy[index])
+
+    def with_stray_light(self, kind: str) -> FieldBank:
+        """Return a bank in which the light outside the window is dealt with.
+
+        Args:
+            kind: ``"renormalize"`` scales each PSF to the light of its point; ``"veil"`` and ``"discard"`` leave it.
+        """
+        check_choice("stray_light", kind, STRAY_LIGHT)
+        if kind != "renormalize":
+            return self
+        energy = self.energy.clamp(min=torch.finfo(self.energy.dtype).tiny)
+        return FieldBank(self.psfs / energy[..., None, None], self.defocus, self.field, self.energy, self.light)
+
+
+@on_cpu
+def check_field(field: Sequence[tuple[float, float]], lens: Lens | None, *, states: bool) -> list[tuple[float, float]]:
+    """Return points of the field, or raise ``ValueError`` or ``TypeError`` if they are none or there is no lens."""
+    if lens is None:
+        raise ValueError(
+            "field points need a camera with a lens, got none: give it lens='double-gauss-50mm' or another"
+        )
+    if states:
+        raise ValueError("PSFs at field points are averaged over the exposure, got states=True: leave one of them out")
+    try:
+        points = torch.as_tensor(field, dtype=torch.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"field must be points (y, x) in sensor pixels, got {field!r:.80}") from None
+    if points.ndim != 2 or points.shape[1] != 2 or not len(points):
+        raise ValueError(f"field must be one or more points (y, x) in sensor pixels, got shape {tuple(points.shape)}")
+    check_finite("field", points)
+    return [(y, x) for y, x in points.tolist()]
+
+
+def field_psf_bank(
+    phase: Tensor,
+    weights: Tensor,
+    pupil: Pupil,
+    spectrum: Spectrum,
+    dispersion: Sequence[float],
+    defocus: Sequence[float],
+    field: Sequence[tuple[float, float]],
+    lens: Lens,
+    pixel_pitch: float,
+    window: int,
+    tolerance: float = 1e-2,
+) -> FieldBank:
+    r"""Return the PSFs of a mask sequence behind a real lens, at points of the field.
+
+    .. math:: h_{fdc} = \sum_\lambda s_c(\lambda)\, \ell_f(\lambda) \sum_k w_k h_{fdk\lambda}
+
+    Args:
+        phase: radians at 530 nm, (K, N, N).
+        weights: share of the exposure of each mask, (K,), summing to one.
+        pupil: what the mask's plane lets through besides the lens's stop and rims, which cut it exactly.
+        spectrum: wavelengths and how the channels weight them.
+        dispersion: for each wavelength, the factor from phase at 530 nm to phase there.
+        defocus: nodes in radians at 530 nm.
+        field: points y, x in sensor pixels from the axis.
+        lens: in front of the sensor.
+        pixel_pitch: of the sensor in metres.
+        window: side P of the PSFs in pixels, odd.
+        tolerance: error allowed to the integrals over sensor pixels, as for the PSFs of an ideal lens.
+
+    Convention:
+        - PSFs of a channel are centred where its light lands on average: what its colours lie apart is in them, what
+          the channels lie apart is not.
+
+    Example:
+        >>> from kornia_tidy.psf import Pupil
+        >>> lens, mask = Lens.named("single-50mm", 17.6, 0.595), torch.zeros(1, 23, 23)
+        >>> stop, grey = Pupil(torch.ones(23, 23), 0.1), Spectrum.monochrome()
+        >>> field_psf_bank(mask, torch.ones(1), stop, grey, [1.0], [0.0], [(0, 0)], lens, 8e-6, 23).psfs.shape
+        torch.Size([1, 1, 1, 23, 23])
+    """
+    sensor = Sensor(pixel_pitch, window, min(max(tolerance / 10, _LEAST), _MOST))
+    apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
+    screens = [_screens(phase, pupil, factor) for factor in dispersion]
+    stop = weights, pupil.transmission, lens
+    psfs, light = [], []
+    for point, shifts in zip(field, apart, strict=True):
+        metres = (point[0] * pixel_pitch, point[1] * pixel_pitch)
+        total: Tensor | float = 0.0
+        lit: Tensor | float = 0.0
+        for w, wavelength in enumerate(spectrum.wavelengths):
+            seen, mixing = _mixing(spectrum, w, phase)
+            if seen:
+                given = metres, defocus, wavelength, sensor, shifts[w, seen].tolist()
+                energies, share = lens_psfs(screens[w], *stop, *given)
+                total = total + torch.einsum("pv,d,dvyx->dpyx", mixing, share, energies)
+                lit = lit + torch.einsum("pv,d->dp", mixing, share)
+        psfs.append(total)
+        light.append(lit)
+    whole, there = torch.stack(psfs), torch.stack(light)
+    energy = whole.sum((-2, -1)) / torch.where(there == 0, torch.ones_like(there), there)
+    points = phase.new_tensor([list(point) for point in field])
+    return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
+
+
+def _mixing(spectrum: Spectrum, wave: int, like: Tensor) -> tuple[list[int], Tensor]:
+    """Return the channels that see a wavelength, and its weight in each plane by channel, (planes, channels seen)."""
+    planes = [row[wave] for row in spectrum.plane_weights]
+    basis = len(planes) // len(spectrum.weights)
+    seen = [channel for channel, row in enumerate(spectrum.channel_weights) if row[wave]]
+    rows = [[weight if plane // basis == channel else 0.0 for channel in seen] for plane, weight in enumerate(planes)]
+    return seen, like.new_tensor(rows)
+
+
+def _screens(phase: Tensor, pupil: Pupil, dispersion: float) -> list[Screen]:
+    """Return the fields in the stop: of whole cells, or of what a mask with gaps changes and of the rest."""
+    cells = pupil.amplitude.shape[-1]
+    waves = pupil_field(phase, pupil.amplitude, dispersion)
+    begin = torch.arange(cells, dtype=torch.float64) - cells / 2
+    whole = torch.stack([begin, begin + 1]) * pupil.cell_pitch
+    if pupil.fill_factor == 1:
+        return [Screen(waves, whole)]
+    active = gapped_cells(cells, cells // phase.shape[-1], pupil.fill_factor)[:, :cells] * pupil.cell_pitch
+    still = pupil.amplitude.to(waves).expand_as(waves)
+    return [Screen(waves - still, active), Screen(still, whole)]
+
+
+@on_cpu
+def _lateral_shifts(lens: Lens, field: Sequence[tuple[float, float]], spectrum: Spectrum, pitch: float) -> Tensor:
+    """Return by how many pixels light of a wavelength lands beside the mean of each channel, (F, W, C, 2)."""
+    points, shares = (torch.tensor(rows, dtype=torch.float64) for rows in (field, spectrum.channel_weights))
+    if int((shares > 0).sum(1).max()) == 1:
+        return points.new_zeros(len(points), *shares.T.shape, 2)
+    heights = torch.linalg.vector_norm(points, dim=1)
+    along = torch.stack([lens.lateral_colour(heights * pitch, wave) for wave in spectrum.wavelengths], 1) / pitch
+    apart = along[:, :, None] - (along @ shares.T)[:, None]
+    direction = points / heights.clamp(min=1e-12)[:, None]
+    return apart[..., None] * direction[:, None, None]
