@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-import kornia_tidy.files
 from kornia_tidy.cli import main, read_command
 from kornia_tidy.data import read_depth, read_image
+from kornia_tidy.figures import style
 from kornia_tidy.inference import capture_file
 from kornia_tidy.inference.capture_file import read_light
 from kornia_tidy.inference.light_head import LightHead, reconstruct_light
@@ -193,8 +193,8 @@ class TestRawReconstruct(BaseTester):
                 raise KeyboardInterrupt
             write(path, data)
 
-        write = kornia_tidy.files.write_bytes
-        monkeypatch.setattr(kornia_tidy.files, "write_bytes", interrupting)
+        write = style.write_bytes
+        monkeypatch.setattr(style, "write_bytes", interrupting)
         assert reconstruct(files, weights, folder) == 130
         assert (folder / "a.json").exists()
         assert (folder / "b.png").exists()

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.commands import trade
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.fidelity import LAYERS
@@ -70,7 +69,7 @@ class TestTrade(BaseTester):
 
         command = ["trade", *QUICK, *KNOBS, "-o", str(tmp_path)]
         with monkeypatch.context() as patch:
-            patch.setattr(trade, "sweep", interrupted)
+            patch.setattr(sys.modules["kornia_tidy.tradeoff.measure"], "sweep", interrupted)
             assert main(command) == 130
         assert "2 of 4 settings are written" in capsys.readouterr().out
         assert [row.value for row in read_json(tmp_path / "trade.json").rows] == [2.5, 2.0]
