@@ -15,7 +15,7 @@ from kornia_tidy.augmentation.rows import changed_rows, row_seeds
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.sensor.recording import quantize, shot_noise
+from kornia_tidy.sensor.steps import quantize, shot_noise
 
 COLOR_SPACES = ("srgb", "linear")
 
@@ -55,7 +55,7 @@ def sensor_noise(
         ValueError: if the image is not (B, C, H, W), or a quantity is negative.
 
     Convention:
-        - Gradients are those of :func:`~kornia_tidy.sensor.recording.shot_noise`, zero where a value is clipped.
+        - Gradients are those of :func:`~kornia_tidy.sensor.steps.shot_noise`, zero where a value is clipped.
         - :class:`~kornia_tidy.SensorNoise` is the same sensor as a module, in linear light.
 
     Source: EMVA Standard 1288, 4.0, section 2 (linear camera model).

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample
 from kornia_tidy.render.bands import padded_band
-from kornia_tidy.sensor.noise import STRIP
+from kornia_tidy.sensor.sensor import STRIP
 
 
 def rows_at_once(sample: Sample, allowed: int) -> int | None:

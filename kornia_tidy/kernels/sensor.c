@@ -1,4 +1,4 @@
-// What a sensor records of light, with its derivative. The formulas are in sensor/recording.py and sensor/shot.py.
+// What a sensor records of light, with its derivative. The formulas are in sensor_ops.py and sensor/steps.py.
 //
 // Counts below 25 electrons are found term by term in double, as float32 would change one in 3e5. Above, the normal
 // quantile is (2 u - 1) G(w) with w = -log(4 u (1 - u)), G a polynomial of w, or of its root beyond 5.

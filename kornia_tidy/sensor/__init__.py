@@ -1,15 +1,15 @@
 """Sensor: converts irradiance to the values that a camera records, with shot, dark and read noise.
 
 A linear-light image in units of full scale comes in. The same image with noise, quantised and clipped, goes out. Read
-``noise.py`` first; ``recording.py`` has its formula, ``sensor.py`` says what another sensor must take,
+``noise.py`` first; ``sensor.py`` has what it shares with sensors of your own, ``steps.py`` single steps,
 ``fixed_pattern.py`` what differs from pixel to pixel, ``exposure.py`` the light that an f-number admits.
 """
 
 from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor, full_well_of
 from kornia_tidy.sensor.fixed_pattern import draw_pattern
 from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.sensor.recording import quantize, shot_noise
 from kornia_tidy.sensor.sensor import Sensor
+from kornia_tidy.sensor.steps import quantize, shot_noise
 
 __all__ = [
     "Sensor",

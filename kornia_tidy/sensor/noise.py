@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_float_tensor, check_generator, check_number, check_positive
+from kornia_tidy.checks import check_number, check_positive
+from kornia_tidy.kernels.sensor_ops import record
 from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at
-from kornia_tidy.sensor.recording import check_bits, record
+from kornia_tidy.sensor.sensor import Sensor
+from kornia_tidy.sensor.steps import check_bits
 
-STRIP = 64  # rows of noise drawn in one call
 
-
-class SensorNoise(nn.Module):
+class SensorNoise(Sensor):
     r"""A sensor: converts a linear-light image to the recorded image, also in linear light.
 
     The steps, with full scale = 1.0 = ``full_well`` electrons:
@@ -113,54 +113,31 @@ class SensorNoise(nn.Module):
         _check_not_negative("read_noise_electrons", read_noise_electrons, "electrons")
         return cls(read_noise_electrons / full_well, full_well=full_well, dark=dark_electrons, bits=bits)
 
-    def forward(
-        self,
-        image: Tensor,
-        params: Mapping[str, Tensor] | None = None,
-        generator: torch.Generator | None = None,
-        origin: tuple[int, int] = (0, 0),
-    ) -> Tensor:
-        """Return the noisy image.
+    @property
+    def noise(self) -> dict[str, Callable[..., Tensor]]:
+        """What is drawn: "read" if ``sigma`` is not zero, "shot", uniform in [0, 1), if ``full_well`` is given."""
+        samplers: dict[str, Callable[..., Tensor]] = {"read": torch.randn} if self.sigma > 0 else {}
+        return samplers if self.full_well is None else samplers | {"shot": torch.rand}
 
-        Args:
-            image: (B, C, H, W), linear light, 1.0 = full scale. Negative values (FFT round-off) give no electrons.
-            params: random fields of an earlier :meth:`draw`, to be used again; needed for reproducible noise under
-                ``torch.compile``.
-            generator: source of random numbers, in eager mode only; it may be on another device than the image.
-                Default: the global generator of the image's device.
-            origin: row and column of the sensor at the image's first pixel, by which ``response`` and ``offset`` are
-                found. The noise does not depend on it.
-
-        Returns:
-            The same shape and dtype.
+    def record(self, light: Tensor, noise: Mapping[str, Tensor], origin: tuple[int, int]) -> Tensor:
+        """Return the noisy light. See the class.
 
         Raises:
-            TypeError: if the image is not a floating-point tensor.
-            ValueError: if the image is not (B, C, H, W), a field is missing or has another shape, both ``params``
-                and ``generator`` are given, or the image reaches beyond the pixels of ``response`` or ``offset``.
+            ValueError: if the light reaches beyond the pixels of ``response`` or ``offset``.
         """
-        check_float_tensor("image", image, 4, "(B, C, H, W)")
-        value = image.to(torch.promote_types(image.dtype, torch.float32))
-        if params is None:
-            fields = self.draw(image.shape, device=image.device, generator=generator, dtype=value.dtype)
-        elif generator is not None:
-            raise ValueError("give params to replay or generator to draw, got both")
-        else:
-            fields = {name: self._field(params, name, value) for name in self._field_names()}
         if self.response is not None:
-            value = value * pattern_at("response", self.response, value, origin)
-        offset = self.offset if self.offset is None else pattern_at("offset", self.offset, value, origin)
+            light = light * pattern_at("response", self.response, light, origin)
         return record(
-            value,
-            fields.get("shot"),
-            fields.get("read"),
-            None if offset is None else offset.expand_as(value),
+            light,
+            noise.get("shot"),
+            noise.get("read"),
+            None if self.offset is None else pattern_at("offset", self.offset, light, origin).expand_as(light),
             1.0 if self.full_well is None else self.full_well,
             self.dark,
             self.sigma,
             self.bits,
             self.clip,
-        ).to(image.dtype)
+        )
 
     def std(self, image: Tensor) -> Tensor:
         r"""Return the standard deviation of the noise in each pixel, before the clip; a fixed pattern is none.
@@ -188,68 +165,6 @@ class SensorNoise(nn.Module):
         if self.bits is not None:
             variance = variance + (2**self.bits - 1) ** -2.0 / 12
         return variance.sqrt()
-
-    def draw(
-        self,
-        shape: Sequence[int],
-        device: torch.device | str | None = None,
-        generator: torch.Generator | None = None,
-        dtype: torch.dtype = torch.float32,
-    ) -> dict[str, Tensor]:
-        """Draw the random fields for an image of this shape.
-
-        Args:
-            shape: the image's shape (B, C, H, W).
-            device: device of the fields. They are drawn on the generator's device, so a CPU generator gives the same
-                fields for every device.
-            generator: source of random numbers. Default: the global generator of ``device``.
-            dtype: float32 or float64.
-
-        Returns:
-            "read": standard normal, if ``sigma`` is not zero; "shot": uniform in [0, 1), if ``full_well`` is given.
-
-        Raises:
-            ValueError: if ``dtype`` is neither.
-
-        Convention:
-            - Fields are drawn in strips of 64 rows from the top, so that an image rendered in bands has the same noise
-              as the whole.
-
-        Example:
-            >>> sorted(SensorNoise(0.01, full_well=1e4).draw((1, 3, 4, 4)))
-            ['read', 'shot']
-        """
-        if dtype != torch.float32:
-            check_choice("dtype", dtype, (torch.float32, torch.float64))
-        if generator is not None:
-            check_generator(generator)
-        source = device if generator is None else generator.device
-        samplers = {"read": torch.randn} if self.sigma > 0 else {}
-        if self.full_well is not None:
-            samplers["shot"] = torch.rand
-        *outer, height, width = shape
-        fields: dict[str, Tensor] = {}
-        for top in range(0, max(height, 1), STRIP):
-            part = (*outer, min(STRIP, height - top), width)
-            for name, sampler in samplers.items():
-                drawn = sampler(part, generator=generator, device=source, dtype=dtype)
-                if name not in fields:
-                    fields[name] = drawn.new_empty(*shape, device=device)
-                fields[name][..., top : top + STRIP, :] = drawn.to(device)
-        return fields
-
-    def _field_names(self) -> list[str]:
-        return ["read"] * (self.sigma > 0) + ["shot"] * (self.full_well is not None)
-
-    @staticmethod
-    def _field(params: Mapping[str, Tensor], name: str, value: Tensor) -> Tensor:
-        if name not in params:
-            raise ValueError(f"params must hold the field {name!r} as draw() returns it, got {sorted(params)}")
-        if params[name].shape != value.shape:
-            raise ValueError(
-                f"params[{name!r}] must have the image's shape {tuple(value.shape)}, got {tuple(params[name].shape)}"
-            )
-        return params[name].to(value)
 
     def extra_repr(self) -> str:
         """Return a one-line description of the sensor."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import Sensor
 
 
-class SensorEach(nn.Module):
+class SensorEach(Sensor):
     """A batch of sensors, one for each capture.
 
     Args:
@@ -35,11 +37,17 @@ class SensorEach(nn.Module):
         super().__init__()
         self.sensors = nn.ModuleList(sensors)
 
-    def forward(
-        self, irradiance: Tensor, params: Mapping[str, Tensor] | None = None, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Return the recorded captures; noise is drawn for one after the other."""
-        seen = [sensor(one[None], params, generator) for sensor, one in self._each(irradiance)]
+    @property
+    def noise(self) -> dict[str, Callable[..., Tensor]]:
+        """What any of the sensors draws."""
+        return {name: draw for sensor in self.sensors for name, draw in cast("Sensor", sensor).noise.items()}
+
+    def record(self, light: Tensor, noise: Mapping[str, Tensor], origin: tuple[int, int]) -> Tensor:
+        """Return the recorded captures."""
+        seen = []
+        for n, (sensor, one) in enumerate(self._each(light)):
+            own = {name: noise[name][n : n + 1] for name in sensor.noise}
+            seen.append(sensor.record(one[None], own, origin))
         return torch.cat(seen)
 
     def std(self, image: Tensor) -> Tensor:

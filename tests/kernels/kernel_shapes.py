@@ -412,7 +412,7 @@ def _recorded(
     bits: int,
     clip: bool,
 ) -> _Recorded:
-    """The formulas of ``recording.py`` by SciPy's distributions; the rate is rounded as that of the sensor is."""
+    """The formulas of ``sensor_ops.py`` by SciPy's distributions; the rate is rounded as that of the sensor is."""
     share, eps = gamma(24, light.dtype), torch.finfo(light.dtype).eps
     value, slope, torn = light.double(), torch.ones_like(light).double(), torch.zeros_like(light, dtype=torch.bool)
     off = torch.zeros_like(value)

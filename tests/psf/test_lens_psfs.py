@@ -14,7 +14,8 @@ from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics import Lens, Spectrum, circular_aperture
 from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.zernike import zernike_polynomials
-from kornia_tidy.psf import FieldBank, PSFModel
+from kornia_tidy.psf import FieldBank, PSFModel, Pupil
+from kornia_tidy.psf.field_bank import field_psf_bank
 from tests.base import BaseTester, shared
 from tests.optics.lens.lenses import symmetric_pair
 
@@ -196,13 +197,12 @@ class TestLensPSFs(BaseTester):
 
     def test_gradcheck_to_the_masks(self):
         lens = Lens.from_seidel(50e-3, 17.6, 0.595, 7e-3, coma=0.5)
-        camera, small = lens.camera(8e-6), Fidelity(window=3, double=True)
+        flat = torch.ones(1, dtype=torch.float64)
+        pupil = Pupil(torch.ones(5, 5, dtype=torch.float64), 0.46)
 
         def psfs(phase: torch.Tensor) -> torch.Tensor:
-            masks = PixelwiseMask(1, 5)
-            seen = PSFModel(masks, camera, lens=lens, spectrum=GREY, fidelity=small)
-            shown = seen.replace(masks=masks)._replace(shown=seen.timeline(torch.float64)._replace(states=phase))
-            return shown.psf_bank(dtype=torch.float64, defocus=[4.0], field=[(300.0, 400.0)]).psfs
+            given = pupil, GREY, [1.0], [4.0], [(300.0, 400.0)], lens, 8e-6, 3
+            return field_psf_bank(phase, flat, *given).psfs
 
         self.gradcheck(psfs, (torch.rand(1, 5, 5),))
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.inference.trained import update_psfs
 from kornia_tidy.reconstruction.closed_form import ClosedForm
-from kornia_tidy.sensor import Sensor, draw_pattern
+from kornia_tidy.sensor import draw_pattern
 from tests.base import BaseTester
 
 SIZE = (150, 60)  # rows of a strip: 64
@@ -113,7 +113,7 @@ class TestPatternedSensor(BaseTester):
             patterned()(torch.rand(1, 1, 151, 60))
 
 
-class RowCounter(nn.Module, Sensor):
+class RowCounter(nn.Module):
     """A sensor of somebody else's, that records on which row of it light falls."""
 
     def forward(self, irradiance, params=None, generator=None, origin=(0, 0)):

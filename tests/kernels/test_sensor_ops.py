@@ -6,9 +6,9 @@ import pytest
 import torch
 from scipy import stats
 
-from kornia_tidy.kernels.sensor_ops import SOURCE
-from kornia_tidy.sensor import SensorNoise, recording
-from kornia_tidy.sensor.recording import record
+from kornia_tidy.kernels import sensor_ops
+from kornia_tidy.kernels.sensor_ops import SOURCE, record
+from kornia_tidy.sensor import SensorNoise
 from tests.base import BaseTester
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
@@ -31,7 +31,7 @@ def by_torch(monkeypatch):
 
     def made(sensor, light, params):
         with monkeypatch.context() as patch:
-            patch.setattr(recording, "compiled", lambda source, dtype: None)
+            patch.setattr(sensor_ops, "compiled", lambda source, dtype: None)
             return sensor(light, params)
 
     return made

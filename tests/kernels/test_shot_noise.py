@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from kornia_tidy.sensor import shot, shot_noise
-from kornia_tidy.sensor.shot import GAUSSIAN_FROM, poisson_quantile
+from kornia_tidy.kernels import shot_noise as shot
+from kornia_tidy.kernels.shot_noise import GAUSSIAN_FROM, poisson_quantile
+from kornia_tidy.sensor import shot_noise
 from tests.base import BaseTester
 
 needs_more_than_half = pytest.mark.parametrize("wide", [torch.float32, torch.float64], ids=str)

@@ -1,4 +1,4 @@
-"""Shot noise: Poisson draws of electrons from a uniform random field, with a gradient for the mean."""
+"""Poisson draws of electrons from uniform random numbers by plain operations of torch, with a gradient for the mean."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MAX_COUNT = 80  # P(more than 72 | 25 expected) is 7e-15, the tail that poisson
 
 
 def drawn_electrons(rate: Tensor, uniform: Tensor) -> Tensor:
-    """Return the electrons of :func:`~kornia_tidy.sensor.recording.shot_noise`, by plain operations of torch.
+    """Return the electrons of :func:`~kornia_tidy.sensor.shot_noise`, by plain operations of torch.
 
     Args:
         rate: expected electrons, not negative, float32 or float64, any shape.
