@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: float) -> RenderPlan:
     """Return the cheapest fidelity for a scene within an error. See :meth:`TiDyOptics.plan`."""
-    from kornia_tidy.planning.measured_plan import plan_measured  # noqa: PLC0415 (a capture without a plan does not need it)
-    from kornia_tidy.planning.planner import Planner  # noqa: PLC0415
-    from kornia_tidy.planning.wide_plan import plan_wide  # noqa: PLC0415
+    from kornia_tidy.planning.plan import plan_scene  # noqa: PLC0415 (a capture without a plan does not need it)
 
     shape = (len(optics.spectrum.weights), *depth.shape[-2:])
     blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
@@ -30,11 +28,7 @@ def plan_capture(optics: Any, depth: Tensor, image: Tensor | None, tolerance: fl
         raise ValueError(f"a plan needs at least one image and its depth, got {found}")
     light = None if image is None else optics.decode(sample.image.to(sample.dtype))
     defocus = optics.defocus(sample.depth.to(compute_dtype(depth.dtype, optics.fidelity, depth.device)))
-    if optics.psf_model.measured is not None:
-        return plan_measured(optics, defocus, (len(sample.image), sample.image.shape[1]), tolerance)
-    if (wide := plan_wide(optics, defocus, light, tolerance)) is not None:
-        return wide
-    return Planner(optics, sample.image.shape[1]).scene(defocus, light).plan(tolerance)
+    return plan_scene(optics, defocus, light, (len(sample.image), sample.image.shape[1]), tolerance)
 
 
 def explain_capture(optics: Any, image: Tensor, depth: Tensor) -> Explanation:

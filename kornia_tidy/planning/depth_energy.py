@@ -99,10 +99,12 @@ class Depths:
         inside[..., top : _OFFSET + height - margin, left : _OFFSET + width - margin] = 1
         return inside
 
-    def _labels(self, batch: int) -> Tensor:
+    def _labels(self, batch: int, foremost: bool = False) -> Tensor:
         """Return the bin of each pixel of the padded planes, (B, 1, H', W'); outside, the number of bins."""
-        outside = torch.tensor(len(self.psi))
-        return self._laid_out(self._index, outside).expand(batch, -1, -1, -1)
+        outside, index = torch.tensor(len(self.psi)), self._index
+        if foremost:
+            index = max_pool2d(index.double(), 3, 1, 1).long()
+        return self._laid_out(index, outside).expand(batch, -1, -1, -1)
 
     def shares(self, light: Tensor) -> Tensor:
         r"""Return the share of each octave's power within reach of the pixels at each depth, for gather.
@@ -157,7 +159,7 @@ class Depths:
         labels = self._index.expand(len(light), -1, -1, -1).flatten()
         return planes.new_zeros(len(planes), len(self.psi)).index_add_(1, labels, planes) / planes.shape[1]
 
-    def products(self, light: Tensor) -> Tensor:
+    def products(self, light: Tensor, foremost: bool = False) -> Tensor:
         """Return the inner products of the light at two depths in each octave, for scatter.
 
         The light of one depth, black elsewhere, has outlines that the image lacks. For depths with similar PSFs they
@@ -165,6 +167,8 @@ class Depths:
 
         Args:
             light: (B, C, H, W).
+            foremost: whether a pixel's light is given to the nearest depth among its neighbours, as light that shines
+                through a gap has the blur of the gap.
 
         Returns:
             (C, levels + 1, b, b) float64, a mean over pixels; of the last octave less that of the means.
@@ -172,7 +176,7 @@ class Depths:
         light = light.detach().float().cpu()
         count = len(self.psi)
         planes = self._laid_out(light, 0.0).transpose(0, 1)
-        labels = self._labels(len(light))[:, 0]
+        labels = self._labels(len(light), foremost)[:, 0]
         inside = (labels[:1, None] < count).float()
         covered = avg_pool2d(inside, 2**LEVELS)[0]
         drawn_out = self._border == "replicate"  # the replicated border adds to the light of the image

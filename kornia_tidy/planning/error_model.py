@@ -17,11 +17,11 @@ light, the contributions of bins b and b' add up or cancel:
 
 with the products :math:`C_{jbb'}` of the light at b and at b'.
 
-For a change of layers, every :math:`\Delta_b` is a linear combination of a few PSFs. PSFs are band-limited in
-:math:`\psi`, so those at some sixty Chebyshev nodes give all others by interpolation, and the kind and spacing of the
-layers only change the coefficients. The sums over f then reduce to a matrix of inner products of these PSFs, one for
-each channel and octave. For a change of window, quadrature points per pixel or wavelengths, :math:`\Delta` is computed
-at some depths. Differences at two depths are then assumed equal or independent, whichever gives the larger error.
+The sums over f are computed at some depths of the scene, and the power between them is interpolated. Where bins add up
+in amplitude, differences at two depths are assumed equal or independent, whichever gives the larger error.
+
+PSFs are band-limited in :math:`\psi`, so those at some sixty Chebyshev nodes give all others by interpolation, and the
+kind and spacing of the layers only change the coefficients.
 
 This is an estimate, which assumes that the light of an octave has random phases. The safety factors of
 :mod:`kornia_tidy.planning.planner` cover the deviation of real scenes.
@@ -38,8 +38,6 @@ from torch import Tensor
 from kornia_tidy.planning.scene_light import SceneLight, interpolation
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
 from kornia_tidy.render.layers import assign_layers
-
-_NEGLIGIBLE = 1e-3  # of an octave's power; the weakest frequencies are left out
 
 
 def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
@@ -132,67 +130,23 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
     return weights @ torch.tensor(matrix, dtype=torch.float64), samples
 
 
-class LayerErrors:
-    """Prediction of root mean square differences between captures of one scene with different layers.
-
-    Args:
-        nodes: Chebyshev nodes from which the PSFs of the masks are interpolated, see :func:`nodes_needed`.
-        psfs: (n, C, P, P) PSFs there, not normalised.
-        light: of the scene.
-    """
-
-    def __init__(self, nodes: Tensor, psfs: Tensor, light: SceneLight) -> None:
-        self._nodes, self._light = nodes, light
-        shapes = light.shapes(psfs.shape[-1])
-        self._products = torch.stack([_products(own, shape) for own, shape in zip(psfs.unbind(1), shapes, strict=True)])
-
-    def rows(self, nodes: Sequence[float], layers: str, band: float) -> Tensor:
-        """Return the interpolation coefficients of the layered PSF of each bin of defocus, (b, n)."""
-        weights, at = layer_coefficients(self._light.psi, nodes, layers, band)
-        return weights @ chebyshev_weights(torch.tensor(at, dtype=torch.float64), self._nodes)
-
-    def own_rows(self) -> Tensor:
-        """Return the interpolation coefficients of the exact PSF of each bin of defocus, (b, n)."""
-        return chebyshev_weights(self._light.psi, self._nodes)
-
-    def __call__(self, ours: Tensor, theirs: Tensor) -> float:
-        """Return the root mean square difference between captures with two sets of coefficients, full scale 1."""
-        difference = ours - theirs
-        responses = difference @ self._products  # (C, octaves, b, n)
-        alone = (responses * difference).sum(-1)
-        squares = [
-            ((own @ difference.float()) * responses).sum((1, 2, 3)) if own.ndim == 4 else (own * alone).sum((1, 2))
-            for own in self._light.energies
-        ]
-        return math.sqrt(max(0.0, *(float(each.mean()) for each in squares)))
-
-
-def _products(psfs: Tensor, shapes: Tensor) -> Tensor:
-    """Return the inner products of the PSFs of one channel in each octave, (octaves, n, n).
-
-    In float64: of layers close to each other all but a millionth cancels.
-    """
-    size = shapes.shape[-2]
-    spectra = torch.view_as_real(torch.fft.rfft2(psfs.double(), s=(size, size)).flatten(1))
-    products = []
-    for weight in shapes.flatten(1):
-        ordered = weight.sort(descending=True).values
-        counts = weight >= ordered[int((ordered.cumsum(0) < 1 - _NEGLIGIBLE).sum())]
-        own = spectra[:, counts]
-        products.append((own * weight[counts, None]).flatten(1) @ own.flatten(1).mT)
-    return torch.stack(products)
-
-
-def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight) -> float:
+def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight, *, alternate: bool = False) -> float:
     """Return the root mean square error on a scene from changes of the PSFs.
 
     Args:
         nodes: ascending defocus in radians at which the changes are given. In between, their power is interpolated.
         changes: (len(nodes), C, P, P).
         light: of the scene.
+        alternate: whether the changes of PSFs at similar depths may have opposite signs, as those of layers do.
     """
     shapes = light.shapes(changes.shape[-1])
-    power = torch.fft.rfft2(changes, s=(shapes.shape[-2],) * 2).abs().square()
-    known = (power.double().transpose(0, 1).flatten(2) @ shapes.flatten(2).mT).clamp(min=0)  # (C, nodes, octaves)
-    squares = interpolation(light.grid, nodes) @ known
-    return math.sqrt(max(light.mean_square(squares.mT)))
+    known = torch.stack([_power_in_octaves(change, shapes) for change in changes])  # (nodes, C, octaves)
+    squares = torch.einsum("bn,ncj->cjb", interpolation(light.psi, nodes), known.clamp(min=0))
+    return math.sqrt(max(0.0, *light.mean_square(squares, alternate)))
+
+
+def _power_in_octaves(change: Tensor, shapes: Tensor) -> Tensor:
+    """Return the mean square of light of power one in each octave, (C, octaves), behind a change of PSFs (C, P, P)."""
+    spectrum = torch.fft.rfft2(change, s=(shapes.shape[-2],) * 2)
+    power = (spectrum.real.square() + spectrum.imag.square()).double()
+    return torch.einsum("cuv,cjuv->cj", power, shapes)

@@ -7,9 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.planning.costs import rendering_work
 from kornia_tidy.planning.render_plan import RenderPlan
-from kornia_tidy.planning.rendering_cost import rendering_work
 from kornia_tidy.psf.psf_cache import nodes_around
 
 
@@ -38,7 +37,6 @@ def plan_measured(optics: Any, defocus: Tensor, images: tuple[int, int], toleran
         images: number of images, and of their channels.
         tolerance: largest error allowed, root mean square of full scale.
     """
-    check_positive("tolerance", tolerance)
     model, (batch, channels) = optics.psf_model, images
     nodes, window = model.defocus_nodes, model.window
     fidelity = optics.fidelity.replace(layers="linear", window=window)

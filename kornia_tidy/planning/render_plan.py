@@ -25,7 +25,7 @@ class RenderPlan:
         states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
         wavelengths: number of wavelengths computed for each layer.
         wavelengths_total: number of wavelengths of the camera's spectrum, all of which the reference uses.
-        light_held: least and largest share of the light in the window over the range.
+        light_held: least and largest share of the light in the window, at the depths of the scene.
         reference_error: error of the reference from its layers, against the exact PSF of each pixel's depth.
         error_parts: contributions to ``predicted_error``, by name of the setting.
     """

@@ -19,7 +19,6 @@ from kornia_tidy.render.borders import next_fast_size, pad_border
 CONTRAST = 0.3  # standard deviation of light assumed without an image, full scale 1; photographs have 0.13 to 0.35
 GRID_RATIO = 2.0  # side of the frequency grid over the window: the autocorrelation of a PSF then does not wrap around
 _BLOCK = 1024  # px; larger images are processed in blocks
-_GRID = 33  # depths at which changes of PSFs are compared
 ALIKE = 2.0  # rad; correlation length of changes of PSFs over defocus
 _USUAL = 0.1  # weight of a photograph's spectrum in that of the scene
 
@@ -133,12 +132,6 @@ class SceneLight:
         self.psi, self.energies = psi, [each if each.ndim == 3 else each.float() for each in energies]
         self._power = power
         self._shapes: dict[int, Tensor] = {}
-        # PSF changes vary slowly with defocus, so a coarse grid suffices for them.
-        self.grid = torch.linspace(float(psi[0]), float(psi[-1]), _GRID, dtype=torch.float64)
-        spread = interpolation(psi, self.grid.tolist()) if psi[-1] > psi[0] else torch.ones(1, _GRID).double() / _GRID
-        self._on_grid = [
-            each @ spread if each.ndim == 3 else spread.mT @ (each @ spread.float()).double() for each in self.energies
-        ]
 
     @classmethod
     def seen(cls, light: Tensor, depths: Depths, border: str, size: int, compositing: str) -> SceneLight:
@@ -147,12 +140,12 @@ class SceneLight:
         if compositing == "gather":
             octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
             return cls(power, depths.psi, octaves[..., None] * depths.shares(light) / depths.seen)
-        lights = [light]
-        if compositing == "occlusion":  # dark objects occlude bright ones
-            lights.append(brightest_around(light) - light)
-        energies = [depths.products(each) / depths.seen for each in lights]
+        lights = [(light, False)]
+        if compositing == "occlusion":  # dark objects occlude bright ones, and bright ones are seen through gaps
+            lights += [(brightest_around(light) - light, False), (light, True)]
+        energies = [depths.products(*each) / depths.seen for each in lights]
         if border == "zero":
-            for each, own in zip(lights, energies, strict=True):
+            for (each, _), own in zip(lights, energies, strict=True):
                 means = depths.means(each)
                 missed = _dark_square(light.shape[-2:], int(size / GRID_RATIO) // 2)
                 own[:, -1] += missed * means[:, :, None] * means[:, None]
@@ -165,23 +158,38 @@ class SceneLight:
         octaves = (power[:, None] * octave_filters(size)).sum((-2, -1))
         return cls(power, depths.psi, octaves[..., None] * depths.share)
 
-    def mean_square(self, squares: Tensor) -> Iterator[float]:
+    def mean_square(self, squares: Tensor, alternate: bool = False) -> Iterator[float]:
         """Yield the mean square error from a change of PSFs, for each distribution of power.
 
         Changes at two depths are assumed fully correlated, or correlated within ``ALIKE`` radians of defocus, whichever
         gives the larger error.
 
         Args:
-            squares: (C, octaves, grid) mean square of the error for light of power one, at the depths of ``grid``.
+            squares: (C, octaves, b) mean square of the error for light of power one, at the depths ``psi``.
+            alternate: whether changes may have opposite signs at similar depths: then they may be independent too.
         """
-        sizes = squares.clamp(min=0).sqrt()
-        alike = torch.exp(-0.5 * ((self.grid[:, None] - self.grid) / ALIKE).square())
-        for own in self._on_grid:
+        for own in self.energies:
             if own.ndim == 3:
                 yield float((squares * own).sum((1, 2)).mean())
-            else:
-                sums = [((each @ sizes[..., None])[..., 0] * sizes).sum(-1) for each in (own, own * alike)]
-                yield float(torch.maximum(*sums).clamp(min=0).sum(1).mean())
+                continue
+            sizes = squares.sqrt().float()
+            alike = torch.exp(-0.5 * ((self.psi[:, None] - self.psi) / ALIKE).square()).float()
+            sums = [((each @ sizes[..., None])[..., 0] * sizes).sum(-1) for each in (own, own * alike)]
+            if alternate:
+                sums.append((squares * own.diagonal(dim1=-2, dim2=-1)).sum(-1))
+            yield float(torch.stack([each.float() for each in sums]).amax(0).clamp(min=0).sum(1).mean())
+
+    def depths(self, most: int) -> list[float]:
+        """Return some depths of the scene, ascending, more of them where more of its pixels and light are.
+
+        Args:
+            most: how many there may be; both ends are among them.
+        """
+        power = sum((each if each.ndim == 3 else each.diagonal(dim1=-2, dim2=-1)).sum((0, 1)) for each in self.energies)
+        mass = torch.as_tensor(power).double().clamp(min=0)
+        mass = (mass / mass.sum().clamp(min=1e-30) + 1 / len(self.psi)).cumsum(0)
+        at = torch.searchsorted(mass, torch.linspace(0, float(mass[-1]), most, dtype=torch.float64))
+        return self.psi[at.clamp(max=len(self.psi) - 1).unique()].tolist()
 
     def shapes(self, window: int) -> Tensor:
         """Return the normalised spectrum within each octave, of sum one, on the frequency grid for a window.

@@ -66,27 +66,6 @@ Fidelity.max_window or layer_spacing
         )
 
 
-def check_layer_spacing(spacing: float, band: float, shortest_wavelength: float) -> None:
-    """Refuse layers too far apart to be interpolated without error.
-
-    Args:
-        spacing: between layers in radians of defocus.
-        band: highest frequency of a PSF along defocus, in radians per radian.
-        shortest_wavelength: in metres, for the message.
-
-    Raises:
-        ValueError: if the spacing is not below pi / band.
-
-    Example:
-        >>> check_layer_spacing(1.0, 1.13, 470e-9)
-    """
-    if spacing >= (limit := math.pi / band):
-        raise ValueError(
-            f"layers='bandlimited' needs a layer_spacing below {limit:.2f} rad for this aperture and "
-            f"{shortest_wavelength * 1e9:.0f} nm, got {spacing}"
-        )
-
-
 def fitting_lens(
     lens: Lens | str, camera: ThinLensCamera | DefocusRange, fidelity: Fidelity, spectrum: Spectrum
 ) -> Lens:

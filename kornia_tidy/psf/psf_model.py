@@ -31,14 +31,7 @@ from kornia_tidy.psf.defocus_interpolation import (
 )
 from kornia_tidy.psf.field_bank import FieldBank, check_field, field_psf_bank
 from kornia_tidy.psf.geometric_psf import blur_radius
-from kornia_tidy.psf.lens_limits import (
-    LEAST_WINDOW,
-    PARTS,
-    WIDEST_DISC,
-    check_defocus_range,
-    check_layer_spacing,
-    fitting_lens,
-)
+from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, nodes_around, plain_attributes
@@ -631,8 +624,6 @@ class PSFModel:
 
     def _check_layers(self) -> None:
         check_defocus_range(self.camera.defocus_range, self.pixel_step, self.fidelity, self.fixed_window)
-        if self.fidelity.layers == "bandlimited":
-            check_layer_spacing(self.fidelity.layer_spacing, self._band(), min(self.spectrum.wavelengths))
 
     @property
     def pupil(self) -> Pupil:
@@ -699,7 +690,7 @@ class PSFModel:
             return None
         if not is_flat(self.states(torch.float32)[0]):
             return None
-        blur = wide_blur(camera.defocus_range, step, self.pupil.extent)
+        blur = wide_blur(camera.defocus_range, step, self.pupil)
         return blur if known is None or known.side == blur.window else None  # a window of another kind was loaded
 
     @torch.no_grad()

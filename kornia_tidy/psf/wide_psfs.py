@@ -8,13 +8,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur, window_of
+from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur
 
 Exact = Callable[[Tensor, Tensor, tuple[float, ...], int], PSFBank]
 """Exact PSFs of states and their weights, at nodes, in a window."""
@@ -56,10 +55,7 @@ def wide_psfs(
             psfs = psfs + rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
         parts.append(psfs)
     if small:
-        # Of all small discs of the lens, so that a PSF does not depend on what is asked for besides.
-        side = min(window, window_of(blur.ray_radius, step, pupil.extent, grid))
-        psfs = exact(small, side).psfs
-        parts.insert(1, pad(psfs, ((window - side) // 2,) * 4))
+        parts.insert(1, exact(small, window).psfs)
     psfs = torch.cat(parts)
     return PSFBank(psfs, psfs.new_tensor(nodes), psfs.sum((2, 3)))
 

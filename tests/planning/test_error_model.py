@@ -11,7 +11,6 @@ from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.planning.depth_energy import Depths, octave_filters
 from kornia_tidy.planning.error_model import (
-    LayerErrors,
     change_error,
     chebyshev_nodes,
     chebyshev_weights,
@@ -50,7 +49,7 @@ class TestInterpolation(BaseTester):
 
     def test_feature_sampled_psfs_carry_those_of_every_defocus(self):
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
-        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, PSFSamples(optics, 3).geometry(Fidelity()).bandwidth))
+        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, PSFSamples(optics, 3).band))
         psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
         with torch.no_grad():
             direct, known = (optics.psf_bank(3, None, at).psfs for at in (psi, tuple(nodes.tolist())))
@@ -60,7 +59,7 @@ class TestInterpolation(BaseTester):
     def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
         """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
         optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
-        assert 1.05**2 * 530 / 470 <= PSFSamples(optics, 1).geometry(Fidelity()).bandwidth <= 1.2 * 530 / 470
+        assert 1.05**2 * 530 / 470 <= PSFSamples(optics, 1).band <= 1.2 * 530 / 470
 
 
 class TestPower(BaseTester):
@@ -143,14 +142,38 @@ class TestLayers(BaseTester):
             coded = render(point, psi.expand(1, 1, 15, 15), bank, layers=mode, border="zero")
         self.assert_close(coded, psf, atol=1e-12, rtol=0)
 
+    def test_feature_wide_ranges_take_psfs_of_their_own_for_each_depth(self, monkeypatch):
+        """And narrow ones interpolate them: the same to a millionth."""
+        optics, depths = TiDyOptics(PixelwiseMask(1), sensor=None), (-7.3, 0.2, 11.0)
+        fidelity = Fidelity(layers="linear", layer_spacing=1.0)
+        interpolated = PSFSamples(optics, 3).layered(fidelity, depths, 15)
+        monkeypatch.setattr("kornia_tidy.planning.psf_samples._MOST_NODES", 1)
+        self.assert_close(PSFSamples(optics, 3).layered(fidelity, depths, 15), interpolated, rtol=0, atol=1e-6)
+
     def test_feature_differences_are_those_of_convolved_images(self):
-        """Two constant PSFs with different shares of the scene."""
         generator = torch.Generator().manual_seed(0)
         light = torch.rand(1, 1, 24, 24, dtype=torch.float64, generator=generator)
-        psfs = torch.randn(2, 1, 3, 3, generator=generator)
-        errors = LayerErrors(torch.tensor([-1.0, 1.0]), psfs, one_depth(power_spectrum(light, "circular", 64)))
-        ours, theirs = torch.tensor([[0.3, 0.7]]).double(), torch.tensor([[0.6, 0.4]]).double()
-        kernel = torch.einsum("an,ncpq->pq", ours - theirs, psfs.double())
+        change = torch.randn(1, 1, 3, 3, generator=generator)
         varying = light[0, 0] - light.mean()
-        expected = (scipy.ndimage.convolve(varying.numpy(), kernel.numpy(), mode="wrap") ** 2).mean() ** 0.5
-        assert errors(ours, theirs) == pytest.approx(expected, rel=0.05)  # a tenth of the shape is a photograph's
+        expected = (scipy.ndimage.convolve(varying.numpy(), change[0, 0].numpy(), mode="wrap") ** 2).mean() ** 0.5
+        error = change_error((0.0,), change, one_depth(power_spectrum(light, "circular", 64)))
+        assert error == pytest.approx(expected, rel=0.05)  # a tenth of the shape is a photograph's
+
+    def test_feature_changes_that_alternate_do_not_cancel_between_depths(self):
+        """Of white light, whose outlines at two depths cancel each other unless its PSFs change differently."""
+        white, defocus = torch.ones(1, 1, 32, 32), 0.3 * (torch.arange(32) % 2).expand(1, 1, 32, 32)
+        light = SceneLight.seen(white, Depths(defocus, -20, 20, "circular"), "circular", 32, "scatter")
+        changes = torch.zeros(2, 1, 3, 3)
+        changes[..., 1, 1], changes[..., 0, 1] = 0.1, -0.1
+        same, alternating = (change_error((0.0, 0.3), changes, light, alternate=each) for each in (False, True))
+        assert same < 0.02
+        assert 0.04 < alternating < 0.11
+
+    def test_feature_depths_are_where_pixels_and_light_are(self):
+        light, defocus = torch.zeros(1, 1, 40, 40), torch.linspace(-10, 10, 40).expand(1, 1, 40, 40)
+        light[..., 20, 33] = 100.0
+        depths = SceneLight.seen(light, Depths(defocus, -20, 20, "reflect"), "reflect", 64, "gather").depths(8)
+        assert len(depths) == len(set(depths)) <= 8
+        assert depths[0] == pytest.approx(-10)
+        assert depths[-1] == pytest.approx(10)
+        assert min(abs(psi - float(defocus[0, 0, 0, 33])) for psi in depths) < 0.1

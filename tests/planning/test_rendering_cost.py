@@ -14,9 +14,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.overlap_ops import SOURCE
-from kornia_tidy.planning.bank_cost import bank_operations, window_side
+from kornia_tidy.planning.costs import bank_operations, rendering_work, window_side
 from kornia_tidy.planning.planner import Planner
-from kornia_tidy.planning.rendering_cost import rendering_work
 from kornia_tidy.render.backend import transform_operations
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.scene import layered_scene

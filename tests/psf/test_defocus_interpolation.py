@@ -10,6 +10,7 @@ from kornia_tidy.psf.defocus_interpolation import (
     defocus_band,
     fine_layer_matrix,
     fine_nodes,
+    interpolable_spacing,
     interpolated_bank,
     interpolation_matrix,
 )
@@ -115,9 +116,13 @@ class TestContinuousDepth(BaseTester):
         assert float(torch.stack(errors).mean()) < mean
         assert float(torch.stack(errors).max()) < worst
 
-    def test_exception_samples_too_far_apart_for_the_band(self):
-        with pytest.raises(ValueError, match=r"layer_spacing below 2\.43 rad for this aperture and 470 nm, got 3\.0"):
-            TiDyOptics(fidelity=Fidelity(layers="bandlimited", layer_spacing=3.0))
+    def test_feature_samples_stand_as_close_as_the_band_asks_for(self):
+        optics = TiDyOptics(fidelity=Fidelity(layers="bandlimited", layer_spacing=3.0, window=5))
+        nodes = np.array(optics.defocus_nodes)
+        assert np.diff(nodes).max() < 1.05 * interpolable_spacing(defocus_band(1.145, 470e-9, 530e-9))
+        reference = Fidelity.preset("reference").replace(window=5)
+        square = TiDyOptics(PixelwiseMask(1), fidelity=reference, aperture=torch.ones(23, 23))
+        assert np.diff(square.defocus_nodes).max() < 0.6 * np.diff(nodes).max()
 
     def test_dynamo_a_band_limited_capture_is_one_graph(self):
         fidelity = Fidelity(layers="bandlimited", window=5)
