@@ -52,7 +52,7 @@ POINT_SAFETY = 1.6  # factor for quadrature points; measured up to 1.5, as they 
 OCCLUSION = 1.3  # ratio of occlusion's error to the prediction for scatter; measured up to 1.1, before SAFETY
 OCCLUSION_WINDOW = 1.3  # the same ratio for windows
 ORDER_ERROR = 4e-3  # of occlusion, relative to the contrast, per radian between linear layers; measured up to 1.9e-3
-OUTLINE_ERROR = 2e-2  # the same, times the square root of the share of outline pixels; measured up to 1.9e-2
+OUTLINE_ERROR = 2e-2  # the same, relative to the contrast at outlines; measured up to 1.9e-2
 _OUTLINE = 1.0  # rad between neighbouring pixels; larger steps are outlines of objects
 _ENOUGH = 0.05  # of the tolerance: with errors below it, more wavelengths bring nothing
 _DEPTHS = 16  # of the scene at which PSFs are compared
@@ -126,6 +126,7 @@ class PlannedScene:
             self._apart = means / self._depths.share - means.sum(1, keepdim=True)
             self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
         self._at = tuple(self.light.depths(_DEPTHS))
+        self._outlines = self._at_outlines(light) if self._occlusion else 0.0
 
     def _seen_light(self, light: Tensor, size: int) -> SceneLight:
         return SceneLight.seen(light, self._depths, self.samples.border, size, self.samples.compositing)
@@ -302,11 +303,15 @@ class PlannedScene:
     def _occlusion(self) -> bool:
         return self.samples.compositing == "occlusion"
 
-    @cached_property
-    def _outlines(self) -> float:
-        """Share of the pixels that have a neighbour at another depth."""
+    def _at_outlines(self, light: Tensor | None) -> float:
+        """Return the root mean square, over all pixels, of the contrast of those with a neighbour at another depth."""
         nearest, farthest = (max_pool2d(sign * self._defocus, 3, 1, 1) for sign in (1, -1))
-        return float((nearest + farthest > _OUTLINE).double().mean())
+        outline = (nearest + farthest > _OUTLINE).double()
+        contrast = self._contrast * float(outline.mean().sqrt())
+        if light is None:
+            return contrast
+        brightest, darkest = (max_pool2d(sign * light.double(), 3, 1, 1) for sign in (1, -1))
+        return max(contrast, float((outline * (brightest + darkest).square()).mean().sqrt()))
 
     @cached_property
     def _share_in_frame(self) -> float:
@@ -327,8 +332,8 @@ class PlannedScene:
         own, theirs = self._rendered(fidelity), self._rendered(self.reference)
         if own == theirs:
             return 0.0
-        each = max(ORDER_ERROR, OUTLINE_ERROR * self._outlines**0.5)
-        return each * self._contrast * (own[-1] - own[0]) / (len(own) - 1)
+        each = max(ORDER_ERROR * self._contrast, OUTLINE_ERROR * self._outlines)
+        return each * (own[-1] - own[0]) / (len(own) - 1)
 
     def _dark_error(self, fidelity: Fidelity) -> float:
         """Return the error of occlusion from the regularised division by the cumulative alpha.

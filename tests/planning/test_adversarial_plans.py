@@ -9,7 +9,10 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy import DefocusRange, TiDyOptics
+from kornia_tidy import DefocusRange, Fidelity, TiDyOptics
+from kornia_tidy.masks import FresnelLens
+from kornia_tidy.planning import psf_samples
+from kornia_tidy.planning.candidates import REFERENCE
 from tests.base import BaseTester
 from tests.planning.adversarial_scenes import COMPOSITINGS, MASK_KINDS, SCENES, TOLERANCES, Case, judge, report
 from tests.planning.planning_rig import Rig
@@ -63,6 +66,24 @@ class TestAdversarialScenes(BaseTester):
         outcome = judge(Case.of_seed(2819))
         assert (outcome.case.kind, outcome.case.compositing) == ("checkerboard", "occlusion")
         assert outcome.measured <= min(outcome.predicted, outcome.case.tolerance), outcome
+
+    @pytest.mark.parametrize(("background", "own"), [(15.5, -20.0), (20.5, 0.0), (-19.5, -30.0)])
+    @pytest.mark.parametrize("border", ["reflect", "zero"])
+    def test_feature_light_through_a_gap_has_the_blur_of_the_gap(self, monkeypatch, border, background, own):
+        """Points of light behind a background half way between layers: off 2.2 times the tolerance before."""
+        monkeypatch.setattr(psf_samples, "REFERENCE", REFERENCE.replace(max_window=33))
+        lens = FresnelLens(10.0), DefocusRange(-40, 40)
+        rig = Rig(TiDyOptics(*lens, sensor=None, compositing="occlusion", border=border, fidelity=Fidelity(window=3)))
+        light, defocus = torch.zeros(1, 3, 40, 40), torch.full((1, 1, 40, 40), background)
+        for y, x, value in ((20, 17, 1.0), (7, 30, 0.6)):
+            light[..., y, x], defocus[..., y, x] = value, own
+        scene = rig.planner.scene(defocus, light)
+        kinds = [scene.plan(1e-5).fidelity]
+        for layers, spacing in (("linear", 0.25), ("cubic", 1.0)):
+            kinds.append(scene.reference.replace(layers=layers, layer_spacing=spacing))
+        for fidelity in kinds:
+            assert rig.error(light, defocus, fidelity, scene.reference) <= scene.error(fidelity)
+        assert scene.error(kinds[0]) <= 1e-5
 
     @pytest.mark.slow
     @pytest.mark.timeout(1800)
