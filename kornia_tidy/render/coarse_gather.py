@@ -5,6 +5,19 @@ camera with pixels k times as wide, and interpolated linearly. Averaging twice a
 :math:`1/12 + 1/12 + 1/6 = 1/3` of a squared grid pixel on each axis; the PSF is sharpened by as much,
 :math:`h - \Delta h / 6`, so that what is left is of fourth order. Pixels blend their two layers as in
 :func:`kornia_tidy.render.compositing.gather`, and each belongs to the one group of layers that spans its defocus.
+
+A sharpened PSF is negative just outside of the aperture's image: there h is zero, and at a straight edge at most two of
+its four neighbours lie within, so that it is at least :math:`-h_{max} / 3`. Averaging and interpolation only mix its
+values. Light that is nowhere negative therefore gives
+
+.. math:: I(x) \ge -\sum_j \max(-h_j, 0) \, L_{max},
+
+with the sum over the sharpened PSF, 0.023 for a disc of 12 pixels of the grid and 0.007 for one of 24, and the
+brightest light within the PSF's reach. One pixel of light L gives at least :math:`-L / (3 A R^2)` for a radius of R
+sensor pixels, with the aperture's area A in squared pupil radii, which is :math:`\pi` for the disc. Where two groups
+meet, both have a layer with the same PSF h. Their pixels differ by at most half of the absolute sum of the difference
+of the two kernels, 0.034 for the disc, times the range of the light within reach; by
+:data:`~kornia_tidy.psf.wide_blur.GRID_ERROR` root mean square in a photograph.
 """
 
 from __future__ import annotations

@@ -6,18 +6,24 @@ from dataclasses import replace
 import pytest
 import torch
 
+from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.geometric_psf import geometric_psfs
 from kornia_tidy.psf.pieces import Piece
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.pupil import pupil_over
+from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.wide_blur import GRID_ERROR, SCENE_DEVIATION, window_of
-from kornia_tidy.render.coarse_gather import gather_group
+from kornia_tidy.render.coarse_gather import _sharpened, gather_group
 from kornia_tidy.render.compositing import gather
 from tests.base import BaseTester
 
 STEP = 1.625e-6
 PUPIL = pupil_over((1, 23, 23), None, 1.0)
+SHAPES = {
+    "disc": circular_aperture(23),
+    "ring": annular_aperture(23, 0.1, 0.5),
+    "triangle": polygon_aperture(23, 0.1, 3),
+}
 
 
 def defocus_of(radius: float) -> float:
@@ -25,11 +31,13 @@ def defocus_of(radius: float) -> float:
     return radius * math.pi * STEP / REFERENCE_WAVELENGTH
 
 
-def group_of(radii: tuple[float, ...], grid: int, dtype: torch.dtype = torch.float32, span=None, window=0) -> Piece:
+def group_of(
+    radii: tuple[float, ...], grid: int, dtype: torch.dtype = torch.float32, span=None, window=0, pupil=PUPIL
+) -> Piece:
     """Discs of these radii in pixels, on a grid, for the pixels of a span of radii."""
     nodes = [defocus_of(radius) for radius in radii]
-    side = window_of(max(radii), STEP, PUPIL.extent, grid)
-    psfs = geometric_psfs(PUPIL.transmission, PUPIL.cell_pitch, nodes, STEP * grid, side).to(dtype)[:, None]
+    side = window_of(max(radii), STEP, pupil.extent, grid)
+    psfs = geometric_psfs(pupil.transmission, pupil.cell_pitch, nodes, STEP * grid, side).to(dtype)[:, None]
     bank = PSFBank(psfs, torch.tensor(nodes, dtype=dtype), psfs.sum((2, 3)))
     ends = None if span is None else (defocus_of(span[0]), defocus_of(span[1]))
     return Piece(lambda: bank, 1.0, ends, grid, window)
@@ -42,6 +50,14 @@ def light(size: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
     spectrum = torch.fft.fft2(noise - noise.mean()) / (f[:, None].square() + f.square()).sqrt().clamp(min=1 / size)
     plane = torch.fft.ifft2(spectrum).real
     return (0.5 + SCENE_DEVIATION * plane / plane.std()).to(dtype)
+
+
+def kernels_of(group: Piece, radius: float, size: int) -> list[torch.Tensor]:
+    """The light that pixels collect at the four places within a pixel of a grid of two, by the pixel it comes from."""
+    image = torch.zeros(1, 1, size, size, dtype=torch.float64, requires_grad=True)
+    seen = gather_group(image, torch.full_like(image, defocus_of(radius)).detach(), group, "circular")
+    pixels = [seen[0, 0, size // 2 + y, size // 2 + x] for y in (0, 1) for x in (0, 1)]
+    return [torch.autograd.grad(pixel, image, retain_graph=True)[0] for pixel in pixels]
 
 
 class TestGatherGroup(BaseTester):
@@ -83,6 +99,32 @@ class TestGatherGroup(BaseTester):
         whole = gather_group(one, psi, group)
         monkeypatch.setattr("kornia_tidy.render.coarse_gather._LAYER_BYTES", 1)
         self.assert_close(gather_group(one, psi, group), whole, rtol=0, atol=1e-6)
+
+    @pytest.mark.parametrize("aperture", ["disc", "ring", "triangle"])
+    def test_feature_light_is_never_below_the_bound(self, aperture):
+        """The worst light is white where the kernel is negative; a point of light is the worst for its energy."""
+        radius, pupil = 24.0, Pupil(SHAPES[aperture], 0.1)
+        group, size = group_of((radius,), 2, torch.float64, pupil=pupil), 62
+        sharpened = _sharpened(group.bank().psfs)
+        bound = float((-sharpened).clamp(min=0).sum())
+        for kernel in kernels_of(group, radius, size):
+            worst = (kernel < 0).double()
+            darkest = gather_group(worst, torch.full_like(worst, defocus_of(radius)), group, "circular").min()
+            assert -bound <= float(darkest) <= 0.9 * float(kernel.clamp(max=0).sum()) < -1e-3
+            assert -float(kernel.min()) < 1 / (3 * pupil.light * radius**2)
+        assert bound < {"disc": 0.023, "ring": 0.046, "triangle": 0.048}[aperture]
+
+    def test_feature_neighbouring_groups_differ_by_no_more_than_the_bound(self):
+        """Half of the absolute difference of their kernels is in one light of 0 and 1 the difference of a pixel."""
+        radius, size = 24.0, 62
+        groups = [group_of((radius,), grid, torch.float64) for grid in (1, 2)]
+        for fine, coarse in zip(*(kernels_of(group, radius, size) for group in groups), strict=True):
+            assert 0.01 < float((fine - coarse).abs().sum()) / 2 < 0.034
+        one, psi = light(160, torch.float64), torch.full((1, 1, 160, 160), defocus_of(radius), dtype=torch.float64)
+        fine, coarse = (gather_group(one, psi, group, "circular") for group in groups)
+        reach = float(one.max() - one.min())
+        assert float((fine - coarse).abs().max()) < 0.034 * reach
+        assert float((fine - coarse).square().mean().sqrt()) < 1.3 * GRID_ERROR
 
     @pytest.mark.takes_seconds
     def test_gradcheck_of_image_defocus_and_psfs(self):
