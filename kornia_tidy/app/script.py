@@ -26,7 +26,7 @@ PLACES = {
     "photographic_leaves": "kornia_tidy.data",
     "read_files": "kornia_tidy.app.scenes",
     "split_maps": "kornia_tidy.inference.tasks",
-    "stretched": "kornia_tidy.commands.demo",
+    "stretched": "kornia_tidy.inference.tasks",
     "update_psfs": "kornia_tidy.inference.trained",
     "write_depth": "kornia_tidy.data",
     "write_image": "kornia_tidy.data",

@@ -35,7 +35,7 @@ class PSFSamples:
     """
 
     def __init__(self, optics: Any, channels: int) -> None:
-        model: PSFModel = optics.psf_model.snapshot(torch.float64)
+        model: PSFModel = optics.psf_model
         self.spectrum = model.spectrum if channels == len(model.spectrum.weights) else Spectrum.monochrome()
         states = len(model.state_weights(torch.float32))
         # For occlusion each state is rendered separately, see Fidelity.occlusion_states.

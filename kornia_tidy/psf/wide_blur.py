@@ -166,7 +166,7 @@ def wide_blur(defocus_range: tuple[float, float], step: float, pupil: Pupil) -> 
         >>> from kornia_tidy.optics.aperture import circular_aperture
         >>> blur = wide_blur((-572.0, 572.0), 1.625e-6, Pupil(circular_aperture(23), 0.1))
         >>> [group.grid for group in blur.groups], blur.window, len(blur.nodes)
-        ([4, 2, 1, 2, 4], 131, 109)
+        ([4, 2, 1, 2, 4], 131, 111)
     """
     lo, hi = defocus_range
     per_pixel = math.pi * step / REFERENCE_WAVELENGTH  # radians of defocus for a pixel of radius

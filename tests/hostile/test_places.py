@@ -164,7 +164,7 @@ class TestLinks(BaseTester):
             (folder / name).unlink(missing_ok=True)
             (folder / name).symlink_to(target)
         whole = (folder / "in.png").read_bytes()
-        assert "it is the input" in refused(command(SIMULATE, folder))
+        assert "it is an input" in refused(command(SIMULATE, folder))
         shutil.copy(folder / "in.png", folder / "other.png")
         (folder / "out.png").unlink()
         (folder / "out.png").symlink_to("other.png")
