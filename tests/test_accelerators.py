@@ -214,12 +214,12 @@ class TestCounts:
     @pytest.mark.parametrize(
         ("compositing", "fixed", "launches"),
         [
-            ("gather", False, 181),
-            ("gather", True, 175),
-            ("scatter", False, 191),
-            ("scatter", True, 185),
+            ("gather", False, 178),
+            ("gather", True, 171),
+            ("scatter", False, 188),
+            ("scatter", True, 181),
             ("occlusion", False, 300),
-            ("occlusion", True, 284),
+            ("occlusion", True, 283),
         ],
     )
     def test_feature_a_training_step_launches_no_more_than_before_and_waits_once(self, compositing, fixed, launches):

@@ -63,8 +63,8 @@ class Row:
         what: was measured.
         value: of it; None where it was skipped.
         unit: of the value.
-        remark: what it is beside, or why it was skipped.
-        right: whether a bound is kept; None where there is none.
+        remark: the comparison, or the reason for skipping it.
+        right: True if a bound is kept, False if not, None without a bound.
     """
 
     section: str
@@ -118,7 +118,7 @@ def scene(height: int, width: int, batch: int = 1) -> tuple[Tensor, Tensor]:
 
 
 def depth_of(optics: TiDyOptics, nearness: Tensor) -> Tensor:
-    """Return metres of a map in [0, 1], of which 0 is the far end of a camera's range of defocus."""
+    """Return the depth of a map in [0, 1], laid linearly on a camera's range of defocus; 0 is the far end."""
     lo, hi = optics.camera.defocus_range
     return optics.camera.depth(lo + (hi - lo) * (0.02 + 0.96 * nearness.double())).float()
 
@@ -176,7 +176,7 @@ def agreement(bench: Bench) -> Iterator[Row]:
 
 
 def deeplens() -> Callable[..., Tensor] | str:
-    """Return DeepLens's function, or why there is none."""
+    """Return DeepLens's function, or the reason for its absence."""
     try:
         from deeplens.imgsim import conv_psf_depth_interp  # ty: ignore[unresolved-import]
     except ImportError as error:
@@ -185,7 +185,7 @@ def deeplens() -> Callable[..., Tensor] | str:
 
 
 def renderers() -> dict[str, Callable[[Tensor, Tensor, Bank], Tensor] | str]:
-    """Return ways to render linear layers, or why there is none."""
+    """Return renderers of linear layers by name, or the reason for the absence of one."""
     own = deeplens()
 
     def by_deeplens(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
@@ -288,7 +288,7 @@ def restoration(bench: Bench) -> Iterator[Row]:
 
 
 def measured(bench: Bench, begin: float) -> Iterator[Row]:
-    """Yield all rows; what comes too late is skipped."""
+    """Yield all rows; those after the time limit are skipped."""
     for part in (agreement, rendering, training, restoration):
         if time.monotonic() - begin > SECONDS:
             yield Row(part.__name__, "all", None, "", "no time was left")

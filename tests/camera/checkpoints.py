@@ -135,7 +135,7 @@ def scene(optics: TiDyOptics) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def capture_of(optics: TiDyOptics) -> Tensor:
-    """Return every second pixel of a capture, with noise that is no random number."""
+    """Return every second pixel of a capture, with noise by a formula."""
     image, depth = scene(optics)
     uniform = (torch.arange(image.numel(), dtype=torch.float64) * 0.754877).remainder(1).reshape(image.shape)
     values = {"read": 2 * uniform - 1, "shot": uniform}

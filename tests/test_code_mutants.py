@@ -1,0 +1,93 @@
+"""Mutants: faults of each kind are found where they can be made, drawn by a seed, and shown to the right tests."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.base import BaseTester
+from tests.code_mutants.mutants import KINDS, draw_mutants, mutants_of
+from tests.code_mutants.trial import chosen_tests, compiles, within
+
+ROOT = Path(__file__).resolve().parents[1]
+
+PYTHON = b'''
+class Bank:
+    """A bank of - 3 * numbers."""
+
+    def recall(self, key: int = 3) -> Tensor:
+        if key < 4 and self._known:
+            self._memory.clear()
+        self._kind = key
+        return torch.cos(-self.psi) * 2.5
+'''
+C = b"""// x + 1
+static void add(float *sum, long n) {
+    memset(sum, 0, n);
+    for (long i = 0; i < n; i++) sum[i] += -0.5 * sum[i];
+}
+"""
+
+
+def changes(path: str, source: bytes) -> dict[str, set[str]]:
+    """The new lines, by kind."""
+    found: dict[str, set[str]] = {kind: set() for kind in KINDS}
+    for mutant in mutants_of(path, source):
+        before, after = source.decode().splitlines(), mutant.apply(source).decode().splitlines()
+        assert before[mutant.line - 1] != after[mutant.line - 1]
+        found[mutant.kind].add(after[mutant.line - 1].strip())
+    return found
+
+
+class TestMutants(BaseTester):
+    def test_feature_faults_of_python(self):
+        found = changes("kornia_tidy/psf/bank.py", PYTHON)
+        assert "return torch.cos((self.psi)) * 2.5" in found["sign"]
+        assert "return torch.sin(-self.psi) * 2.5" in found["sign"]
+        assert {"if key <= 4 and self._known:", "if key < 5 and self._known:"} <= found["off-by-one"]
+        assert "return torch.cos(-self.psi) * 25.0" in found["unit"]
+        assert found["gradient"] == {"return (torch.cos(-self.psi) * 2.5).detach()"}
+        assert found["memory"] == {"pass"}
+        assert {"if True:", "if (key < 4 or self._known):"} <= found["condition"]
+        assert not any("numbers" in line for lines in found.values() for line in lines)
+
+    def test_feature_faults_of_c(self):
+        found = changes("kornia_tidy/kernels/add.c", C)
+        loop = "for (long i = 0; i < n; i++) sum[i] {} {}0.5 * sum[i];"
+        assert found["sign"] == {loop.format("-=", "-"), loop.format("+=", "")}
+        assert loop.replace("i < n", "i <= n").format("+=", "-") in found["off-by-one"]
+        assert loop.format("=", "-") in found["gradient"]
+        assert found["memory"] == {";"}
+
+    def test_feature_mutants_know_their_function(self):
+        assert {m.function for m in mutants_of("kornia_tidy/psf/bank.py", PYTHON)} == {"", "Bank.recall"}
+
+    def test_feature_a_seed_draws_the_same_and_kinds_take_turns(self):
+        drawn = draw_mutants(ROOT, 18, seed=3)
+        assert drawn[:12] == draw_mutants(ROOT, 12, seed=3)
+        assert [m.kind for m in drawn] == 3 * list(KINDS)
+        assert len({*drawn}) == 18
+        for mutant in drawn:
+            if mutant.path.endswith(".py"):
+                ast.parse(mutant.apply((ROOT / mutant.path).read_bytes()))
+
+    @pytest.mark.parametrize(("text", "right"), [("x = 1\n", True), ("x = = 1\n", False)])
+    def test_feature_what_does_not_compile_is_no_mutant(self, text, right, tmp_path):
+        (tmp_path / "a.py").write_text(text)
+        assert compiles(tmp_path / "a.py") is right
+
+    def test_feature_the_likeliest_tests_come_first(self):
+        [mutant] = [m for m in mutants_of("kornia_tidy/psf/bank.py", PYTHON) if m.kind == "gradient"]
+        own = "kornia_tidy/psf/bank.py:Bank.recall"
+        calls = {
+            "tests/camera/test_a.py::far": (0.1, [own]),
+            "tests/psf/test_b.py::slow": (3.0, [own]),
+            "tests/psf/test_b.py::other": (0.1, ["kornia_tidy/psf/bank.py:Bank.save"]),
+            "tests/psf/test_bank.py::own": (2.0, [own]),
+            "tests/psf/test_bank.py::beside": (0.1, []),
+        }
+        tests = chosen_tests(mutant, calls, ROOT)
+        assert [test.rpartition("::")[2] for test in tests] == ["own", "slow", "far", "beside"]
+        assert within(tests, calls, 5.0) == 2
