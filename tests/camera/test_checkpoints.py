@@ -11,7 +11,10 @@ from tests.base import BaseTester
 from tests.camera.checkpoints import CAPTURE, FOLDER, KINDS, OTHERS, capture_of, other_cameras
 
 SAME = 1e-6  # full scale
-TOLERANCES = {"bits": 1 / 1023 + SAME}  # rounding may decide for the next level
+TOLERANCES = {
+    "bits": 1 / 1023 + SAME,  # rounding may decide for the next level
+    "fast lens": 1e-2,  # layers stand closer near focus, where those of before erred by some 4e-3 of white noise's light
+}
 
 
 def written(kind: str) -> dict[str, torch.Tensor]:
