@@ -13,7 +13,7 @@ from tests.camera.checkpoints import CAPTURE, FOLDER, KINDS, OTHERS, capture_of,
 SAME = 1e-6  # full scale
 TOLERANCES = {
     "bits": 1 / 1023 + SAME,  # rounding may decide for the next level
-    "fast lens": 1e-2,  # layers stand closer near focus, where those of before erred by some 4e-3 of white noise's light
+    "fast lens": 1e-2,  # layers stand closer near focus, where those of before erred by some 4e-3
 }
 
 
