@@ -28,7 +28,9 @@ extensions = [
     "sphinx_design",
 ]
 nitpicky = True
-nitpick_ignore = [("py:class", "Distance")]  # another name of float, by which settings allow inf
+_SETTINGS = "Metres|Distance|DepthRange|Seed|Preset|Compositing|Border|StrayLight|ColorSpace|Start|Inverse"
+# Other names of float, int and str, by which settings tell their units, ranges and choices.
+nitpick_ignore_regex = [("py:class", _SETTINGS), ("py:obj", r"typing\.Annotated.*")]
 default_role = "literal"  # docstrings write commands as Markdown does
 exclude_patterns = ["examples/*.md"]
 

@@ -4,8 +4,7 @@ Surfaces and glasses come in as plain data; wavefronts over the stop at any fiel
 Read ``lens.py`` first, then ``joined_rays.py``: which rays a wavefront is made of.
 """
 
-from kornia_tidy.optics.lens.lens import Lens, LensRangeWarning
 from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
 from kornia_tidy.optics.lens.prescription import Prescription
 
-__all__ = ["NAMED_LENSES", "Lens", "LensRangeWarning", "Prescription"]
+__all__ = ["NAMED_LENSES", "Prescription"]
