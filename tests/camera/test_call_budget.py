@@ -14,6 +14,7 @@ import kornia_tidy
 from kornia_tidy import TiDyOptics
 from kornia_tidy.data import dead_leaves
 from tests.base import BaseTester
+from tests.kernels.operator_tester import needs_compiler
 
 PACKAGE = Path(kornia_tidy.__file__).parent
 
@@ -68,6 +69,7 @@ def calls(request) -> list[Call]:
         return calls_of(lambda: optics(image, depth))
 
 
+@needs_compiler  # the limits are those of the compiled backend
 class TestCallBudget(BaseTester):
     def test_feature_functions(self, calls):
         assert len({call[:2] for call in calls}) <= FUNCTIONS, listed(calls)
