@@ -16,6 +16,7 @@ from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf import FieldBank, PSFModel, Pupil
 from kornia_tidy.psf.field_bank import field_psf_bank
+from kornia_tidy.render.compositing import render
 from tests.base import BaseTester, shared
 from tests.optics.lens.lenses import symmetric_pair
 
@@ -215,6 +216,16 @@ class TestLensPSFs(BaseTester):
         self.assert_close(optics.psf_bank(defocus=[-5.0, 5.0]).psfs, bank.at(0).psfs, atol=1e-5, rtol=1e-3)
         bank.psfs.square().sum().backward()
         assert optics.masks.phase.grad is not None
+
+    @torch.no_grad()
+    def test_feature_captures_see_the_axis_and_say_so_once(self):
+        optics = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft", sensor=None, color_space="linear")
+        image, depth = torch.rand(1, 3, 72, 80), torch.full((1, 1, 72, 80), 0.5)
+        with pytest.warns(UserWarning, match="rendered through the PSFs of the lens's axis"):
+            capture = optics(image, depth)
+        self.assert_close(optics(image, depth), capture)  # warnings are errors here
+        bank = optics.psf_bank()
+        self.assert_close(capture, render(image, optics.defocus(depth), bank, layers=optics.fidelity.layers), atol=1e-5)
 
     def test_feature_states_of_cameras_hold_the_lens(self):
         one = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft")
