@@ -82,7 +82,9 @@ class TestCaptureInBands(BaseTester):
         image, depth = make_scene(150, 40)
         expected = optics(image[0].bfloat16(), depth[0])
         optics.memory_budget = 1
-        assert torch.equal(optics(image[0].bfloat16(), depth[0]), expected)
+        banded = optics(image[0].bfloat16(), depth[0])  # float32's round-off may decide for the next bfloat16
+        self.assert_close(banded, expected, rtol=2**-7, atol=0)
+        assert (banded != expected).float().mean() < 1e-3
 
     @pytest.mark.takes_seconds
     @torch.no_grad()
