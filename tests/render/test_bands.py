@@ -95,7 +95,7 @@ class TestCaptureInBands(BaseTester):
         taken = peak_bytes(lambda: optics(image, depth), image.device)
         assert taken - 4 * image.numel() <= 64 << 20
         optics.memory_budget = 1 << 40
-        assert peak_bytes(lambda: optics(image, depth), image.device) > 2 * 64 << 20
+        assert peak_bytes(lambda: optics(image, depth), image.device) > 1.5 * (64 << 20)
 
     def test_feature_gradients_take_the_image_at_once(self):
         optics = make_optics(memory_budget=1)
