@@ -114,6 +114,7 @@ class TestConditions(BaseTester):
         root = Path(kornia_tidy.__file__).parent
         elsewhere = {"camera/dataset_transform", "files", "camera/motion", "camera/burst", "tensor_files", "__init__"}
         elsewhere |= {"tradeoff/conditions", "tradeoff/figure", "tradeoff/files", "tradeoff/__init__"}
+        elsewhere |= {"choices", "settings"}
         names = {
             name.partition(".")[2].replace(".", "/") for name in done.stdout.split() if name.startswith("kornia_tidy.")
         }
